@@ -180,8 +180,8 @@ def _section(effect: type[Effect]) -> str:
 INTRODUCTION = """# Effects
 
 Terms that a model may lack. Each enters one balance with an amplitude, which is zero if the effect is absent. A
-positive amplitude takes away: a voltage drop, a loss torque, a resisting force, a lost speed. In `mass`, `inertia`,
-`inductance` and `sensor` it adds.
+positive amplitude takes away: a voltage drop, a loss torque, a resisting force, a loss of speed. In `mass`,
+`inertia`, `inductance` and `sensor` it adds.
 
 *`python benchmarks/effects.py` writes this page from the library; a test compares the two.*
 

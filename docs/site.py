@@ -137,7 +137,7 @@ def exit_codes() -> str:
     codes = (
         ("0", "done, whatever the answer: runs that stall or slide, requirements that are missed, every verdict"),
         ("1", "internal error; `--check`: a part of the installation does not work"),
-        ("2", "usage or configuration, a folder that cannot be written or is in use, or not enough memory"),
+        ("2", "usage or configuration error, a folder that cannot be written or is in use, or not enough memory"),
         ("3", "done, but a solver failed or the time ran out; the results state where"),
         ("4", "bad data, or a finished sweep with damaged files"),
         ("130", "interrupted; the same command with the same `--out` continues"),

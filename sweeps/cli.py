@@ -243,8 +243,8 @@ def render() -> None:
     config.FittedRuns,
     group=DATA,
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
-    failure="the fit, or a fit with a block left out, did not converge, or the solver failed at a row. An inadequate "
-    "fit and rows that slide give 0",
+    failure="the fit, or a fit with a block left out, did not converge, or the solver failed for a row. An "
+    "inadequate fit, or a row in which the robot slides, gives 0",
 )
 def calibrate() -> None:
     """Fit parameters to measured runs, with intervals.

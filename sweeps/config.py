@@ -261,15 +261,15 @@ class OneRun(Part):
     )
     supply_voltage_V: float | None = option_field(
         None,
-        "Supply voltage (V), negative backward",
+        "Supply voltage (V), negative in reverse",
         usual="33; for a rig its limit; none with --battery",
         flag="--voltage",
     )
     motor_speed_rpm: float | None = option_field(
-        None, "Motor speed (rpm), negative backward, for rigs with imposed motor speed"
+        None, "Motor speed (rpm), negative in reverse, for rigs with imposed motor speed"
     )
     motor_current_A: float | None = option_field(
-        None, "Current per motor (A), negative backward, for rigs with imposed motor current"
+        None, "Current per motor (A), negative in reverse, for rigs with imposed motor current"
     )
     payload_kg: float | None = option_field(None, "Additional load mass", usual="0")
     slope_deg: float | None = option_field(None, "Slope, positive uphill", usual="0")
@@ -411,7 +411,7 @@ class LoopBeside(FittedRuns):
 
 
 class TurnPart(Part):
-    """Different commands for the two sides of one run. None: the same command."""
+    """Separate commands for the left and right sides of the robot. None: both sides get the same command."""
 
     left_V: Voltage | None = option_field(
         None, "Voltage of the left motor (V). Together with --right, the robot can turn"
@@ -679,7 +679,10 @@ class FeedforwardPart(Part):
     """Constants kS, kV, kA in the place of a robot's parameters."""
 
     feedforward: Literal["simple", "elevator", "arm"] | None = option_field(
-        None, "Fit kS, kV, kA (kG) of this mechanism instead, and feedback gains (docs/howto/wpilib.md)", usual="no"
+        None,
+        "Fit kS, kV, kA (and kG) of this mechanism instead of a robot, and compute feedback gains "
+        "(docs/howto/wpilib.md)",
+        usual="no",
     )
     unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
         None, "Unit of the position in kV and kA, with --feedforward", usual="rotation; for a travel m"

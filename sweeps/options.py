@@ -45,7 +45,7 @@ def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
 
 
 def option_of_field(name: str, fact: Json) -> str:
-    """The option of a field: `--discharge` of `discharge_mAh`."""
+    """Command-line option for a field of the configuration, for example `--discharge` for `discharge_mAh`."""
     stem, _ = split_unit(name)
     return str(fact.get("flag") or "--" + stem.replace("_", "-"))
 

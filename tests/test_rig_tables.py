@@ -610,7 +610,7 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
     assert_allclose(sds[0], sds[1], rtol=1e-9)
     assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
-    with pytest.raises(BadData, match="negative backward; or signed = false"):
+    with pytest.raises(BadData, match="negative in reverse; or signed = false"):
         records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))
     assert records.read_runs(text_file(path, signed), robot=free).layout.instruments[0].signed is True

@@ -158,7 +158,7 @@ def test_samples_that_are_recorded_late_are_sorted_by_their_stamps():
     late = Signal("late", 8, lambda: 10 * time, clock=Clock("c", lambda: time, "s"))
     found, values, notes = one_clock.signals_on_one_grid("log", {"late": late}, lambda c: False, lambda c: True, "")
     assert_array_equal(values["late"], 10 * np.arange(8.0))
-    assert found.tolist() == list(range(8)) and "1 sample of c recorded late" in notes[0]
+    assert found.tolist() == list(range(8)) and "1 sample of c arrived late" in notes[0]
     back = Signal("back", 60, lambda: np.zeros(60), clock=Clock("c", lambda: np.tile(np.arange(30.0), 2), "s"))
     with pytest.raises(BadData, match="log, c: goes back from 29 to 0 s at sample 31"):
         one_clock.signals_on_one_grid("log", {"back": back}, lambda c: False, lambda c: True, "")

@@ -215,7 +215,7 @@ def reverse(model, **options):
     return jax.eval_shape(jax.grad(speed), 24.0)
 
 
-REFUSED = r"derivatives are forward \(jax.jacfwd, jax.jvp\); for jax.grad use model steady, or mmrjax.step for runs"
+REFUSED = r"derivatives are forward \(jax.jacfwd, jax.jvp\)\. For jax.grad use model steady, or mmrjax.step for runs"
 
 
 def test_reverse_mode_is_refused_in_a_sentence_where_a_fidelity_has_none(monkeypatch):

@@ -72,7 +72,7 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     (remark,) = file.remarks
     assert remark.startswith("robot.toml: the robot's sides differ, ") and "(side_radius)" in remark
     assert remark in capsys.readouterr().err.replace("\n", " ")
-    assert "33 V on level ground, it turns: 4W2T by 0.0175 rad/s to the right at 1.31 m/s ahead (--left" in remark
+    assert "33 V on level ground, it turns: 4W2T turns to the right at 0.0175 rad/s and 1.31 m/s (--left" in remark
     assert "6T2A" not in remark  # whose sides are alike
     assert [w.text for w in page.robot_section(file)["warnings"]] == [". ".join(file.remarks)]
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()

@@ -279,7 +279,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         bent = abs(float(twice) - 2 * float(once)) > 1e-6 * abs(float(twice))
         if bent or (float(slope) == 0) != (float(once) == 0):
             raise refuse(
-                ": its term is not linear in its amplitude; expected amplitude times a function of the other signals"
+                ": its term is not proportional to its amplitude; expected amplitude times a function of the signals"
             )
         if not all(math.isfinite(float(jnp.sum(x))) for x in memory_rates):
             raise refuse(": the rate or settled value of its memory is not finite")

@@ -258,8 +258,8 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
 
 
 def _header_settings(name: str, comments: list[str]) -> Json:
-    """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`. Other lines are
-    comments.
+    """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`. Other comment
+    lines are ignored.
     """
     header_settings: Json = {}
     for line in comments:

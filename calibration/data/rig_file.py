@@ -44,7 +44,7 @@ _LEAST = {"mass_kg", *_TRAVEL}  # these must be more than 0
 #: Default values of a robot that starts from nothing, each with its reason. It has no limits and no other losses
 #: (`robots.blank`).
 DEFAULTS: dict[str, tuple[float, str]] = {
-    "motor.inertia": (0.0, "not stated: only the load's inertia counts; time histories from rest need it"),
+    "motor.inertia": (0.0, "not stated: only the load's inertia counts; time histories from rest need the motor's"),
     "battery.current_other": (0.0, "not stated: no other consumers on the battery"),
 }
 #: Time constant L / R of a winding whose inductance is not stated [s]: of small motors 0.05 to 1 ms.

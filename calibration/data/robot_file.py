@@ -74,7 +74,7 @@ CURVE = {"battery.curvature", "battery.slope"}
 #: Switches of a robot, which no fit can free: meaning.
 SWITCHES = {
     "gearbox.mesh_theory": "efficiency 2 - 1/η (gear mesh theory) when the load drives the motor, else η",
-    "driver.returns_current": "supply and driver accept returned current, else a diode blocks it",
+    "driver.returns_current": "supply and driver accept regenerative current (otherwise a diode blocks it)",
 }
 #: Choices by word, which no fit can free: allowed words, meaning.
 CHOICES = {

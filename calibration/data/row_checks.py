@@ -419,7 +419,7 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             hint = alone if layout.crosses_zero else ""
             raise BadData(
                 f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
-                f"{imposed[row]:g} {unit}; expected readings with their signs, negative backward{hint}"
+                f"{imposed[row]:g} {unit}; expected readings with their signs, negative in reverse{hint}"
             )
 
 

@@ -852,9 +852,9 @@ def _check_signs(found: Settled) -> None:
         is_reversed = bool(wrong) and len(wrong) == len(ahead)
         if back and all(s.mean[channel.name] > 0 for s in back) and not is_reversed:
             raise BadData(
-                f"{_place_text(found, back[0], channel)}; expected readings with their signs, negative backward; or "
-                f"set [instruments.{channel.name}] signed = false in the rig's file, if it shows only the "
-                "magnitude"
+                f"{_place_text(found, back[0], channel)}; expected readings with their signs, negative in "
+                f"reverse; or set [instruments.{channel.name}] signed = false in the rig's file, if it shows "
+                "only the magnitude"
             )
         if (is_reversed or (wrong and channel.zero_at_rest)) and not runs.pulled:
             cure = (

@@ -38,7 +38,7 @@ def driven_on(columns: Columns, layout: Layout) -> np.ndarray:
 
 def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
     """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows),
-    negative backward.
+    negative in reverse.
 
     Args:
         columns: columns of a table that turns.

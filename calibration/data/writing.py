@@ -30,13 +30,13 @@ XarrayDataset: TypeAlias = Any
 
 
 def columns_of(result: Any) -> Columns:
-    """Returns the table of a result, by column: of shape (rows,) each.
+    """Returns the table of a result as a dict of columns, each of shape (rows,).
 
     Args:
-        result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
+        result: runs, a dict of columns, or the result of a calibration, a loop or a simulation.
 
     Raises:
-        TypeError: something without a table.
+        TypeError: `result` has no table.
     """
     if isinstance(result, Mapping):
         content = result
@@ -59,7 +59,7 @@ def to_arrow(result: Any) -> ArrowTable:
         result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
 
     Raises:
-        TypeError: something without a table.
+        TypeError: `result` has no table.
     """
     import pyarrow as pa
 
@@ -74,7 +74,7 @@ def to_pandas(result: Any) -> PandasFrame:
         result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
 
     Raises:
-        TypeError: something without a table.
+        TypeError: `result` has no table.
     """
     import pandas as pd
 
@@ -88,7 +88,7 @@ def to_polars(result: Any) -> PolarsFrame:
         result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
 
     Raises:
-        TypeError: something without a table.
+        TypeError: `result` has no table.
     """
     import polars as pl
 
@@ -102,7 +102,7 @@ def to_xarray(result: Any) -> XarrayDataset:
         result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
 
     Raises:
-        TypeError: something without a table.
+        TypeError: `result` has no table.
     """
     import xarray as xr
 

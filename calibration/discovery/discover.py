@@ -803,11 +803,11 @@ def diagnose_base_by_bootstrap(
     freedom: np.ndarray | None = None,
     null: StrongestStatistics | None = None,
 ) -> Diagnosis:
-    """Diagnosis of the base fit, with its own bootstrap.
+    """Diagnosis of the base fit, tested against a bootstrap of this fit.
 
     Args:
         freedom: degrees of freedom of the sd of each channel.
-        null: statistics of bootstrap tables, if already known.
+        null: statistics of the bootstrap replicates. None: they are computed here.
     """
     space, base = screened.base.space, screened.base.candidate
     linear, scores, statistics = screened.diagnosed

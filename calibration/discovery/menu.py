@@ -419,7 +419,7 @@ def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
 
 
 def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
-    """Runs of a load on a shaft, or at imposed speed or current: at other levels and in the other direction."""
+    """Proposed runs for a shaft load, or an imposed speed or current: other levels, torques and direction."""
     others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
     high = round_significant(max(map(abs, levels), default=0.0)) or 1.0

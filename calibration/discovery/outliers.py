@@ -159,11 +159,11 @@ class Screening:
 def compile_ahead(
     space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings
 ) -> Iterator[Callable[[BaseFit], None]]:
-    """Context manager that compiles later programs on other cores during the base fit.
+    """Context manager that compiles programs for later steps, on other cores, during the base fit.
 
-    It compiles a diagnosis, one bootstrap replicate and a fit with slots, all at the prior mean. It yields a function
-    of the base fit that compiles the predictions of experiments or, for long runs, the fits with slots. All results
-    are discarded.
+    To compile them, it runs a diagnosis, one bootstrap replicate and, except for long runs, a fit with slots, all at
+    the prior mean. It yields a function of the base fit that does the same for the predictions of experiments or, for
+    long runs, for the fits with slots. All results are discarded.
     """
     nothing, none = np.zeros(len(space.coordinates)), empty_slots(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)

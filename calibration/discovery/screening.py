@@ -271,9 +271,9 @@ def fit_by_regression(
 def include_likely_effects(
     space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
 ) -> CandidateSpace:
-    """Candidate space whose program includes the effects that are likely to be needed, see `_likely_effects`.
+    """Candidate space whose compiled fits include the effects that are likely to be needed, see `_likely_effects`.
 
-    Unchanged unless the runs are long and the program is not chosen yet.
+    Returns the space unchanged if the model is not a rollout or if these effects have already been chosen.
     """
     if not space.bare.observe.long or space.room:
         return space

@@ -28,7 +28,7 @@ SILENCE = 10.0
 
 @dataclasses.dataclass(frozen=True)
 class PointSupply:
-    """Supply of the motors at each point: battery (1) or external (0), charge taken [C], and adhesion ratio."""
+    """Motor supply and ground at each point: battery (1) or external supply (0), charge drawn [C], adhesion ratio."""
 
     battery: float = 0.0
     discharge: float = 0.0

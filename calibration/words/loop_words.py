@@ -750,7 +750,7 @@ def track_model_answer(found: TrackModelResult) -> str:
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
-    on = "" if found.settled else (". The search has not converged: continue with --members and more --generations")
+    on = "" if found.settled else ". The search has not converged: repeat it with more --generations (see --members)"
     slip = f"rms slip error of the {found.rows} rows on tracks {before:.2g} → {after:.2g} percentage points"
     if not found.gear_explains_discrepancy:
         why = f". Outside their priors: {', '.join(found.outside)}" if found.outside else ""
@@ -891,7 +891,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "kept_out": sentence_on_unused_rows,
     "phases_differ": "the phase of the wave differs between runs, so robot.toml contains the mean phase. The wave "
     "explains {free:.0f} σ² with a free phase in each run, and {held:.0f} σ² with a common phase. Start every run "
-    "with the shaft at a mark",
+    "with the shaft at the same angle",
     "still_lacks": lambda place, variable: (
         f"the {bases.place_in_words(place)} still has an unexplained error, which varies with the "
         f"{bases.variable_in_words(variable)}"

@@ -168,7 +168,7 @@ SAID: dict[str, str | Callable[..., str]] = {
             "compliant "
             f'coupling, perhaps with backlash. Set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
             if stiffness
-            else f"at each of {reversals} reversals about {width:.2g} {unit} of motion are lost. Friction, inertia "
+            else f"at each of {reversals} reversals about {width:.2g} {unit} of motion is lost. Friction, inertia "
             f'and delay do not explain this, but backlash or a compliant coupling does. Set backlash = "{angle:.2g} '
             '± 30 %" (rad'
         )
@@ -182,7 +182,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "thinned": "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time, and the imposed "
     "quantity of all rows. Change the number with --rows, or use settle, which takes all rows",
     "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers "
-    "refer to these. Change the number with --rows",
+    "refer to the rows used. Set how many are used with --rows",
     "coarse_steps": lambda lasts, step: (
         f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Ripple of a shaft with a period below "
         "about ten steps is not resolved. Use shorter runs to look for it"

@@ -84,7 +84,7 @@ def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = N
     """Masses of half a robot with its levers at the angles of the conditions.
 
     Args:
-        mass: total mass with payload [kg]. None: as stated.
+        mass: total mass with payload [kg]. None: total mass of the conditions, or else robot mass plus payload.
     """
     if mass is None:
         total_mass = robot.chassis(conditions.configuration).mass + conditions.payload

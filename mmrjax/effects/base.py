@@ -51,7 +51,7 @@ class Effect(eqx.Module):
     Attributes:
         name: its name in files and reports. By default made from the class name, `MassError` as `mass_error`.
         balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has. Has no default. A
-            positive term is a loss: a voltage drop, a loss torque, a resisting force, a lost speed. In `mass`,
+            positive term is a loss: a voltage drop, a loss torque, a resisting force, a loss of speed. In `mass`,
             `inertia` and `inductance` it adds. In `sensor` it adds to the reading of `channel`, which may be a
             magnitude.
         driver: the quantity that its term changes with: `speed`, `current`, `load`, ..., `direction` for the

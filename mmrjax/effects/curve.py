@@ -260,7 +260,7 @@ def _wave_class(place: str) -> type[Effect]:
         amplitude: Scalar = _size(unit, size)
         phase: Scalar = phase_parameter()
         order_shaft: Scalar = parameter(
-            1.0, "-", "waves a turn of the driving pulley or wheel k", (0.01, 1000.0), "the order that the data show",
+            1.0, "-", "waves per turn of driving pulley or wheel k", (0.01, 1000.0), "the order that the data show",
             relative_sd=0.01,
         )  # fmt: skip
         y_sin: Scalar = _ordinate()

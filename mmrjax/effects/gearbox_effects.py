@@ -142,13 +142,13 @@ class BristleLoadLoss(Bristle, GearboxEffect):
 class BristleBackdrivingLoss(Bristle, GearboxEffect):
     """ΔM_r = a (|M_load| z - M_load z²) / 2, θ_s z' = ω_k - |ω_k| z, z(0) = 0.
 
-    Teeth lose a larger or smaller share of the load while it drives the motor, through the bristle of
+    While the load drives the motor, teeth lose a larger or smaller share of it than otherwise, through the bristle of
     `bristle_load_loss`.
 
     Source: Duclusaud, Passault, Padois and Ly (2024, arXiv:2410.08650): directional models in which motor and load
     each have a share of friction. Dahl (1968). Settled z = sign ω_k: it then equals `backdriving_loss`, 0 if the
-    motor drives the load and a |M_load| if the load drives the motor. Reversals under load distinguish the two. See
-    `bristle_load_loss` for the sum of both.
+    motor drives the load and a |M_load| if the load drives the motor. Reversals under load distinguish it from
+    `backdriving_loss`. See `bristle_load_loss` for the sum of that effect and this one.
     """
 
     driver = "load"

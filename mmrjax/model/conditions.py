@@ -87,7 +87,7 @@ class Conditions(eqx.Module):
         adhesion: adhesion of this surface, as a ratio to that of the surface the robot's friction is stated for [-].
         total_mass: weighed mass of robot and payload [kg]. None: the robot's own mass plus the payload.
         order: place in the sequence of runs. Drifts from run to run depend on it [-].
-        duty: share of the supply voltage that the driver applies to the motors, negative backward [-]. None: 1.
+        duty: share of the supply voltage that the driver applies to the motors, negative in reverse [-]. None: 1.
         open: 1 if the motors' circuit is open, so that they coast, -1 if the driver shorts it, so that they brake at
             any duty.
         motor_speed: speed imposed on the motor shafts [rad/s]. The voltage follows. None: the voltage is imposed.

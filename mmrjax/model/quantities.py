@@ -524,7 +524,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             resolution=2, ignores=(SLOPE,),
         ),
         Quantity(
-            "peak_current", "A", "peak current of the start, all motors", group=f"{_DERIVED}start_figures",
+            "peak_current", "A", "peak starting current, all motors", group=f"{_DERIVED}start_figures",
             resolution=2, rests_on=CURRENT,
         ),
         Quantity("time_to_speed", "s", "time to 95 % of speed", group=f"{_DERIVED}start_figures"),

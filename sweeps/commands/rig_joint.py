@@ -140,7 +140,7 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict
 
 
 def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:
-    """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]. None: no weight.
+    """Amplitude M [N·m] and rest angle θ_0 [rad] of the gravity torque -M sin(θ - θ_0). None: M is negligible.
 
     Args:
         torque, torque_quarter: torques of gravity about the axis at θ = 0 and at a quarter turn [N·m].

@@ -28,7 +28,7 @@ from sweeps.export.situation import ComparisonRuns, JointResult, situation_of_jo
 FORMATS = {
     "mujoco": "MJCF with <dcmotor>, and a runnable scene",
     "jax": "an actuator function in JAX, as source and as a serialised program",
-    "onnx": "the same step as an ONNX model, for Isaac Lab, Unity or C++",
+    "onnx": "an ONNX model of one time step, for Isaac Lab, Unity or C++",
     "mjlab": "an actuator configuration for law_source, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
     "randomization": "samples from the posterior, as parameters of MuJoCo and of the actuator",

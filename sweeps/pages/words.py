@@ -43,8 +43,8 @@ STATUSES: dict[str, StatusWords] = {
     ),
     "tips": StatusWords(
         "tips over",
-        "the robot turns over: its centre of mass is not above the contacts, or its own motion throws it over",
-        "the robot turns over: its centre of mass is not above the contacts, or its own motion throws it over",
+        "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
+        "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
     ),
     "reverses": StatusWords(
         "reverses", "steady travel backward", "found a steady operating point, travelling backward"

@@ -21,7 +21,7 @@ from sweeps.report.document import Block, Document, Note, Section, Table, remark
 
 
 def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
-    """The report of a calibration of a robot of that name or file."""
+    """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
     chi, about = found.chi_square, found.identifiability
     estimated = "" if chi.tests_adequacy else catalogue.text("calibration.estimated")
@@ -98,7 +98,7 @@ def _shifts(found: CalibrationResult) -> Iterable[Block]:
 
 
 def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
-    """Simulated readings over time, over the measured ones, and their errors over each condition."""
+    """Sections: histories over time, simulated against measured readings, residuals over each condition."""
     table = found.rows()
     table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
     answer, panels = fit_words.calibration_answer(found), found.channels

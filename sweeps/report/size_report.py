@@ -52,7 +52,7 @@ class SizeResult:
                 if nearest
                 else ""
             )
-            return f"No design of these parts meets the requirements.{why}{left_out}"
+            return f"No design with these parts meets the requirements.{why}{left_out}"
         missing = [requirement_label(o) for o in self.outcomes if not (o.met or requirement_label(o) in s.unmeetable)]
         binds = f" Binding limits: {', '.join(s.best.binds) or 'none'}."
         binds += f" It misses {', '.join(missing)}." if missing else ""
@@ -121,7 +121,7 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
         f"{s.starts} searches evaluated {s.evaluated:,} designs."
     )
     best = () if s.best is None else (s.best, *s.alternatives)
-    about = _DESIGNS if best else "No design of these parts meets the requirements."
+    about = _DESIGNS if best else "No design with these parts meets the requirements."
     tables = _table("best", found, best), requirements_sheet(found.outcomes, terminal=False)
     motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
     return Document(

@@ -170,7 +170,7 @@ def signals_on_one_grid(
         unit, period = read[key].unit, read[key].period
         if key in late:
             notes.append(
-                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late. They are sorted by time "
+                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} arrived late. Samples are sorted by time "
                 "stamp"
             )
         if period:

@@ -1015,7 +1015,7 @@ def _check_signs(runs: Runs) -> None:
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
                         f"{runs[channel.column][rows[0]]:g} {channel.unit} at "
                         f"{volts[rows[0]]:g} {unit}; "
-                        "expected readings with a sign, negative backward; or state [instruments."
+                        "expected readings with a sign, negative in reverse; or state [instruments."
                         f"{channel.name}] signed = false in the robot's file, if it shows the magnitude only"
                     )
 

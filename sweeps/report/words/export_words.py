@@ -254,9 +254,10 @@ def law_text(found: Export) -> str:
     bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
     origin = escape_markdown(f"{drive.file.name}, {drive.configuration}")
     return f"""# The law of this drive
-A motor with its gearbox on one joint: {origin}. A program, mmrjax {__version__},
-found its numbers from measurements or data sheets, and wrote it as {FORMATS[found.format]}. You need no other file of
-that program. All units are SI. The joint is the driven wheel or output shaft.
+A motor with its gearbox on one joint: {origin}. The program mmrjax {__version__}
+obtained the parameters of this drive from measurements or data sheets, and exported the drive as
+{FORMATS[found.format]}. You need no other file of that program. All units are SI.
+The joint is the driven wheel or output shaft.
 
 ## How to use it
 {USE[found.format].format(**about)}{command_sentence(found)}
