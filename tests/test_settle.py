@@ -259,7 +259,7 @@ WRONG = {
     "a current without sign": (
         dict(total_current_A=np.abs),
         r"rows 4\d\d to 600, total_current_A: shows 0\.6 A at -6 V; expected readings with their signs, negative "
-        r"backward; or set \[instruments\.total_current\] signed = false",
+        r"in reverse; or set \[instruments\.total_current\] signed = false",
     ),
     "a speed turned round": (
         dict(motor_speed_rpm=lambda x: -x),

@@ -72,7 +72,10 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     (remark,) = file.remarks
     assert remark.startswith("robot.toml: the robot's sides differ, ") and "(side_radius)" in remark
     assert remark in capsys.readouterr().err.replace("\n", " ")
-    assert "33 V on level ground, it turns: 4W2T turns to the right at 0.0175 rad/s and 1.31 m/s (--left" in remark
+    turning = (
+        "33 V on both sides on level ground, the robot does not travel straight: 4W2T turns to the right at 0.0175"
+    )
+    assert f"{turning} rad/s and 1.31 m/s (--left" in remark
     assert "6T2A" not in remark  # whose sides are alike
     assert [w.text for w in page.robot_section(file)["warnings"]] == [". ".join(file.remarks)]
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()
@@ -82,7 +85,7 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
                            "a turn")  # fmt: skip
     document = Document("a", "b.", (), (Section("c", ()),))
     warned = page_renderer.write_report_page(tmp_path, document, file).read_text("utf-8")
-    assert 'id="robot-warning"' in warned and "33 V on level ground, it turns: 4W2T" in warned
+    assert 'id="robot-warning"' in warned and turning in warned
     found.reading["yaw_rate"] = [0.0, 0.0]
     assert of_file(tmp_path, SIDE_RADIUS).remarks == ()
 
