@@ -1,5 +1,6 @@
 """What is installed works without the repository, and says what it is."""
 
+import importlib.metadata
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ import venv
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 import mmrjax as mm
 
@@ -40,6 +42,16 @@ def test_dockerfile_has_the_program_s_python_and_copies_what_it_needs():
     assert f"python:{PROJECT['requires-python'].removeprefix('>=')}" in text and 'ENTRYPOINT ["mmrjax"]' in text
     away = (ROOT / ".dockerignore").read_text("utf-8").split()
     assert not {"mmrjax", "calibration", "sweeps", "pyproject.toml", "requirements.lock", "README.md"} & set(away)
+
+
+def test_every_pin_installs_on_the_oldest_python_that_is_promised():
+    """Also on its first patch release, which distributions ship for years."""
+    oldest = f"{PROJECT['requires-python'].removeprefix('>=')}.0"
+    pins = re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "requirements.lock").read_text("utf-8"), re.M)
+    about = {d.name: d for d in importlib.metadata.distributions()}
+    pinned = [about[name] for name, version in pins if name in about and about[name].version == version]
+    pythons = {d.name: SpecifierSet(d.metadata.get("Requires-Python", "")) for d in pinned}
+    assert pythons and [name for name, needed in pythons.items() if not needed.contains(oldest)] == []
 
 
 def test_hosted_checks_run_targets_that_there_are_and_name_no_address():
