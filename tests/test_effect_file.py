@@ -182,7 +182,7 @@ REFUSED = {
         r"derivatives of its term are not finite at rest, where drive and track start",
     ),
     "there at zero": (GOOD.replace("self.amplitude *", "0.1 +"), r"its term is 1\.1 at amplitude 0"),
-    "not linear": (GOOD.replace("self.amplitude *", "self.amplitude**2 *"), r"its term is not linear"),
+    "not linear": (GOOD.replace("self.amplitude *", "self.amplitude**2 *"), r"its term is not proportional"),
     "no gradient": (
         GOOD.replace("self.amplitude *", "abs(self.amplitude)**0.5 *"),
         r"derivative of its term at amplitude 0 is (nan|inf|-inf)",
