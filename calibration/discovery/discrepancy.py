@@ -47,7 +47,6 @@ INDIRECT = 6.0
 #: Balances of torques and slip.
 MECHANICAL = ("track", "ground", "slip")
 #: Largest number of instants among which the ends of a window are chosen.
-#: Most instants between which the ends of a window are looked for.
 INSTANTS = 200
 #: Difference of the scores of two balances' best curves up to which they cannot be separated [normal deviate].
 ALIKE = 1.0
@@ -83,36 +82,35 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     j = k if for_a_while else max(place_columns, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
-        evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
-        direct = [i for i in smoothly if names[i][1] != "voltage"] if place in MECHANICAL else smoothly
-        j = max(direct or smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
+        direct = [i for i in smoothly if place not in MECHANICAL or names[i][1] != "voltage"]
+        evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in direct or smoothly}
+        j = max(evidence, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
     variable, strength = names[j][1], float(explained[j])
-    similar = [b for b, d in best.items() if d > deviate[k] - ALIKE]
-    alike = [(b, *_balances_of_same_response(left.linear, b)) for b in similar]
+    alike = _places_of_same_response(left.linear, [b for b, d in best.items() if d > deviate[k] - ALIKE])
     happening = bases_room.window_from_name(variable)
     if happening is not None and happening.axis in bases_room.AXES:
         happening, strength = refine_window(left.linear, place, happening.axis, included)
         variable = str(happening)
     strongest = max(strength, float(explained[k]))
     also = similar_variables(names, deviate, place, variable)
-    return DiscrepancyLocation(place, variable, tuple(itertools.chain(*alike)), also, strength, strongest)
+    return DiscrepancyLocation(place, variable, alike, also, strength, strongest)
 
 
-def _balances_of_same_response(linear: Linearization, place: str) -> Names:
-    """Balances without curves of their own whose errors change the readings as an error of this place does.
+def _places_of_same_response(linear: Linearization, similar: Sequence[str]) -> Names:
+    """Places, each followed by the balances without curves of their own whose errors change the readings alike.
 
     A loss in the gearbox is like one of the load, unless a channel shows the output torque. It is then like an error
     of the ammeter if the speed is imposed.
     """
-    without_curves = tuple(itertools.chain(*bases_room.STANDS_FOR.values()))
-    errors = np.ones((linear.points, 1))
-    mine, *others = (bases_room.place_signature(linear, p, errors)[:, 0] for p in (place, *without_curves))
-    norms = [float(np.linalg.norm(mine) * np.linalg.norm(other)) for other in others]
-    pairs = zip(without_curves, others, norms, strict=True)
-    return tuple(b for b, other, norm in pairs if abs(mine @ other) > PARALLEL * norm)
+    without_curves, errors = tuple(itertools.chain(*bases_room.STANDS_FOR.values())), np.ones((linear.points, 1))
+    responses = np.stack([bases_room.place_signature(linear, p, errors)[:, 0] for p in (*similar, *without_curves)])
+    responses /= np.maximum(np.linalg.norm(responses, axis=1, keepdims=True), 1e-300)
+    alike = np.abs(responses[: len(similar)] @ responses[len(similar) :].T) > PARALLEL
+    pairs = zip(similar, alike, strict=True)
+    return tuple(itertools.chain(*((p, *itertools.compress(without_curves, row)) for p, row in pairs)))
 
 
 def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str) -> Names:
