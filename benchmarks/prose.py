@@ -14,7 +14,7 @@ import argparse
 import ast
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +66,10 @@ def _docstrings(tree: ast.AST) -> Iterator[str]:
     yield from (text for node in ast.walk(tree) if isinstance(node, kinds) and (text := ast.get_docstring(node)))
 
 
-def _strings(trees: Iterable[ast.AST]) -> Iterator[str]:
+def _strings(trees: Iterable[ast.AST], aside: Collection[int] = ()) -> Iterator[str]:
     for tree in trees:
         for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in aside:
                 yield node.value
 
 
@@ -79,8 +79,7 @@ def program_texts(tree: ast.AST) -> list[str]:
     aside = {id(x) for n in errors for x in ast.walk(n)} | {
         id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)
     }
-    nodes = (n for n in ast.walk(tree) if isinstance(n, ast.Constant) and id(n) not in aside)
-    return [n.value for n in nodes if isinstance(n.value, str)]
+    return [*_strings([tree], aside)]
 
 
 def semicolons(texts: Iterable[str]) -> float:
@@ -113,19 +112,15 @@ def texts_by_kind(root: Path) -> dict[str, list[str]]:
 
 def figures(root: Path = ROOT) -> dict[str, float]:
     """Each figure of `CEILINGS`."""
-    result = {}
-    for kind, texts in texts_by_kind(root).items():
+    result, by_kind = {}, texts_by_kind(root)
+    for kind, texts in by_kind.items():
         every = [sentence for text in texts for sentence in sentences(text)]
         result[kind] = 100 * sum(map(is_flagged, every)) / max(len(every), 1)
     trees = {name: [ast.parse(p.read_text("utf-8")) for p in (root / name).rglob("*.py")] for name in PACKAGES}
     written = [text for each in trees.values() for tree in each for text in _docstrings(tree)]
     result["semicolons"] = semicolons(written)
-    result["chains"] = semicolons(
-        [
-            *texts_by_kind(root)["templates"],
-            *(s for each in trees.values() for tree in each for s in program_texts(tree)),
-        ]
-    )
+    programs = (s for each in trees.values() for tree in each for s in program_texts(tree))
+    result["chains"] = semicolons([*by_kind["templates"], *programs])
     return result | {name: empty_names(each) for name, each in trees.items()}
 
 
