@@ -107,11 +107,12 @@ def noise_of_angle(readings: np.ndarray) -> float:
 
 
 def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> tuple[np.ndarray, int]:
-    """Angle [rad], speed, acceleration and slope of the line to the next speed at `times`, shape (4, times), by a
-    spline that leaves the noise alone, and the number of its knots.
+    """Motion at `times` on a smoothing spline, shape (4, times), and the number of the spline's knots.
 
-    It has the fewest knots with which readings are off by their noise, at least that of the display's step if most
-    readings repeat others. At a jump of the torque, knots crowd, so that the acceleration jumps within a few samples.
+    The motion is the angle [rad], the speed, the acceleration, and the slope of the line to the next speed. The
+    spline has the fewest knots with which readings are off by their noise. This noise is at least that of the
+    display's step if most readings repeat others. At a jump of the torque, knots crowd, so that the acceleration
+    jumps within a few samples.
     """
     noise, steps = noise_of_angle(angle), np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
@@ -119,8 +120,8 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that more knots would be needed, for readings without noise
         curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
-        speed = curve.derivative(1)(times)
-        lines = np.diff(speed) / np.diff(times)
+    speed = curve.derivative(1)(times)
+    lines = np.diff(speed) / np.diff(times)
     return np.stack([curve(times), speed, curve.derivative(2)(times), [*lines, lines[-1]]]), len(curve.get_knots())
 
 
@@ -138,8 +139,9 @@ def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays
 
 
 def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray, int]:
-    """`smoothed_motion` of all joints at each row of a log, shape (4, rows, joints), by splines of degree 5 and of
-    degree 3, and the largest number of knots of a joint at degree 5.
+    """`smoothed_motion` of all joints at each row of a log, by splines of degree 5 and of degree 3.
+
+    Both have the shape (4, rows, joints). The largest number of knots of a joint at degree 5 follows.
 
     Raises:
         BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. As
@@ -207,7 +209,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         angle, speed, acceleration, lines = motion[:, :, k]
         ratio = float(robot.gearbox.ratio)
         per_ampere = ratio * float(robot.gearbox.efficiency_load * robot.motor.torque_constant)
-        rotor = ratio * per_ampere * float(robot.motor.inertia / robot.motor.torque_constant)
+        rotor = ratio**2 * float(robot.gearbox.efficiency_load * robot.motor.inertia)
         inertial = float(load.inertia) * lines + rotor * (lines - acceleration)
         columns = {
             LOAD: torques[:, k] - inertial - np.asarray(load.torque_load(angle)),
