@@ -226,8 +226,7 @@ def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signal
 
     Returns:
         Signals that a term of the left side may read while the robot climbs and turns left, all signals at that
-        point, and
-        the signals that a term may read at rest.
+        point, and the signals that a term may read at rest.
     """
     robot = paper_robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)

@@ -68,12 +68,12 @@ def split_values_and_sds(table: Json, where: str, prefix: str = "") -> dict[str,
 
 def is_example(line: str) -> bool:
     """True if a line of a rig's file is marked as an example and has a template's number."""
-    return EXAMPLE in line and not line.startswith("#") and _number_of_line(line) in _template_numbers()
+    return EXAMPLE in line and _number_of_line(line) in _template_numbers()
 
 
 def has_template_number(line: str) -> bool:
     """True if a line has the name and number of a template's example, marked or not. 0 and 1 may be anyone's."""
-    number = None if line.startswith("#") else _number_of_line(line)
+    number = _number_of_line(line)
     return number is not None and number[1] not in (0.0, 1.0) and number in _template_numbers()
 
 
@@ -103,5 +103,6 @@ def _template_numbers() -> frozenset[tuple[str, float] | None]:
 
 
 def _number_of_line(line: str) -> tuple[str, float] | None:
+    """Name and number of a line. None for other lines, also for comments."""
     match = re.match(r'(\w+) = "?([-+.\deE]+)', line)
     return None if match is None else (match[1], float(match[2]))
