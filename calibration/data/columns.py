@@ -142,19 +142,19 @@ class Layout:
         return cls(*choices, robot.channels, supply)
 
     @property
-    def table8(self) -> bool:
+    def uses_paper_conditions(self) -> bool:
         """True if the robot is driven as the paper's robot, so that the conditions of Table 8 apply."""
         return self.inherits and self.has_ground and self.imposed == "voltage"
 
     @property
     def complete(self) -> bool:
         """True if tables must contain every condition. Otherwise a missing condition has its usual value."""
-        return self.table8
+        return self.uses_paper_conditions
 
     @property
     def crosses_zero(self) -> bool:
         """True if readings may cross zero. Errors are then relative to a channel's size and not to the reading."""
-        return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
+        return not self.uses_paper_conditions or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @functools.cached_property
     def idle(self) -> Names:

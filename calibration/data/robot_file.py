@@ -472,7 +472,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
         tables[f"effects.{effect.name}"] = _lines_of_effect(effect)
     for title, line in _lines_of_parameters(robot, nothing):
         tables.setdefault(title, []).append(line)
-    for title, line in _lines_of_ratings(robot, nothing, {name for name, lines in tables.items() if lines}):
+    for title, line in _rating_lines(robot, nothing, {name for name, lines in tables.items() if lines}):
         tables.setdefault(title, []).append(line)
     lines = [f"# {printable(line)}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if inherits else rig_file.NONE}"']
@@ -520,7 +520,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         yield table, f"{line}{origin}" if inherits else line
 
 
-def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
+def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
     """Table and line of each rating, switch and choice that differs from the base robot.
 
     Args:

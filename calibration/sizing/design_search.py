@@ -291,7 +291,7 @@ def size_robot(
     tell(progress_remark("refined", REFINED))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(search.cost(real))[:REFINED]
-    free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
+    free = free + search.refined(real.rows[top], real.x[top], search.first_objective_weights(len(top)), np.ones(3))
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
     def found(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
@@ -375,7 +375,7 @@ class _DesignSearch:
         """Designs with their objectives and margins."""
         return _EvaluatedDesigns(rows, x, *evaluate_designs(self.problem, self.choice, rows, x))
 
-    def first(self, count: int) -> np.ndarray:
+    def first_objective_weights(self, count: int) -> np.ndarray:
         """Weights of only the first objective, shape (count, objectives)."""
         return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
 
@@ -392,7 +392,7 @@ class _DesignSearch:
 
     def cost(self, designs: _EvaluatedDesigns) -> np.ndarray:
         """Cost by the first objective, shape (designs,)."""
-        return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
+        return _cost(designs.f, designs.g, self.kept, self.first_objective_weights(len(designs.rows)))
 
     def misses(self, drawn: _EvaluatedDesigns) -> np.ndarray:
         """Total violation of the limits that can be met, shape (designs,)."""

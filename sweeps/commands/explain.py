@@ -196,7 +196,7 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
             yield "" if k else "on a bench", test
 
 
-def _condition_lines(name: str, library: Library) -> Iterator[Line]:
+def _operating_condition_lines(name: str, library: Library) -> Iterator[Line]:
     if label := next((label for label in quantities.LABELS if label.name == name), None):
         yield "is", label.label
         yield "column", label.column
@@ -282,7 +282,7 @@ EXPLAINED: dict[str, Explain] = {
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,
-    "condition": _condition_lines,
+    "condition": _operating_condition_lines,
     "word of the reports": _explain_by_table(
         {k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}
     ),

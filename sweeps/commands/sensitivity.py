@@ -128,12 +128,12 @@ def _operating_points(
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
         raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
-    table8: dict[str, tuple[float, ...]] = {}
-    if layout.table8:
-        table8 = CORNERS if config.method in ("sobol", "morris") else WHOLE
+    usual_axes: dict[str, tuple[float, ...]] = {}
+    if layout.uses_paper_conditions:
+        usual_axes = CORNERS if config.method in ("sobol", "morris") else WHOLE
         if not set(OF_TURNS).isdisjoint(ranges):  # which settle on level ground alone
-            table8 = {**table8, "slopes_deg": (0.0,)}
-    axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+            usual_axes = {**usual_axes, "slopes_deg": (0.0,)}
+    axes = {key: getattr(config, key) or usual_axes.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
         ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
         imposed.check_acting(robot, ground, shaft)
@@ -194,7 +194,7 @@ def _candidate_runs(config: configuration.Sensitivity, robot: Robot, points: Run
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source
-    elif turns or not Layout.of(robot).table8:
+    elif turns or not Layout.of(robot).uses_paper_conditions:
         runs, source = points, "the operating points"
     else:
         runs = grid_conditions(GridPart(surface=config.surface), robot)

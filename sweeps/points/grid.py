@@ -55,11 +55,11 @@ def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str
     elif getattr(config, own_axis) is None:
         update[own_axis] = imposed.imposed_levels(robot, OPTIONS[own_axis], notes)
     if robot.has_ground:
-        table8 = robot.rig.inherits
+        inherits = robot.rig.inherits
         update |= {
-            "payloads_kg": config.payloads_kg or (PAYLOADS_KG if table8 else (0.0,)),
-            "slopes_deg": config.slopes_deg or (SLOPES_DEG if table8 else (0.0,)),
-            "surface": config.surface or (BENCH if table8 else None),
+            "payloads_kg": config.payloads_kg or (PAYLOADS_KG if inherits else (0.0,)),
+            "slopes_deg": config.slopes_deg or (SLOPES_DEG if inherits else (0.0,)),
+            "surface": config.surface or (BENCH if inherits else None),
         }
     return config.model_copy(update=update)
 

@@ -65,7 +65,7 @@ def imposed_default(robot: Robot, option: str) -> float:
     Raises:
         BadConfiguration: the file states none.
     """
-    if Layout.of(robot).table8:
+    if Layout.of(robot).uses_paper_conditions:
         return VOLTAGE
     most = imposed_limit(robot)
     if most is None:
@@ -90,7 +90,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     Raises:
         BadConfiguration: the file states none.
     """
-    if Layout.of(robot).table8:
+    if Layout.of(robot).uses_paper_conditions:
         return VOLTAGES_V
     most = imposed_limit(robot)
     if most is None:

@@ -164,7 +164,7 @@ class Design:
         """Number of points."""
         return math.prod(self.shape)
 
-    def block(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
+    def values_in_slices(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
         """Values of the points of a box, a row a point, in the order of `names`. Laid out a column a name."""
         sizes = tuple(b.stop - b.start for b in box)
         values = np.empty((len(self.names), *sizes))
@@ -180,7 +180,9 @@ class Design:
     def at(self, numbers: Int[np.ndarray, " points"]) -> Float[np.ndarray, "points names"]:
         """Values of single points by their number, the last dimension fastest, for few points."""
         places = np.array(np.unravel_index(np.asarray(numbers), self.shape)).T
-        return np.concatenate([self.block(tuple(slice(i, i + 1) for i in map(int, place))) for place in places])
+        return np.concatenate(
+            [self.values_in_slices(tuple(slice(i, i + 1) for i in map(int, place))) for place in places]
+        )
 
 
 @dataclasses.dataclass(frozen=True)

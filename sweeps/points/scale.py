@@ -125,7 +125,7 @@ class Compiled:
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
         """Values of a chunk's points, the last ones repeated up to the compiled shape."""
-        values = self.job.plan.design.block(self.job.blocks.box(chunk))
+        values = self.job.plan.design.values_in_slices(self.job.blocks.box(chunk))
         if len(values) == self.size:
             return values
         return values[np.minimum(np.arange(self.size), len(values) - 1)]

@@ -124,7 +124,7 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
         rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
-        values.append(layout.design.block(box)[rows])
+        values.append(layout.design.values_in_slices(box)[rows])
         for variable in layout.variables:
             values_by_name[variable.name].append(group[variable.name][box].ravel()[rows])
     return np.concatenate(values), {name: np.concatenate(parts) for name, parts in values_by_name.items()}
