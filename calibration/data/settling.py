@@ -690,7 +690,7 @@ def _reading_size(shown: np.ndarray) -> float:
 
 
 def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
-    """A level in parts of a third of the shortest stretch and at least `PART` samples. The last three form a stretch."""
+    """Parts of a level: a third of the shortest stretch, at least `PART` samples. The last three form a stretch."""
     size = max(shortest / 3, float(time[-1] - time[0]) / 300)
     part = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are complete
     edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(time)]
@@ -758,7 +758,7 @@ def _correlation_time(x: np.ndarray) -> float:
 
 
 def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
-    """Mean of a channel over a stretch, the sd of that mean, and the change over the stretch by a straight-line fit."""
+    """Mean of a channel over a stretch, the sd of this mean, and the change along a straight-line fit."""
     readings = signal.shown[rows]
     finite = np.isfinite(readings)
     if finite.sum() < max(FEWEST, 0.5 * signal.filled * len(rows)):
