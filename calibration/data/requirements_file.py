@@ -49,7 +49,8 @@ class Envelope:
 
     Attributes:
         configuration: name of the configuration. Empty: the first one of the robot.
-        surface: surface of Table 5. battery: on the battery, else on the external supply.
+        surface: surface of Table 5.
+        battery: True on the battery, False on the external supply.
         payload_kg, slope_deg, state_of_charge, supply_voltage_V: ranges, units as named.
         ambient_C: ambient temperature [°C]. None: that of the robot.
     """

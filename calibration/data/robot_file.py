@@ -167,9 +167,9 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
         parameters: parameters in SI units, in tables by dotted name, e.g. `[motor] resistance = 0.9`, or with the sd
-        of their prior, `"0.9 ± 5 %"`. The sd is wider as long as the number is that of a template. Also RATINGS,
-        SWITCHES (true or false) and CHOICES. effects: an effect is present if the file has its table
-        `[effects.NAME]`. The table may name the
+            of their prior, `"0.9 ± 5 %"`. The sd is wider as long as the number is that of a template. Also RATINGS,
+            SWITCHES (true or false) and CHOICES.
+        effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
 

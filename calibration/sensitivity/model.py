@@ -264,8 +264,7 @@ def _derivatives(
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
-    """Jacobian of all points. One tangent per column suffices, because the outputs of a point depend only on its row.
-    """
+    """Jacobian of all points. One tangent per column suffices, since outputs of a point depend only on its row."""
 
     def numbers(values: Array) -> tuple[dict[str, Array], Array]:
         made = _outputs(variation, source, options, names, values, conditions)

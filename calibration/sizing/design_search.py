@@ -499,8 +499,7 @@ def _refine_designs(
 def _nearest_buildable(
     choice: ChoiceSpace, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Designs near the given ones with gear ratios from data sheets and whole cells: the two nearest values of each.
-    """
+    """Designs near the given ones with gear ratios from data sheets and whole cells: the two nearest of each."""
     made: dict[tuple, tuple] = {}
     for k in order:
         drive = choice.options.drives[choice.drive[rows[k]]]

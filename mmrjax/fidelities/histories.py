@@ -353,8 +353,9 @@ class _StepPart(eqx.Module):
             still holds the shaft, and the remaining part.
         begin: unknowns at its start.
         lag: lag of the current at its start.
-        since, length: start and length of the part [s]. side, then: direction in which a shaft turns, and after it
-        has waited. before, stages, end: see `RunStates`.
+        since, length: start and length of the part [s].
+        side, then: direction in which a shaft turns, and after it has waited.
+        before, stages, end: see `RunStates`.
     """
 
     turn: Array
