@@ -212,8 +212,8 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
     if battery:
         imposed.check_battery(robot)
     elif column not in cell_values:
-        rest = 0.0 if column in elsewhere else None
-        cell_values[column] = imposed.imposed_default(robot, OPTIONS[column]) if rest is None else rest
+        default = 0.0 if column in elsewhere else None
+        cell_values[column] = imposed.imposed_default(robot, OPTIONS[column]) if default is None else default
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}

@@ -85,10 +85,10 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     inner = rows[1:-1] if len(rows) > 4 else rows
     if not np.isfinite(usual) or (np.abs(inner - rows_per_stamp) > 1).mean() > ODD:
         return time, 0.0
-    apart = np.where(np.isfinite(step), step, usual) / rows
-    apart = np.minimum(apart, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)
+    row_step = np.where(np.isfinite(step), step, usual) / rows
+    row_step = np.minimum(row_step, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)
     index = np.arange(len(time)) - np.repeat(begins, rows)
-    return np.repeat(stamps, rows) + index * np.repeat(apart, rows), float(rows.mean())
+    return np.repeat(stamps, rows) + index * np.repeat(row_step, rows), float(rows.mean())
 
 
 #: Day assumed for a time without a date, and length of a day [s].

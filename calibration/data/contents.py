@@ -203,14 +203,14 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     row_signals = [s for s in signals if s.clock is None and not s.refused]
     time_signal = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
     clock = time_signal or next((s for s in row_signals if _is_rising_count(s)), None)
-    rest = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
+    other_signals = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
         unit = _unit_of_time(clock.name) or ("s" if clock.words else one_clock.guessed_unit(clock.load()))
         elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
         line = f'time_{unit} = "{clock.path}"'
         if time_signal is None and elapsed is not None:
-            seconds_per_unit = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
+            seconds_per_unit = proposals.seconds_per_count(other_signals, np.asarray(clock.load(), float))
             question = f"compared with a position, it counts {1 / seconds_per_unit:.3g} per second"
             if math.isnan(seconds_per_unit):
                 seconds_per_unit, question = UNITS[unit], "unit of the counts? give the seconds per count"
@@ -230,7 +230,7 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         clock_seconds = _seconds(signal.clock)
         return None if isinstance(clock_seconds, str) else clock_seconds[0]
 
-    yield from proposals.propose_columns(rest, spelled, seconds)
+    yield from proposals.propose_columns(other_signals, spelled, seconds)
 
 
 def _is_rising_count(signal: Signal) -> bool:

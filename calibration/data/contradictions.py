@@ -124,19 +124,23 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
         return
     voltage = runs[column]
     back = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
-    along = np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back)
+    voltage_forward = (
+        np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back)
+    )
     if column == SUPPLY and (voltage > 0).all():
-        along = np.abs(voltage)
+        voltage_forward = np.abs(voltage)
     read = CURRENTS if robot.knows(VOLTAGE) else ()
     current = next((c for c in read if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
     if current is not None:
         motors = float(robot.sides) if current == "total_current_A" else 1.0
-        along = along - np.nan_to_num(runs[current]) / motors * float(robot.motor.resistance) * np.sign(back)
+        voltage_forward = voltage_forward - np.nan_to_num(runs[current]) / motors * float(
+            robot.motor.resistance
+        ) * np.sign(back)
     tells = np.abs(back) > LEAST
-    wrong = np.flatnonzero(tells & (along < TOO_SMALL * np.abs(back)))
+    wrong = np.flatnonzero(tells & (voltage_forward < TOO_SMALL * np.abs(back)))
     if wrong.size > (0 if current else MOST_BRAKING * np.sum(tells)):
         row = int(wrong[0])
-        why = "with the wrong sign" if along[row] < 0 else "too small"
+        why = "with the wrong sign" if voltage_forward[row] < 0 else "too small"
         raise BadData(
             f"{runs.source} row {row + 1}, {column}: got {voltage[row]:g} at an imposed {SPEED} of "
             f"{runs[SPEED][row]:g}, {why} for the motors' back-EMF of "

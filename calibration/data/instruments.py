@@ -34,11 +34,11 @@ def common_step(readings: np.ndarray) -> float:
     if levels.size < FEWEST:
         return 0.0
     step, largest = 0.0, float(np.ptp(levels))
-    for apart in np.diff(levels):
-        a, b = float(apart), step
+    for difference in np.diff(levels):
+        a, b = float(difference), step
         while b > ROUNDING * largest:
-            rest = a - b * round(a / b)
-            a, b = b, abs(rest)
+            remainder = a - b * round(a / b)
+            a, b = b, abs(remainder)
         step = a
         if step < SMALLEST * largest:
             return 0.0

@@ -84,8 +84,8 @@ class Posterior:
         kinds = np.asarray(self.kinds)
         theta = xp.where(xp.asarray(kinds == LOG), xp.exp(xp.where(kinds == LOG, u, 0.0)), u)
         theta = xp.where(xp.asarray(kinds == ANGLE), xp.remainder(u + np.pi, 2 * np.pi) - np.pi, theta)
-        followers = [ratio * theta[..., k] for _, k, ratio in self.tied]
-        return xp.concatenate([theta, xp.stack(followers, -1)], -1) if followers else theta
+        tied_values = [ratio * theta[..., k] for _, k, ratio in self.tied]
+        return xp.concatenate([theta, xp.stack(tied_values, -1)], -1) if tied_values else theta
 
     def values(self, normal_scores: Any) -> Any:
         """Parameters [SI] of draws.

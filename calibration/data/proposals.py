@@ -139,8 +139,8 @@ def propose_columns(
         best, *others = sorted(group, key=lambda c: (c.signal.clock is None, bool(c.question)))
         question = best.question
         if others:
-            rest = ", ".join(c.signal.path for c in others[:3])
-            question = f"or {rest}: which one is the {quantity.replace('_', ' ')}?"
+            other_paths = ", ".join(c.signal.path for c in others[:3])
+            question = f"or {other_paths}: which one is the {quantity.replace('_', ' ')}?"
         if joint := _joint_name(best.signal, signals):
             question = f"joint {joint}{'; ' * bool(question)}{question}"
         yield best.signal.path, best.line(question)
@@ -328,8 +328,8 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
     if not np.any(integral):
         return math.nan
     factor = float(distance @ integral / (integral @ integral))
-    rest = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
-    return factor if rest < INTEGRAL else math.nan
+    relative_error = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
+    return factor if relative_error < INTEGRAL else math.nan
 
 
 def _currents_by_duty(pool: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:

@@ -296,11 +296,11 @@ def jitter_sentence(runs: Runs) -> str:
     """
     for name, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
-        off = np.clip(steps - usual, -usual, usual)
-        spread = float(np.std(off))
+        deviation = np.clip(steps - usual, -usual, usual)
+        spread = float(np.std(deviation))
         if usual <= 0 or spread <= UNEVEN * usual or (steps > LONG * usual).any():
             continue
-        if float(np.mean(off[1:] * off[:-1])) < TURNS_BACK * spread**2:
+        if float(np.mean(deviation[1:] * deviation[:-1])) < TURNS_BACK * spread**2:
             run = f" of run {name}" if name else ""
             return (
                 f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
@@ -477,8 +477,13 @@ def swapped_sentence(runs: Runs) -> str:
             power = np.nan_to_num(runs[imposed][rows] * readings)
             total = np.cumsum(power) / max(float(np.abs(power).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
-            first, rest = total[turn], total[-1] - total[turn]
-            if channel.zero_at_rest and channel.settled and first * rest < 0 and min(abs(first), abs(rest)) > SWAPPED:
+            sum_before, sum_after = total[turn], total[-1] - total[turn]
+            if (
+                channel.zero_at_rest
+                and channel.settled
+                and sum_before * sum_after < 0
+                and min(abs(sum_before), abs(sum_after)) > SWAPPED
+            ):
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
@@ -528,7 +533,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
     priors = {name: sd for name, _, sd in robot.rig.priors}
     origins = []
     for p in params.walk_parameters(robot):
-        head, _, rest = p.name.partition(".")
+        head, _, key = p.name.partition(".")
         is_own_configuration = head in robot.configurations
         is_shown = (
             p.name in names_in_file or is_own_configuration or p.name.startswith(("motor.friction", "gearbox."))
@@ -547,7 +552,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
         elif head == BATTERY and not robot.knows([p.name]):
             why = "not stated: an example value. Results on the battery depend on it"
         else:
-            why = _reason_of_default(p.name, rest if is_own_configuration else "")
+            why = _reason_of_default(p.name, key if is_own_configuration else "")
         origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return origins
 

@@ -61,8 +61,12 @@ def reading_period(values: np.ndarray) -> float:
     rows = usual if abs(near.mean() - usual) < 0.25 and (near == usual).mean() > 0.5 else float(near.mean())
     if usual < APART or (gaps < usual - 1.5).mean() > SOONER or (usual < 3 and (gaps < APART).mean() > SOONER):
         return 0.0
-    off = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
-    return rows if (off <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps) else 0.0
+    distance_to_multiple = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
+    return (
+        rows
+        if (distance_to_multiple <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps)
+        else 0.0
+    )
 
 
 def drop_repeated_readings(
@@ -236,16 +240,16 @@ def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot
     if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
         return columns_left, ()
     step = np.diff(time)
-    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
+    shortest_step, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
     constant = windings if clamped else time_constant(robot)
-    if not math.inf > apart >= CONSTANTS_APART * constant or not (
-        clamped or _are_separate_settings(columns, layout, apart)
+    if not math.inf > shortest_step >= CONSTANTS_APART * constant or not (
+        clamped or _are_separate_settings(columns, layout, shortest_step)
     ):
         return columns_left, ()
     for column in (*TIME, "run_id"):
         columns_left.pop(column, None)
-    note = f"rows are {three_digits(apart)} s or more apart, mostly at different settings"
+    note = f"rows are {three_digits(shortest_step)} s or more apart, mostly at different settings"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
     why = "the output is held in every row" if clamped else f"{note}{settle}"
     return columns_left, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)

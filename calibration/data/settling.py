@@ -337,10 +337,12 @@ def _settled_signals_of_log(
     signals = []
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
-            off = find_glitches(runs[c.column], levels, width, _step_of_instrument(runs, c, runs[c.column]), drift)
-            readings = np.where(off, np.nan, runs[c.column])
+            is_glitch = find_glitches(
+                runs[c.column], levels, width, _step_of_instrument(runs, c, runs[c.column]), drift
+            )
+            readings = np.where(is_glitch, np.nan, runs[c.column])
             signals.append(
-                Signal(c, readings, none, _step_of_instrument(runs, c, readings), _reading_size(readings), off)
+                Signal(c, readings, none, _step_of_instrument(runs, c, readings), _reading_size(readings), is_glitch)
             )
     have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
@@ -348,12 +350,14 @@ def _settled_signals_of_log(
             smoothed_values = np.full(len(runs), np.nan)
             readings = np.full(len(runs), np.nan)
             read = next(c for c in runs.channels if c.column == angle)
-            off = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
+            is_glitch = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
             for rows in each:
-                smoothed_values[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
+                smoothed_values[rows] = np.where(is_glitch[rows], np.nan, runs[angle][rows] * factor)
                 readings[rows] = _recent_rate(runs["time_s"][rows], smoothed_values[rows], half)
             signals.append(
-                Signal(channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), off)
+                Signal(
+                    channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), is_glitch
+                )
             )
     if not signals:
         raise BadData(f"{runs.source}: no channel has readings that can be used for settled runs")
@@ -391,17 +395,17 @@ def find_glitches(
         # A level is padded with its end values: if it were mirrored, a start would appear as a glitch.
         ends = np.full(pad, np.median(x[:PART])), np.full(pad, np.median(x[-PART:]))
         middle = median_filter(np.concatenate([ends[0], x, ends[1]]), size)[pad : pad + len(x)]
-        apart = np.abs(x - middle)
-        scatter = 1.4826 * median_filter(apart, min(5 * size, len(x)) | 1, mode="reflect")
+        deviation = np.abs(x - middle)
+        scatter = 1.4826 * median_filter(deviation, min(5 * size, len(x)) | 1, mode="reflect")
         grain = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step  # coarse despite the file
         noise = FAR * np.maximum(scatter, grain)
         if drift is None:
-            off = apart > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
+            is_far = deviation > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
         else:
             allowed = np.maximum(noise, np.maximum(drift * np.abs(middle), FINE * largest))
-            off = (apart > allowed) & (np.abs(middle) > STILL * largest)
-        off[:size] &= ~binary_opening(off[:size], np.ones(PART))
-        is_glitch[rows] = off
+            is_far = (deviation > allowed) & (np.abs(middle) > STILL * largest)
+        is_far[:size] &= ~binary_opening(is_far[:size], np.ones(PART))
+        is_glitch[rows] = is_far
     return is_glitch
 
 
@@ -673,8 +677,8 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
         return 0.0
     first, before, last = np.diff([float(np.mean(q)) for q in quarters]).tolist()
     place = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
-    rest = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
-    standard_error = SDS * math.sqrt(2 * _correlation_time(rest) / len(rest)) * float(np.std(rest))
+    noise = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
+    standard_error = SDS * math.sqrt(2 * _correlation_time(noise) / len(noise)) * float(np.std(noise))
     earlier, later = (before, last) if abs(last) >= standard_error else (first, before)
     if abs(later) < standard_error or earlier * later <= 0:
         return 0.0
@@ -713,10 +717,10 @@ def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tup
     large = np.array([s.largest for s in signals])
     tolerance = np.maximum(0.5 * drift * np.abs(tail), FINE * large)
     for k in range(first - 1, -1, -1):
-        apart = np.abs(means[:, k] - tail)
+        difference = np.abs(means[:, k] - tail)
         count = parts[k][1] - parts[k][0]
         scatter = noise * math.sqrt(1 / max(count, 1) + 1 / (len(rows) - ends[0][0]))
-        if np.any(apart > tolerance + SDS * scatter):
+        if np.any(difference > tolerance + SDS * scatter):
             break
         first = k
     return first
@@ -745,11 +749,11 @@ def _correlation_time(x: np.ndarray) -> float:
     power = float(np.mean(x**2))
     if len(x) < 4 or power <= 0:
         return 1.0
-    most = min(len(x) // 3, 500)
+    longest_lag = min(len(x) // 3, 500)
     wide = np.fft.rfft(x, 2 * len(x))
-    rho = np.fft.irfft(np.abs(wide) ** 2)[:most] / (len(x) * power)
+    rho = np.fft.irfft(np.abs(wide) ** 2)[:longest_lag] / (len(x) * power)
     total = 1.0
-    for k in range(1, most - 1, 2):
+    for k in range(1, longest_lag - 1, 2):
         pair = rho[k] + rho[k + 1]
         if pair <= 0:
             break
@@ -767,15 +771,15 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
     if len(signal.angle):
         angle = signal.angle[rows][finite]
         slope = float(t @ (angle - angle.mean()) / (t @ t))
-        rest = angle - angle.mean() - slope * t
-        sd = math.sqrt(float(np.mean(rest**2)) * _correlation_time(rest) / float(t @ t))
+        residual = angle - angle.mean() - slope * t
+        sd = math.sqrt(float(np.mean(residual**2)) * _correlation_time(residual) / float(t @ t))
         bend = float(t @ (x - x.mean()) / (t @ t))
         return slope, max(sd, 1e-9 * abs(slope)), bend * float(np.ptp(t))
     mean = float(x.mean())
     slope = float(t @ (x - mean) / (t @ t))
-    rest = x - mean - slope * t
-    spread = float(np.std(rest))
-    sd = spread * math.sqrt(_correlation_time(rest) / len(x))
+    residual = x - mean - slope * t
+    spread = float(np.std(residual))
+    sd = spread * math.sqrt(_correlation_time(residual) / len(x))
     if signal.step > 0:  # without noise all readings round the same way; noise makes the error of their mean smaller
         # Two readings do not show how often noise moves one to the other.
         within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
@@ -848,14 +852,14 @@ def _check_signs(found: Settled) -> None:
     layout, runs = found.runs.layout, found.runs
     for signal in (s for s in found.signals if runs.turns_round(s.channel)):
         channel = signal.channel
-        least = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
-        clear = [s for s in found.kept if abs(s.mean[channel.name]) > least[id(s)]]
-        back, ahead = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
-        wrong = [s for s in ahead if s.mean[channel.name] < 0]
-        is_reversed = bool(wrong) and len(wrong) == len(ahead)
-        if back and all(s.mean[channel.name] > 0 for s in back) and not is_reversed:
+        smallest_signed = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
+        clear = [s for s in found.kept if abs(s.mean[channel.name]) > smallest_signed[id(s)]]
+        backward, forward = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
+        wrong = [s for s in forward if s.mean[channel.name] < 0]
+        is_reversed = bool(wrong) and len(wrong) == len(forward)
+        if backward and all(s.mean[channel.name] > 0 for s in backward) and not is_reversed:
             raise BadData(
-                f"{_place_text(found, back[0], channel)}; expected readings with their signs, negative in "
+                f"{_place_text(found, backward[0], channel)}; expected readings with their signs, negative in "
                 f"reverse; or set [instruments.{channel.name}] signed = false in the rig's file, if it shows "
                 "only the magnitude"
             )
@@ -888,17 +892,17 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
         for one, other in ((a, b) for k, a in enumerate(turns) for b in list(turns)[k + 1 :]):
             if not (turns[one] > 0 and turns[other] > 0):
                 continue
-            off = turns[one] / turns[other]
-            unit = next((word for word, x in UNITS.items() if abs(math.log(off / x)) < NEAR), None)
+            ratio = turns[one] / turns[other]
+            unit = next((word for word, x in UNITS.items() if abs(math.log(ratio / x)) < NEAR), None)
             if unit is not None:
                 column = (
                     angles[one] if one in angles and not _direct(runs, one) else channels.find_channel(one).column
                 )
                 raise BadData(
-                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times the value "
+                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {ratio:.4g} times the value "
                     f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
                     f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
-                    f"{{column = ..., factor = {1 / off:.3g}}} in the rig's file"
+                    f"{{column = ..., factor = {1 / ratio:.3g}}} in the rig's file"
                 )
 
 

@@ -116,7 +116,7 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
     """
     names_found: list[str] = []
     for name in names:
-        configuration, _, rest = name.partition(".")
+        configuration, _, key = name.partition(".")
         gone = configuration not in robot.configurations and configuration in (
             runs["configuration"] if runs.has("surface") else ()
         )
@@ -129,5 +129,5 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
             for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in surface_names)
             if n in robot.configurations
         ]
-        names_found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]
+        names_found += [f"{n}.{key}" for n in (on if key.startswith((GROUND, "*")) else on[:1])]
     return names_found

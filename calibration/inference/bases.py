@@ -266,8 +266,10 @@ def condition_polynomials(
     """Polynomials in all conditions, for each configuration. Arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
-    along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
-    spans = [scale_to_unit_range(x, weight) for x in along]
+    values_in_travel = (
+        in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes
+    )
+    spans = [scale_to_unit_range(x, weight) for x in values_in_travel]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)

@@ -247,10 +247,10 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
         if is_complete
         else f"{count_noun(readings, 'reading')} in {rows}"
     )
-    least = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
+    needed_words = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
     problem_words = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(
-        f"{runs.source}: {have} {problem_words}; at least {least} are needed{f', or {cure}' if names else ''}"
+        f"{runs.source}: {have} {problem_words}; at least {needed_words} are needed{f', or {cure}' if names else ''}"
     )
 
 

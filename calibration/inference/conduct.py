@@ -48,10 +48,16 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     for k, channel in enumerate(runs.channels):
         squares = np.nan_to_num(off[:, k]) ** 2
         sums = {rows.tobytes(): (float(squares[rows].sum()), int(rows.sum())) for rows in both}
-        most, count = max(sums.values())
-        if 0 < count <= FEW_ROWS * len(runs) and most >= MOST_ERROR * squares.sum() > 0:
+        largest_sum, count = max(sums.values())
+        if 0 < count <= FEW_ROWS * len(runs) and largest_sum >= MOST_ERROR * squares.sum() > 0:
             notes.append(
-                Remark("after_steps", channel=channel.name, share=most / squares.sum(), rows=count, total=len(runs))
+                Remark(
+                    "after_steps",
+                    channel=channel.name,
+                    share=largest_sum / squares.sum(),
+                    rows=count,
+                    total=len(runs),
+                )
             )
     return notes or _time_shift_remarks(runs, off)
 

@@ -164,8 +164,8 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     else:
         delay = 0.0
     if level:
-        most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
-        limited = Remark("feedforward_limit", level=level, current=most)
+        largest_current = None if log.current is None else float(np.nanmax(np.abs(log.current)))
+        limited = Remark("feedforward_limit", level=level, current=largest_current)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
     fitted_windows = _select_windows(windows, windows["demand"] < level) if level else windows
     values, covariance, _ = _fit_constants(fitted_windows, mechanism)
@@ -298,14 +298,14 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
     """
     windows: list[dict[str, object]] = []
     step, speeds = _median_time_step(log), np.asarray(log.velocity)
-    least = MOVES * np.nanmax(np.abs(speeds))
+    smallest_speed = MOVES * np.nanmax(np.abs(speeds))
     count = max(FEWEST, round(WINDOW / step))
     for rows in _rows_of_runs(log):
         t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
         voltage_integral = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
         path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
         instants = t - delay
-        rests = not abs(v[0]) >= least  # a test begins without voltage
+        rests = not abs(v[0]) >= smallest_speed  # a test begins without voltage
         driven = np.interp(instants, t, voltage_integral) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
         driven += np.maximum(instants - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
@@ -313,7 +313,7 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
         for a in range(len(t) - count):
             b = a + count
             inside = v[a : b + 1]
-            if np.any(np.sign(inside) != np.sign(inside[0])) or np.abs(inside).min() <= least:
+            if np.any(np.sign(inside) != np.sign(inside[0])) or np.abs(inside).min() <= smallest_speed:
                 continue
             length = t[b] - t[a]
             if length > 3 * WINDOW and length > 2 * count * step:
@@ -355,10 +355,10 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
     """
     matrix = _regression_matrix(w, mechanism)
     solved, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
-    rest = w["dv"] - matrix @ solved
+    acceleration_error = w["dv"] - matrix @ solved
     inverse = np.linalg.pinv(matrix.T @ matrix)
     leverage = np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
-    scored = matrix * (rest / np.maximum(1 - leverage, 0.05))[:, None]
+    scored = matrix * (acceleration_error / np.maximum(1 - leverage, 0.05))[:, None]
     middle = scored.T @ scored
     for lag in range(1, w["count"][0] + 1):  # weights of Newey and West (1987)
         near = (w["row"][lag:] - w["row"][:-lag] == lag) & (w["run"][lag:] == w["run"][:-lag])
@@ -379,7 +379,7 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
         names = [*names, kG]
         jacobian = [*jacobian, (c * size[3] + s * size[4]) / kG - np.eye(len(solved))[0] * kG / b]
     derivatives = np.array(jacobian)
-    return np.array(names), derivatives @ spread @ derivatives.T, float(rest @ rest)
+    return np.array(names), derivatives @ spread @ derivatives.T, float(acceleration_error @ acceleration_error)
 
 
 def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
@@ -445,6 +445,6 @@ def _direction_remarks(w: Columns) -> Iterator[Remark]:
 
 def _battery_remarks(log: DriveLog) -> Iterator[Remark]:
     if log.battery is not None and np.isfinite(log.battery).any():
-        rest, low = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
-        if low < 0.9 * rest:
-            yield Remark("feedforward_sag", rest=rest, low=low)
+        highest, lowest = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
+        if lowest < 0.9 * highest:
+            yield Remark("feedforward_sag", rest=highest, low=lowest)

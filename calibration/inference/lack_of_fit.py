@@ -230,8 +230,8 @@ def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> flo
     explained = float(np.sum((directions.T @ np.concatenate([fit.whitened.ravel(), fit.z])) ** 2))
     if known:
         return float(chdtrc(terms, explained))
-    rest = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
-    return float(fdtrc(terms, freedom - terms, explained / terms / rest))
+    unexplained = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
+    return float(fdtrc(terms, freedom - terms, explained / terms / unexplained))
 
 
 def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:

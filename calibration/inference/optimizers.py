@@ -154,8 +154,8 @@ def _optimum_at(
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
-    ahead = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
-    decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
+    residual_after_step = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
+    decrement = half_squares(r, held_rows) - half_squares(residual_after_step, held_rows)
     pinned_offset = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(pinned_offset**2)
     return Optimum(
@@ -450,7 +450,7 @@ def _search_with_states(
     problem: Problem, members: SearchMember, max_steps: int, places: int
 ) -> tuple[Optimum, SearchState]:
     """Results of `search_refilling`, with the state of the solver at the end of each search."""
-    count, most = len(members.start), np.asarray(max_steps)
+    count, step_limit = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
     idle = _placeholder_searches(problem, first)
@@ -464,12 +464,12 @@ def _search_with_states(
             own_members = jax.tree.map(lambda x: x[assigned.member], members)
             running = int(assigned.taken.sum())
             enough = places - running + (max(1, places // 4) if assigned.waiting else running)
-            at, results = go_on(problem, own_members, fresh, at, np.asarray(enough), most)
+            at, results = go_on(problem, own_members, fresh, at, np.asarray(enough), step_limit)
             assigned.leave(*jax.device_get((at[1].over, (results, at[1]))))
         return assigned.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step
-        go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
+        go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), step_limit)
     with Threads(cores) as pool:
         results_by_member = {
             k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()
@@ -728,14 +728,14 @@ def search_with_solver(
     Returns:
         The end of each search, and the observations at its start and at its end.
     """
-    most = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
+    step_limit = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
 
     def residual(z: Z, args: Any) -> Array:
         r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
         return with_derivative(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
-        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
+        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=step_limit, throw=False)
         z, pin = solved.value, no_pin(start.size)
         r, jacobian, observation = _evaluate_residuals(problem, data, pin, z)
         r, jacobian = mask_uncomputed(r, jacobian, data)

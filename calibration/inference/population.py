@@ -118,8 +118,8 @@ Objective = Callable[[np.ndarray, MemberObservations], Float[np.ndarray, " membe
 
 def problem_hash(posed: Problem) -> str:
     """Hash of the data, base robot, coordinates and model of a problem."""
-    arrays, rest = eqx.partition(posed, eqx.is_array_like)
-    digest = hashlib.sha256(str(rest).encode())
+    arrays, static_parts = eqx.partition(posed, eqx.is_array_like)
+    digest = hashlib.sha256(str(static_parts).encode())
     for leaf in jax.tree.leaves(arrays):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()[:16]
@@ -323,13 +323,13 @@ def local_regression(
     z, reading = found.z[finite], found.reading[finite]
     number = min(len(z), MEMBERS_EACH * (z.shape[1] + 1))
     spread = np.linalg.pinv(np.cov(z.T).reshape(z.shape[1], -1))
-    apart = z - found.z[at]
-    near = np.argsort(np.einsum("ij,jk,ik->i", apart, spread, apart), kind="stable")[:number]
+    offsets = z - found.z[at]
+    near = np.argsort(np.einsum("ij,jk,ik->i", offsets, spread, offsets), kind="stable")[:number]
     scale = np.asarray(posed.data.weight / posed.data.sd)
     reading_changes = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
-    design = np.column_stack([np.ones(number), apart[near]])
+    design = np.column_stack([np.ones(number), offsets[near]])
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
-    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
+    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(offsets[near]) + 1e-12)])
     slope = np.linalg.solve(design.T @ design + ridge, design.T @ reading_changes)
     unexplained = reading_changes - design @ slope
     return slope[1:].T, float(np.sqrt(np.mean(unexplained**2)))
@@ -349,9 +349,9 @@ def unreliable_derivatives(
     ahead, behind = np.split(np.where(scale > 0, rows.reading * scale, 0.0), 2)
     differences = ((ahead - behind) / (2 * STEP)).reshape(len(z), -1)  # per posterior sd
     derivatives = jacobian.T * sd[:, None]
-    off = np.linalg.norm(derivatives - differences, axis=1)
+    error_norms = np.linalg.norm(derivatives - differences, axis=1)
     size = np.maximum(np.linalg.norm(differences, axis=1), np.linalg.norm(derivatives, axis=1))
-    return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
+    return ~np.isfinite(error_norms) | ((error_norms > APART * size) & (error_norms > 1.0))
 
 
 def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, ReachedBound]:

@@ -305,9 +305,9 @@ def _leading_parameter(robot: Robot, name: str) -> str | None:
     """Parameter of another configuration to which this one is tied, because the configurations differ only by their
     surface.
     """
-    configuration, _, rest = name.partition(".")
+    configuration, _, key = name.partition(".")
     leader = dict(robot.rig.surfaces).get(configuration)
-    return None if leader is None or rest.startswith(GROUND) else f"{leader}.{rest}"
+    return None if leader is None or key.startswith(GROUND) else f"{leader}.{key}"
 
 
 def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
@@ -481,8 +481,10 @@ def parameter_coordinates(
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
     wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
-    apart = {c for pair in robot.rig.surfaces for c in pair}
-    of_surfaces = {n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in apart}
+    surface_configurations = {c for pair in robot.rig.surfaces for c in pair}
+    of_surfaces = {
+        n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in surface_configurations
+    }
     wide |= {n: share for n, share in of_surfaces.items() if share is not None}
     if not robot.rig.inherits:
         wide = {n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)} | wide

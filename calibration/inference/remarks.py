@@ -40,15 +40,17 @@ def _noise_remarks(found: CalibrationResult) -> Iterator[Remark]:
 def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
     if not found.converged:
         yield Remark("unsettled", names=found.undetermined)
-    apart = {n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None}
-    if apart:
-        worst = max(apart, key=apart.__getitem__)
+    distance_in_sds = {
+        n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None
+    }
+    if distance_in_sds:
+        worst = max(distance_in_sds, key=distance_in_sds.__getitem__)
         yield Remark(
             "beside_steady",
-            inside=sum(a < Z95 for a in apart.values()),
-            total=len(apart),
+            inside=sum(a < Z95 for a in distance_in_sds.values()),
+            total=len(distance_in_sds),
             furthest=worst,
-            sds=apart[worst],
+            sds=distance_in_sds[worst],
         )
     if not found.profiled:
         yield Remark("not_profiled")

@@ -42,10 +42,12 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
     if len(pairs) < FEWEST:
         return noise, []
     first, second = np.array(pairs).T
-    apart = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(noise.sd[first], noise.sd[second])
+    difference_in_sds = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(
+        noise.sd[first], noise.sd[second]
+    )
     factors, notes = dict[str, float](), list[Remark]()
     for k, channel in enumerate(noise.channels):
-        deviations = apart[np.isfinite(apart[:, k]), k]
+        deviations = difference_in_sds[np.isfinite(difference_in_sds[:, k]), k]
         if len(deviations) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
             continue
         median = float(np.median(deviations))
@@ -65,5 +67,5 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
 
 def _median_tail(median: float, count: int) -> float:
     """Probability that the median magnitude of `count` standard normal numbers is at least `median`."""
-    beyond, least = math.erfc(median / math.sqrt(2)), (count + 1) // 2
-    return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(least, count + 1))
+    beyond, needed_count = math.erfc(median / math.sqrt(2)), (count + 1) // 2
+    return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(needed_count, count + 1))

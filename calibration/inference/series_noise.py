@@ -120,9 +120,9 @@ def voltage_levels(voltage: np.ndarray) -> np.ndarray:
     """
     levels = np.unique(voltage)
     gaps = np.diff(levels)
-    for apart in (np.inf, *np.unique(gaps)[::-1]):  # from one group to many
-        groups = np.split(levels, np.flatnonzero(gaps >= apart) + 1)
-        if all(np.ptp(g) <= min(SAG * np.abs(g).max(), apart / 3) for g in groups):
+    for smallest_gap in (np.inf, *np.unique(gaps)[::-1]):  # from one group to many
+        groups = np.split(levels, np.flatnonzero(gaps >= smallest_gap) + 1)
+        if all(np.ptp(g) <= min(SAG * np.abs(g).max(), smallest_gap / 3) for g in groups):
             ends = np.array([g[-1] for g in groups])
             return ends[np.searchsorted(ends, voltage)]
     return voltage
@@ -142,7 +142,7 @@ def _noise_of_channel(
     if not rows_used:
         return None
     difference = weights @ np.nan_to_num(measured)
-    least = float(display_step(measured, channel) / np.sqrt(12))
+    smallest_sd = float(display_step(measured, channel) / np.sqrt(12))
     forms = []
     for in_share in (False, True) if np.ptp(sizes) else (False,):
         scale = weights.multiply(sizes[None]) if in_share else weights
@@ -157,7 +157,7 @@ def _noise_of_channel(
     likely, size, freedom = np.array(forms).T
     probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
     floor, *share = (np.sqrt(probability) * size * (probability > NEGLIGIBLE)).tolist()
-    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, least)
+    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, smallest_sd)
 
 
 def _differences_from_neighbours(

@@ -345,8 +345,12 @@ class _LogArrays:
         readings, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
         if plan.angle:
             lag = slope_rows(time, readings, sd)[0] // 2
-            apart = time[lag:] - time[:-lag]
-            return time[lag:], (readings[lag:] - readings[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
+            time_difference = time[lag:] - time[:-lag]
+            return (
+                time[lag:],
+                (readings[lag:] - readings[:-lag]) / time_difference,
+                1.5 * sd / float(np.median(time_difference)),
+            )
         return time, readings, sd
 
     def length(self) -> float:
@@ -446,17 +450,17 @@ def points_and_windows(
     time, readings, sd = joined["time"], joined["shown"], joined["sd"]
     since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
-    apart = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
+    stretch_index = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
     wide, noise, rate = FEWEST, 0.0, np.zeros(len(run))
     if plan.angle:
         longest = max(log.each, key=len)
         angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
         wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
         wide = max(FEWEST, wide // size | 1)
-        rate = local_slopes(time, readings[:, plan.motion], apart, wide)
+        rate = local_slopes(time, readings[:, plan.motion], stretch_index, wide)
     way, speed = _travel_directions(problem, plan, conditions, readings, sd, rate, noise)
     usable = (way != 0) & (joined["stretch"] >= 0)
-    piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
+    piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(stretch_index) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
         rate = local_slopes(time, readings[:, plan.motion], piece, wide)
     turned_angle = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
@@ -530,7 +534,7 @@ def _travel_directions(
         noise: standard deviation of `rate`.
     """
     if plan.imposed == "motor_speed":
-        speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
+        speed, offset = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
     else:
         robot, none = problem.base, jnp.zeros(())
         chassis = robot.configurations.members[0]
@@ -539,6 +543,6 @@ def _travel_directions(
             problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
         )
         speed = per * (rate if plan.angle else shown[:, plan.motion])
-        off = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
-    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * off)
+        offset = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
+    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * offset)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed

@@ -63,10 +63,10 @@ def default_outputs(robot: Robot, turns: bool) -> Names:
     """Names of the outputs that are studied by default: every channel, and those defined for the robot's load."""
     beside: Names = DEFAULT
     if turns:
-        apart = {row.name for row in derived.OF_STRAIGHT}
+        straight_only = {row.name for row in derived.OF_STRAIGHT}
         return (
             *channels.channel_names(robot.channels),
-            *(n for n in DEFAULT if n not in apart),
+            *(n for n in DEFAULT if n not in straight_only),
             derived.OF_TURNS[0].name,
         )
     if not robot.has_ground:

@@ -449,13 +449,16 @@ def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, cou
     start_indices: list[int] = []
     of_motor: dict[str, int] = {}
     of_choice: dict[int, int] = {}
-    for least in (True, False):
+    for for_each_motor in (True, False):
         for k in order:
             c = int(rows[k])
             name = motor[c]
-            if len(start_indices) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
+            if len(start_indices) == count or (for_each_motor and of_motor.get(name, 0) >= OF_MOTOR):
                 continue
-            if of_choice.get(c, 0) >= OF_CHOICE or k in start_indices[: len(start_indices) if not least else 0]:
+            if (
+                of_choice.get(c, 0) >= OF_CHOICE
+                or k in start_indices[: len(start_indices) if not for_each_motor else 0]
+            ):
                 continue
             start_indices.append(int(k))
             of_motor[name], of_choice[c] = of_motor.get(name, 0) + 1, of_choice.get(c, 0) + 1

@@ -177,8 +177,8 @@ def gaps_to_belt(loop: BeltLoop, at: Float[Array, "n 2"]) -> CornerGaps:
 def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> CornerGaps:
     """Gaps between points and the nearest grouser, a rigid tooth with flanks perpendicular to its base."""
     under = loop.project(at)[1]
-    ahead = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
-    place = jnp.mod(under - ahead, loop.length)
+    grouser_offset = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
+    place = jnp.mod(under - grouser_offset, loop.length)
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     along = running_direction(normal)

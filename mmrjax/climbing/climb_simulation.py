@@ -166,8 +166,8 @@ class ClimbRecord(eqx.Module):
 
         Negative if the line is outside them, NaN for a robot that falls or bounces.
         """
-        least = jnp.min(self.base, axis=-1)
-        return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
+        lowest = jnp.min(self.base, axis=-1)
+        return jnp.where(jnp.isfinite(lowest) & (self.carried >= CARRIED), lowest, jnp.nan)
 
 
 class ClimbSystem(eqx.Module):
@@ -370,8 +370,8 @@ def _drive_action(
 ) -> LeverStep:
     """Action of the lever drives in a step. Without it, the rates after the step would be `free` [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
-    most = jnp.abs(source) if sequence.supply is None else sequence.supply
-    high = jnp.stack([most, most])
+    lever_voltage = jnp.abs(source) if sequence.supply is None else sequence.supply
+    high = jnp.stack([lever_voltage, lever_voltage])
     low = -high
     aims = demanded_lever_rates(run, motion, time)
     if sequence.begins is not None:

@@ -206,13 +206,13 @@ def drive(
     if conditions.turns:
         return _drive_turning(robot, conditions, times, tolerance, max_steps, rolling)
     y0 = drive_start(robot, conditions, rolling)
-    imposed = conditions.motor_speed is not None
-    driven = rolling or imposed or robot.controller is not None  # a controller may turn it later
+    is_speed_imposed = conditions.motor_speed is not None
+    driven = rolling or is_speed_imposed or robot.controller is not None  # a controller may turn it later
     parked = jnp.asarray(False) if driven else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
     ys, went = _integrate_unknowns(drive_rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
     signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
-    if not imposed:
+    if not is_speed_imposed:
         static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
         signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)

@@ -36,10 +36,10 @@ def smallest_of(*values: Scalar) -> Array:
     The derivative of `jnp.minimum` is 0 if XLA computes an argument twice with different rounding, because it
     compares each argument with the result.
     """
-    least = jnp.asarray(values[0])
+    smallest = jnp.asarray(values[0])
     for value in values[1:]:
-        least = jnp.where(value < least, value, least)
-    return least
+        smallest = jnp.where(value < smallest, value, smallest)
+    return smallest
 
 
 def travel_direction(robot: Robot, conditions: Conditions) -> Array:
@@ -323,8 +323,8 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
     """
     settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travel_status(end.speed, voltage))
-    sense, rest = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
+    sense, speed_still = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, speed_still)
     status = jnp.where(still & (sense * end.acceleration < STARTS), STALLED, status)
     gain = end.acceleration * jnp.sign(end.speed_sliding)
     return status_with_slip(status, robot, end, gain, GAIN, still)

@@ -259,9 +259,9 @@ def _state_at_unknowns(
     sound, conditions = _conditions_are_sound(robot, conditions)
     sense = travel_direction(robot, conditions)
     state, signals, residual = _signals_and_residuals(robot, conditions, unknowns, sense)
-    rest = robot.chassis(conditions.configuration).speed_still
+    speed_still = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
-    still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, rest)
+    still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, speed_still)
     still |= sense * signals.speed_theoretical <= 1e-9
     # In the order in which they matter to a reader.
     status = jnp.where(still, STALLED, travel_status(signals.speed, voltage))

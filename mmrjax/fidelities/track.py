@@ -95,8 +95,8 @@ def _period_averages(
     pitch, end = run.path.pitch, travelled[-1]
     middle = (travelled[1:] + travelled[:-1]) / 2
     plain = (time[1:] > time[-1] - WINDOW * (time[-1] - time[0])).astype(time.dtype)
-    first = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
-    periods = jnp.floor(jax.lax.stop_gradient((end - first) / pitch))
+    window_start = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
+    periods = jnp.floor(jax.lax.stop_gradient((end - window_start) / pitch))
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
     def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Any, Array]:

@@ -199,8 +199,8 @@ def _segment_status(
     largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
         mode == SPEED, per_speed, 1.0
     )
-    off = jnp.max(jnp.abs(jnp.asarray(asked.error)))
-    missed = controlled & (off > MISSED * jnp.maximum(largest, 10.0))
+    largest_error = jnp.max(jnp.abs(jnp.asarray(asked.error)))
+    missed = controlled & (largest_error > MISSED * jnp.maximum(largest, 10.0))
     status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
     return status, missed
 

@@ -242,8 +242,11 @@ def event_functions(
     standing = smallest_of(slow, grips, stays - FIRMLY)
     battery, discharge = demand.robot.battery, law.supply_current_and_charge(demand, y, stands)[1]
     empty = jnp.where(demand.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
-    above = _cell_voltage_margin(law, demand, y, stands)
-    falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
+    cell_margin = _cell_voltage_margin(law, demand, y, stands)
+    falls, recovers = (
+        jnp.where(below, -1.0, -cell_margin / OF_CELL),
+        jnp.where(below, (cell_margin - RECOVERED) / OF_CELL, -1.0),
+    )
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
 

@@ -124,9 +124,9 @@ def _controller_duty(robot: Robot, conditions: Conditions, state: State) -> Scal
     """Duty that a controller wants [-]."""
     assert robot.controller is not None and conditions.goal is not None
     shown, speed = controller_reading(robot, conditions, state)
-    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
+    goal_feed_forward = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
     integral = 0.0 if state.integral is None else state.integral
-    return robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
+    return robot.controller.duty(conditions.goal - shown, integral, speed, goal_feed_forward)
 
 
 def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
@@ -147,7 +147,7 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
-    rest = chassis.speed_still
+    speed_still = chassis.speed_still
     duty = robot.driver.duty_limited(bridge_duty(robot, conditions), state.current, conditions.polarity)
     straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = Signals(
@@ -165,8 +165,8 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
         current=state.current,
         speed_motor=state.speed_motor,
         speed=state.speed,
-        direction=contact.smooth_sign(speed_theoretical, rest) if direction is None else direction,
-        direction_travel=contact.smooth_sign(state.speed, rest) if direction is None else direction,
+        direction=contact.smooth_sign(speed_theoretical, speed_still) if direction is None else direction,
+        direction_travel=contact.smooth_sign(state.speed, speed_still) if direction is None else direction,
         speed_wheel=speed_wheel,
         speed_theoretical=speed_theoretical,
         speed_output=state.speed / chassis.radius if robot.loose else speed_wheel,
@@ -655,15 +655,15 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
     if conditions.states_levers:
         rests = resting_posture.level_posture(robot, conditions, mass)
         length, on_tracks, height = rests.length, rests.line, rests.centre_height
-        ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
+        centre_offset = rests.centre_ahead - (rests.front + rests.rear) / 2
     else:
-        ahead, up = masses.masses_of_parts(robot, conditions, mass).centre
+        centre_offset, up = masses.masses_of_parts(robot, conditions, mass).centre
         height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
     return Stance(
         length=length,
         width=chassis.turning.width,
         height=height,
-        ahead=ahead,
+        ahead=centre_offset,
         on_tracks=on_tracks,
         lateral=lateral_friction(conditions, chassis),
         rule=chassis.turning.rule,

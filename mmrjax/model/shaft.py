@@ -119,11 +119,11 @@ class Shaft(eqx.Module):
         elastic = jnp.asarray(self.stiffness) > 0
         stiffness = jnp.where(elastic, self.stiffness, FLANK_STIFFNESS * inertia)
         damping = jnp.where(elastic, self.damping, FLANK_DAMPING * inertia) * closing
-        ahead = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
+        flank_forward = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
         behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
         # Damping sets in over a tenth of the backlash, so that the torque is continuous at contact.
         full = 0.1 * self.backlash + 1e-4
-        push = jnp.maximum(stiffness * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
+        push = jnp.maximum(stiffness * flank_forward + damping * jnp.minimum(flank_forward / full, 1.0), 0.0)
         pull = jnp.minimum(stiffness * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
         return jnp.where(jnp.asarray(self.backlash) > 0, push + pull, stiffness * gap + damping)
 

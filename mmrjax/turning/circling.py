@@ -426,8 +426,8 @@ def status_of_steady_motion(
     """Status of a robot in steady motion."""
     chassis = robot.chassis(conditions.configuration)
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
-    along = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
-    status = jnp.where(jnp.minimum(shafts, along) < chassis.speed_still, STALLED, CONVERGED)
+    motion_size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    status = jnp.where(jnp.minimum(shafts, motion_size) < chassis.speed_still, STALLED, CONVERGED)
     status = jnp.where(has_tipped(robot, travel), TIPS, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
     return jnp.where(empty, BATTERY_EMPTY, status)
@@ -455,9 +455,9 @@ norm = functools.partial(error_norm_of_sides, whole=slice(4, len(_UNITS)), own=O
 def _sides_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
     """Conditions of each side, with the slope along its heading, and its state."""
     sides = conditions.of_sides()
-    along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
+    slope_along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
     return (
-        dataclasses.replace(sides, slope_deg=along, heading_deg=None),
+        dataclasses.replace(sides, slope_deg=slope_along, heading_deg=None),
         balances.states_of_sides(robot, conditions, motion),
     )
 

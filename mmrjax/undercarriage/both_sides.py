@@ -400,8 +400,10 @@ def stand(run: HalfRobotSystem) -> HalfRobotState:
     """
     heading_deg = run.conditions.heading_deg
     heading = jnp.zeros(()) if heading_deg is None else jnp.radians(heading_deg)
-    along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
-    half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
+    slope_along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
+    half = half_robot.stand(
+        dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=slope_along))
+    )
     q = (
         jnp.zeros(COORDINATES, half.q.dtype)
         .at[jnp.asarray([HEIGHT, PITCH, YAW])]

@@ -512,8 +512,10 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     """Status of a run from its averages and its last motion."""
     robot, conditions, signals = run.robot, run.conditions, averages.signals
     status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travel_status(signals.speed, signals.voltage))
-    sense, rest = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    stands = is_at_rest(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
+    sense, speed_still = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    stands = is_at_rest(
+        sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, speed_still
+    )
     parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
     status = jnp.where(parked, STALLED, status)
     # On average over the window.

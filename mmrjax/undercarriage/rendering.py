@@ -159,8 +159,8 @@ def draw_sample(axes: Any, view: RunScene, k: int) -> None:
     strip = ground([(-0.6, 0.0), (0.6, 0.0), (0.6, -0.2), (-0.6, -0.2)])
     axes.add_patch(Polygon(strip, color=_GROUND, alpha=0.45, lw=0))
     axes.plot(*ground([(-0.6, 0), (0.6, 0)]).T, color=_INK, lw=1)
-    first = np.ceil((axle_x - 0.6) / 0.05) * 0.05
-    marks = np.arange(first, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
+    first_mark = np.ceil((axle_x - 0.6) / 0.05) * 0.05
+    marks = np.arange(first_mark, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
     axes.add_collection(LineCollection([ground([(m, 0), (m - 0.008, -0.012)]) for m in marks], colors=_INK, lw=0.8))
 
     gear = view.path.gear

@@ -62,9 +62,9 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
-    along = _derivative_variables(config, robot, conditions, sequence)
+    derivative_variables = _derivative_variables(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, beside) as folder:
-        climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, along)
+        climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, derivative_variables)
         folder.write_table("history.csv", climbed.table)
         if rows := climbed.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})

@@ -118,11 +118,13 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
     imposed.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
-    most = max((float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0)
+    highest = max(
+        (float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0
+    )
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
-    if most > supply:
+    if highest > supply:
         raise BadConfiguration(
-            f"{source.source}, voltage_left_V and voltage_right_V: got {most:g} V; the supply has {supply:g} V "
+            f"{source.source}, voltage_left_V and voltage_right_V: got {highest:g} V; the supply has {supply:g} V "
             "(--voltage, or a column supply_voltage_V)"
         )
 

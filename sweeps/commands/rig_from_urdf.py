@@ -228,11 +228,11 @@ class _UrdfRobot:
             for name, pose in self._moved(link, rigid=True):
                 for shape in self.links[name].findall(tag):
                     rotation, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
-                    for kind, along in (("cylinder", rotation[:, 2]), ("sphere", None)):
+                    for kind, cylinder_axis in (("cylinder", rotation[:, 2]), ("sphere", None)):
                         place_words = f"link {name}, <{tag}> <{kind}>"
                         element = shape.find(f"geometry/{kind}")
                         radius = self._number(element, "radius", place_words, "m", 0.0)
-                        if radius > 0 and is_round(centre, axis, radius, along):
+                        if radius > 0 and is_round(centre, axis, radius, cylinder_axis):
                             radii.append((radius, place_words))
             if radii:
                 return max(radii)
@@ -268,8 +268,8 @@ class _UrdfRobot:
             shared = len(element.findall("joint")) > 1  # actuators then belong to no single joint
             of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
             owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
-            texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
-            ratio_texts = [(text, tag) for text, tag in texts if text is not None]
+            reduction_texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
+            ratio_texts = [(text, tag) for text, tag in reduction_texts if text is not None]
             if not ratio_texts:
                 continue
             name = f"transmission {element.get('name', '')}, <{ratio_texts[0][1]}>".replace(" ,", ",")

@@ -118,8 +118,8 @@ def _run_for_demand(
 
     def driven(volts: np.ndarray) -> Conditions:
         """Voltage of an external supply. A battery determines its own."""
-        most = max(supply, float(np.abs(volts).max()))
-        left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / most, most))
+        supply_voltage = max(supply, float(np.abs(volts).max()))
+        left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / supply_voltage, supply_voltage))
         voltage = asked.voltage if config.battery else source
         return dataclasses.replace(asked, voltage=voltage, duty_left=left, duty_right=right)
 
@@ -193,10 +193,10 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
         return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}
     if config.left_V is None or config.right_V is None:  # duties for a demand are found later
         return columns | {name: 1.0 for name in SIDES}
-    most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
-    if supply is not None and supply < most:
+    larger_voltage, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
+    if supply is not None and supply < larger_voltage:
         raise BadConfiguration(
-            f"--voltage: got {supply:g}; expected at least {most:g} V, the voltage of --left and --right"
+            f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, the voltage of --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
     source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))

@@ -190,8 +190,8 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
 
     def residual(z: jax.Array, args: Any) -> jax.Array:
         solution = law((scale * z) ** 2, command, load, way)
-        apart = [(a - b) / s for a, b, s in zip(solution, (current, speed), sizes, strict=True)]
-        return jnp.concatenate([*apart, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
+        errors = [(a - b) / s for a, b, s in zip(solution, (current, speed), sizes, strict=True)]
+        return jnp.concatenate([*errors, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
 
     solver: Any = solvers.solver_by_name("lm")
     solution: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)

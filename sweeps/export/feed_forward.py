@@ -124,9 +124,13 @@ def map_of_drive(
     module = module_from_source(jax_source(situation.joint, constants))
     params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
     reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
-    most = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
+    largest_torque = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
     return steady_state_map(
-        module, params, symmetric_axis(reach), symmetric_axis(most), float(situation.joint.robot.motor.resistance)
+        module,
+        params,
+        symmetric_axis(reach),
+        symmetric_axis(largest_torque),
+        float(situation.joint.robot.motor.resistance),
     )
 
 

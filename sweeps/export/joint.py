@@ -302,7 +302,7 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
     trace = _ExpressionTracer(joint)
     bare = lambda robot: dataclasses.replace(robot, effects=())  # noqa: E731
 
-    rest = float(joint.load.speed_still) / float(joint.load.radius)
+    speed_at_rest = float(joint.load.speed_still) / float(joint.load.radius)
     friction = (
         "M_t = M_t0 sign ω + K_ft ω, and friction by the normal load"
         if joint.robot.has_ground
@@ -310,8 +310,8 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
     )
     base: Sequence[tuple[str, str, str, str, str, str, Callable[[Robot, Signals], Any]]] = (
         ("direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
-         f"smooth sign of the speed, within ω_0 = {rest:.3g} rad/s of rest", "",
-         lambda r, s: contact.smooth_sign(s.speed_wheel, rest)),
+         f"smooth sign of the speed, within ω_0 = {speed_at_rest:.3g} rad/s of rest", "",
+         lambda r, s: contact.smooth_sign(s.speed_wheel, speed_at_rest)),
         ("back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces", "",
          lambda r, s: r.motor.voltage_back(s.speed_motor)),
         ("winding", "electrical", "V", "U_R = R_rot I", "voltage across the winding", "current",

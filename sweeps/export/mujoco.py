@@ -302,8 +302,15 @@ def _controller_gains(joint: DriveJoint, found: MjcfMotor) -> tuple[float, ...]:
     constant = found.values[CONSTANT]
     volts, kp, ki, kd = (own.supply_voltage * float(g) / found.ratio for g in (1.0, own.kp, own.ki, own.kd))
     torque = constant / found.values[RESISTANCE]
-    most = float(own.limit) * found.ratio / float(own.ki) if ki else 0.0
-    return kp * torque, ki * torque, (kd + constant) * torque, 0.0, most, volts * found.ratio * float(own.limit)
+    integral_limit = float(own.limit) * found.ratio / float(own.ki) if ki else 0.0
+    return (
+        kp * torque,
+        ki * torque,
+        (kd + constant) * torque,
+        0.0,
+        integral_limit,
+        volts * found.ratio * float(own.limit),
+    )
 
 
 def _backlash_body(joint: DriveJoint, found: MjcfMotor, name: str, at: str) -> str:

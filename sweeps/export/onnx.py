@@ -47,8 +47,8 @@ def step_function(joint: DriveJoint, constants: Sequence[LawConstant]) -> tuple[
     states = joint.states
 
     def step(*given: Any) -> tuple[Any, ...]:
-        state, rest = dict(zip(states, given, strict=False)), given[len(states) :]
-        command, position, velocity, dt = rest
+        state, inputs = dict(zip(states, given, strict=False)), given[len(states) :]
+        command, position, velocity, dt = inputs
         params = {name: jnp.asarray(value, velocity.dtype) for name, value in module.PARAMS.items()}
         torque, after, info = module.actuator(params, state, command, position, velocity, dt)
         return (torque, *(after[s] for s in states), info["power"])

@@ -206,10 +206,10 @@ def figure_as_svg(fig: Figure) -> str:
 
     `data-axes` of the document says where its axes are and what they run over, so that a page can show values.
     """
-    least = LEAST_NARROW if fig.get_figwidth() == NARROW else LEAST
+    smallest_font = LEAST_NARROW if fig.get_figwidth() == NARROW else LEAST
     for written in fig.findobj(lambda artist: isinstance(artist, Text)):
         assert isinstance(written, Text)
-        written.set_fontsize(max(written.get_fontsize(), least))
+        written.set_fontsize(max(written.get_fontsize(), smallest_font))
         # A text's colour, darkened until it can be read on white paper; what is near white is for a dark ground,
         # and stays
         colour = written.get_color()
@@ -220,12 +220,12 @@ def figure_as_svg(fig: Figure) -> str:
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # that of SVG
         engine.execute(fig)
-        if least == LEAST_NARROW:
+        if smallest_font == LEAST_NARROW:
             for _ in range(LAYOUTS):
                 if not _wrap_texts(fig) | _make_room_for_names(fig):
                     break
                 engine.execute(fig)
-        _separate_texts(fig, move=least == LEAST_NARROW)
+        _separate_texts(fig, move=smallest_font == LEAST_NARROW)
         fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})

@@ -191,8 +191,8 @@ def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
         for words, (values, shade) in lines.items():
             axes.plot(time, values, color=shade, lw=1.4, alpha=0.9)
             if not gear.on_tracks:
-                apart = {"front wheel": 7, "rear wheel": -7}.get(words, 0)  # they nearly coincide
-                label_line_end(axes, time, np.asarray(values), words, shade, offset=(5, apart))
+                label_offset = {"front wheel": 7, "rear wheel": -7}.get(words, 0)  # they nearly coincide
+                label_line_end(axes, time, np.asarray(values), words, shade, offset=(5, label_offset))
             top = max(top, float(np.max(values)))
         axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
         axes.set_title(title.format(gear.name))

@@ -445,15 +445,15 @@ def frequency_response(
     """
     from scipy import signal
 
-    apart = float(np.median(np.concatenate([np.diff(time) for time, _, _ in runs])))
-    length = min(SEGMENT, *(int(np.ptp(time) / apart) + 1 for time, _, _ in runs))
+    time_step = float(np.median(np.concatenate([np.diff(time) for time, _, _ in runs])))
+    length = min(SEGMENT, *(int(np.ptp(time) / time_step) + 1 for time, _, _ in runs))
     spectra: Any = 0.0
     for time, drive, readings in runs:
-        even = time[0] + apart * np.arange(int(np.ptp(time) / apart) + 1)
-        resampled_drive = drive[np.searchsorted(time, even + 1e-3 * apart, side="right") - 1]
+        even = time[0] + time_step * np.arange(int(np.ptp(time) / time_step) + 1)
+        resampled_drive = drive[np.searchsorted(time, even + 1e-3 * time_step, side="right") - 1]
         series = np.stack([resampled_drive, *(np.interp(even, time, reading) for reading in readings)])
-        frequency, cross = signal.csd(resampled_drive, series, 1 / apart, nperseg=length)
-        _, power = signal.welch(series, 1 / apart, nperseg=length)
+        frequency, cross = signal.csd(resampled_drive, series, 1 / time_step, nperseg=length)
+        _, power = signal.welch(series, 1 / time_step, nperseg=length)
         spectra = spectra + len(even) * np.stack([cross, power + 0j])
     cross, power = spectra[0, 1:, 1:], spectra[1, :, 1:].real
     coherence = np.abs(cross) ** 2 / np.maximum(power[0] * power[1:], 1e-300)

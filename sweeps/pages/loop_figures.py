@@ -199,8 +199,8 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
     fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
     rows_of_runs = list(runs.rows_by_run().values())
     applied = applied_drive(runs)
-    most = min(LAGS, min(map(len, rows_of_runs)) - 1)
-    lags = np.arange(-most, most + 1)
+    largest_lag = min(LAGS, min(map(len, rows_of_runs)) - 1)
+    lags = np.arange(-largest_lag, largest_lag + 1)
     centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
     for axes, channel in zip(grid[0], channels, strict=True):
         limit = 2 / np.sqrt(len(table["time_s"]))

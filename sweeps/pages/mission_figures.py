@@ -149,8 +149,8 @@ def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legen
     slope.plot(
         time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="default" if linear else "steps-post"
     )
-    most = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
-    slope.set_ylim(-most, most)
+    largest_slope = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
+    slope.set_ylim(-largest_slope, largest_slope)
     if legend:
         _draw_legend(axes, slope)
 

@@ -182,12 +182,19 @@ def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -
             continue
         continuous = float(np.interp(bears, curves["motor_A"], curves["torque_Nm"]))
         if style == "-":
-            most = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
+            largest_torque = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
             for axes in grid[0]:
-                axes.axvspan(0, min(continuous, most), color=GREEN, alpha=0.18, lw=0, label="continuous")
-                axes.axvspan(min(continuous, most), most, color=ORANGE, alpha=0.12, lw=0, label="short time")
-                axes.set_xlim(0, most)
-        shown = curves["torque_Nm"] <= most
+                axes.axvspan(0, min(continuous, largest_torque), color=GREEN, alpha=0.18, lw=0, label="continuous")
+                axes.axvspan(
+                    min(continuous, largest_torque),
+                    largest_torque,
+                    color=ORANGE,
+                    alpha=0.12,
+                    lw=0,
+                    label="short time",
+                )
+                axes.set_xlim(0, largest_torque)
+        shown = curves["torque_Nm"] <= largest_torque
         for axes, (name, label) in zip(grid[0], panels.items(), strict=True):
             axes.plot(curves["torque_Nm"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
             axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)

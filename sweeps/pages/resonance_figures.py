@@ -133,8 +133,8 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")
     shown_ripple = ripple[settled] if settled.any() else ripple[found.read]
-    most = float(np.nanmax(shown_ripple)) or 1.0
-    norm = colors.Normalize(0, most)
+    largest_ripple = float(np.nanmax(shown_ripple)) or 1.0
+    norm = colors.Normalize(0, largest_ripple)
     guess = found.travel
     for row, payload in enumerate(payloads):
         rows = np.flatnonzero(table["payload_kg"] == payload)
@@ -170,7 +170,7 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
     kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in others)
     label = SIGNALS[name].label
-    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
+    remarks = [] if largest_ripple >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
     remarks += [kinds] if kinds else []
     axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():

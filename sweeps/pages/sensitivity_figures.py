@@ -94,8 +94,8 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
 
 
 def _split_label(label: str) -> str:
-    first, *rest = label.split(", ")
-    return f"{first}\n{', '.join(rest)}"
+    first, *other_words = label.split(", ")
+    return f"{first}\n{', '.join(other_words)}"
 
 
 def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:

@@ -83,12 +83,12 @@ class TimeOverlay:
 
     def to_json(self) -> str:
         """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
-        most = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
+        points_per_curve = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
         runs: Json = {}
         spent = 0
         worst = self.worst
         for name in (worst, *(name for name in self.rows if name != worst)):
-            rows = self._thinned(self.rows[name], most)
+            rows = self._thinned(self.rows[name], points_per_curve)
             spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
             if runs and spent > 2 * POINTS:
                 break

@@ -95,10 +95,10 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
         wants = "find searches for it" if obstacle.find else f"expected an axis {SIZE}, or find = true"
         raise BadConfiguration(f"{where}, {SIZE}: got {'it' if obstacle.find else 'none'}; {wants}")
     sizes = varied.get(SIZE, ())
-    if obstacle.kind == "stairs" and 2 * obstacle.nose_mm >= (least := min([obstacle.tread_mm, *sizes])):
+    if obstacle.kind == "stairs" and 2 * obstacle.nose_mm >= (shortest := min([obstacle.tread_mm, *sizes])):
         raise BadConfiguration(
             f"{where}, obstacle.nose_mm: got {obstacle.nose_mm:g}; expected less than half of rise and tread, "
-            f"{least / 2:g} mm"
+            f"{shortest / 2:g} mm"
         )
     one = None if obstacle.sequence is None else terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
     for name in ("levers_front_deg", "levers_rear_deg"):

@@ -90,8 +90,8 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
     if len(settled) > 1:
         flagged_count = int((settled & (runs["flags"] != "")).sum())
         beyond = f". {flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
-        rest = (beyond if flagged_count else ", all within every limit") if settled.any() else ""
-        return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
+        limits_words = (beyond if flagged_count else ", all within every limit") if settled.any() else ""
+        return f"{settled.sum()} of {len(settled)} runs have an operating point{limits_words}."
     if not settled[0]:
         return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
     readings = ", ".join(f"{c.label} {run_tables.reading_text(runs[c.column][0], c)} {c.unit}" for c in channels)
@@ -252,11 +252,11 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
     ]
     used_limits = run_tables.use_of_limits(limits, float(robot.motor.temperature_ambient))
     if PEAK in run and not math.isnan(peak := float(run[PEAK])):
-        most = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
+        inrush = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
         used_limits.append({
             "words": "largest current of the start, all motors", "value": f"{peak:.1f} A",
-            "limit": "not stated" if most is None else f"{most:.1f} A",
-            "percent": None if most is None else 100 * peak / most,
+            "limit": "not stated" if inrush is None else f"{inrush:.1f} A",
+            "percent": None if inrush is None else 100 * peak / inrush,
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
     return used_limits
@@ -266,8 +266,8 @@ def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
     """Largest current for all motors [A]: that of the driver, or of the battery minus other consumers. None: not
     stated.
     """
-    most, battery = float(robot.driver.current_limit), robot.battery
-    limits = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
+    driver_limit, battery = float(robot.driver.current_limit), robot.battery
+    limits = [float(robot.sides) * driver_limit] if driver_limit < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:
         limits.append(battery.current_limit - float(battery.current_other))
     return min(limits, default=None)

@@ -60,10 +60,10 @@ def sweep_answer(runs: Columns) -> str:
     if not is_flagged.any():
         return f"{first}, all within every limit." if settled.any() else f"{first}."
     raised = Counter(flag for flags in runs["flags"][is_flagged] for flag in str(flags).split(";"))
-    most, times = raised.most_common(1)[0]
+    most_frequent, times = raised.most_common(1)[0]
     return (
         f"{first}. {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit. Most "
-        f"often, {words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
+        f"often, {words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(times, 'run')})."
     )
 
 

@@ -209,6 +209,6 @@ def _join_tables(arrays: Columns) -> Columns:
     if len(shaped) < 2 or len(widths) > 1 or len(groups) > 1:
         return arrays
     (above,) = groups
-    rest = {path: v for path, v in arrays.items() if path not in shaped}
+    other_arrays = {path: v for path, v in arrays.items() if path not in shaped}
     runs = np.concatenate([np.full(len(v), path_parts(path)[-1]) for path, v in shaped.items()])
-    return rest | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}
+    return other_arrays | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}

@@ -159,17 +159,17 @@ class SettledRuns(Observer):
         usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
             readings_there, sds = measured[rows], noise.sd[rows]
-            apart = np.abs(readings_there[:, None] - readings_there)
+            distance = np.abs(readings_there[:, None] - readings_there)
             mean = np.maximum(np.abs(readings_there[:, None] + readings_there) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
-            for at in np.argwhere(apart > allowed)[:1]:
+            for at in np.argwhere(distance > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
                 first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
                 in_sds = not (noise.estimated[k] or shared[k])
-                deviation = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
+                deviation = f"{distance[at] / sd[at]:.0f} sd" if in_sds else f"{distance[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
                 without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
                 torque = [c for c in (LOAD,) if c != column and runs.has(c)]

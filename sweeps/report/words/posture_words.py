@@ -174,12 +174,12 @@ def posture_table(found: Postures, names: Sequence[str]) -> Table:
 
 def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
-    one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
+    run, highest = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
-        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}. It tips "
-        f"on slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
-        f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm "
-        f"and gaps up to {one['widest_gap_mm']:.0f} mm. The highest step in any posture is {most:.0f} mm (front "
+        f"posture: pitch {run['pitch_deg']:z.1f}°, on {run['contact_mm']:.0f} mm, carried by {run['bears']}. It tips "
+        f"on slopes of {run['tips_back_deg']:.1f}° uphill, {run['tips_forward_deg']:.1f}° downhill, "
+        f"{run['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {run['highest_step_mm']:.0f} mm "
+        f"and gaps up to {run['widest_gap_mm']:.0f} mm. The highest step in any posture is {highest:.0f} mm (front "
         f"{found.over.front_deg:g}°, rear {found.over.rear_deg:g}°)"
     )
 

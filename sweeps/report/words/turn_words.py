@@ -60,14 +60,16 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     known = np.isfinite(speeds) & np.isfinite(rates)
     if not known.any():
         return "and no turn settles even at the full supply voltage"
-    ahead, round_ = np.abs(speeds[known]), np.abs(rates[known])
-    most_rate = np.interp(abs(speed), ahead[::-1], round_[::-1], right=math.nan)
-    most_speed = np.interp(abs(rate), round_, ahead, right=math.nan)
+    straight_speeds, round_ = np.abs(speeds[known]), np.abs(rates[known])
+    most_rate = np.interp(abs(speed), straight_speeds[::-1], round_[::-1], right=math.nan)
+    most_speed = np.interp(abs(rate), round_, straight_speeds, right=math.nan)
     if most_rate >= abs(rate):
         return "which would be enough. If friction falls with sliding speed, there may be no settled turn"
     told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
     told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
-    told += [f"no more than {ahead.max():.3g} m/s in straight travel"] if not math.isfinite(most_rate) else []
+    told += (
+        [f"no more than {straight_speeds.max():.3g} m/s in straight travel"] if not math.isfinite(most_rate) else []
+    )
     told += (
         [f"no more than {round_.max():.3g} rad/s when turning on the spot"] if not math.isfinite(most_speed) else []
     )
