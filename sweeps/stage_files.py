@@ -135,9 +135,9 @@ class _Writer:
             "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
         )  # which sums depend on
         content = x.tobytes(order)
-        at, self._size = self._size, self._size + len(content)
+        offset, self._size = self._size, self._size + len(content)
         self.data.append(content)
-        return [x.dtype.str, list(x.shape), order, at]
+        return [x.dtype.str, list(x.shape), order, offset]
 
 
 class _Reader:
@@ -198,11 +198,11 @@ class _Reader:
             filled = np.empty(math.prod(shape), object)
             filled[:] = [self.decoded(item) for item in rest[0]]
             return filled.reshape(shape)
-        order, at = rest
+        order, offset = rest
         kind = np.dtype(dtype)
         if kind.kind not in KINDS:
             raise Unreadable(f"array of {dtype}")
-        return np.frombuffer(self._data, kind, math.prod(shape), at).reshape(shape, order=order).copy("K")
+        return np.frombuffer(self._data, kind, math.prod(shape), offset).reshape(shape, order=order).copy("K")
 
     def _instance(self, module: str, name: str, factors: list[float] | None, fields: dict[str, Any]) -> Any:
         kind = _class(module, name, factors)

@@ -253,10 +253,10 @@ class Folder:
         hashes = {"robot": sha256_hex((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
         if runs is not None and runs.digest:
             hashes[runs.source] = runs.digest
-        now = datetime.datetime.now(datetime.UTC)
+        end_time = datetime.datetime.now(datetime.UTC)
         times = {
             "started": self.started.isoformat(timespec="seconds"),
-            "seconds": round((now - self.started).total_seconds(), 3),
+            "seconds": round((end_time - self.started).total_seconds(), 3),
         }
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
         # Program, versions and devices that made a result

@@ -34,14 +34,14 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
         count: counter as logged, shape (rows,).
         run: index of the recording of each row, shape (rows,).
     """
-    same = np.diff(run) == 0
-    step = np.where(same, np.diff(count), 0.0)
-    back = np.flatnonzero(step < 0)
-    if not back.size or not (step > 0).any():
+    same_run = np.diff(run) == 0
+    step = np.where(same_run, np.diff(count), 0.0)
+    rows_of_falls = np.flatnonzero(step < 0)
+    if not rows_of_falls.size or not (step > 0).any():
         return count, 0.0
     usual = float(np.median(step[step > 0]))
     for period in PERIODS:
-        across = step[back] + period
+        across = step[rows_of_falls] + period
         is_counter = period < 2**15 or not (count % 1).any()
         if (
             is_counter
@@ -51,10 +51,10 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
             and (across >= 0).all()
         ):
             wraps = np.zeros(len(count))
-            wraps[back + 1] = 1.0
+            wraps[rows_of_falls + 1] = 1.0
             total = np.cumsum(wraps)
             first = np.zeros(len(count), int)
-            first[1:][~same] = np.flatnonzero(~same) + 1
+            first[1:][~same_run] = np.flatnonzero(~same_run) + 1
             begins = total[np.maximum.accumulate(first)]  # wraps before the recording of each row began
             return count + period * (total - begins), period
     return count, 0.0

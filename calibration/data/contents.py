@@ -108,9 +108,11 @@ def inspect_source(source: str | Path | Any) -> FileContents:
             f"{contents_found.name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the "
             "densest channel"
         )
-    still = {fact.path for fact in facts if fact.least == fact.greatest}
+    constant_signals = {fact.path for fact in facts if fact.least == fact.greatest}
     read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
-    moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first one that changes
+    moving = sorted(
+        read, key=lambda signal: signal.path in constant_signals
+    )  # of several, the first one that changes
     lines = dict(_proposed_columns(moving))
     proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
     return FileContents(
@@ -125,17 +127,17 @@ def _source(source: Any) -> Source:
         first = _source(group[0])
         note = f"{source}: {len(group)} files, each a run; these are the signals of {group[0].name}"
         return dataclasses.replace(first, notes=(note, *first.notes))
-    path, within = opening.split_source(str(source))
+    path, signal_path = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
         raise BadData(f"{source}: no such file; expected a file of data, or the folder of a ROS 2 bag")
     form = opening.format_of(path, name)
     if form is not None:
-        return opening.open_signals(path, within, name, form)
+        return opening.open_signals(path, signal_path, name, form)
     table = _signals_of_text(delimited.read_csv_columns(path, name))
     if not table.signals:
         raise BadData(f"{name}: the file is empty; expected a header and rows")
-    return table.below(within) if within else table
+    return table.below(signal_path) if signal_path else table
 
 
 def _signals_of_text(arrays: NamedArrays) -> Source:
@@ -152,8 +154,8 @@ def _signals_of_text(arrays: NamedArrays) -> Source:
 
 def _unit_of_time(name: str) -> str | None:
     """Unit of a clock according to its name, as loggers spell it. None if the name is not that of a clock."""
-    bare = name.casefold().replace("time (", "time_").rstrip(")")
-    return "ms" if bare == "ms_today" else unit_of_clock(bare)
+    plain_name = name.casefold().replace("time (", "time_").rstrip(")")
+    return "ms" if plain_name == "ms_today" else unit_of_clock(plain_name)
 
 
 def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarray, str] | str]) -> SignalFacts:
@@ -191,9 +193,9 @@ def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
         seconds_found = one_clock.clock_seconds(clock)
     except BadData as error:
         return str(error)
-    back = np.flatnonzero(np.diff(seconds_found.time) < 0)
-    if back.size:
-        return f"{clock.name} goes back at sample {back[0] + 2}"
+    rows_of_falls = np.flatnonzero(np.diff(seconds_found.time) < 0)
+    if rows_of_falls.size:
+        return f"{clock.name} goes back at sample {rows_of_falls[0] + 2}"
     return seconds_found.time, seconds_found.unit
 
 

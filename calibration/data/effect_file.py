@@ -236,8 +236,8 @@ def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signal
     # Sums for the turn are computed after both sides' slip and resistance.
     before = "slip" if balance in ROUND else balance
     climbs, points = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
-    still = readable_signals(robot, run, state_at_rest, before, channel)
-    return dataclasses.replace(climbs, **TURN), dataclasses.replace(points, **TURN), still
+    signals_at_rest = readable_signals(robot, run, state_at_rest, before, channel)
+    return dataclasses.replace(climbs, **TURN), dataclasses.replace(points, **TURN), signals_at_rest
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
@@ -246,8 +246,10 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
 
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:
         # The robot file checks configurations that the nominal robot does not have.
-        made = dataclasses.replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
-        with_it = dataclasses.replace(robot, effects=(made,))
+        effect_of_amplitude = dataclasses.replace(
+            params.replace(effect(), {"amplitude": amplitude}), configurations=()
+        )
+        with_it = dataclasses.replace(robot, effects=(effect_of_amplitude,))
         return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
 
     for configuration in range(len(robot.configurations)):

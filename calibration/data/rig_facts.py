@@ -267,7 +267,7 @@ def _time_steps_of_runs(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarra
 
 def gap_sentence(runs: Runs) -> str:
     """Sentence on the longest time step of a log, if rows may be missing there. Otherwise empty."""
-    worst, told = 0.0, ""
+    worst, sentence = 0.0, ""
     for _, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) else 0.0
         long = steps > LONG * usual
@@ -275,12 +275,12 @@ def gap_sentence(runs: Runs) -> str:
             continue
         k, worst = int(np.argmax(steps)), float(steps.max())
         more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
-        told = (
+        sentence = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
             f"{three_digits(usual)} s is usual{more}. A fit keeps the imposed quantity constant in the gap. If rows "
             'are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
         )
-    return told
+    return sentence
 
 
 #: A clock jitters if the time between rows has at least this relative spread and at most this correlation with the
@@ -354,15 +354,15 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
     limit = float(np.median(np.abs(predicted[top])))
-    beyond = read & (np.abs(drive) > limit / REACHES)
+    limited = read & (np.abs(drive) > limit / REACHES)
     # If the voltage from these rows still rises, the driver does not limit it.
-    if beyond.sum() < ROWS_INNER or np.std(np.abs(predicted[beyond])) > FITS * limit:
+    if limited.sum() < ROWS_INNER or np.std(np.abs(predicted[limited])) > FITS * limit:
         return ""
-    row = int(np.flatnonzero(beyond)[0])
+    row = int(np.flatnonzero(limited)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
         f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
-        f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log. The driver limits "
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The driver limits "
         f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
@@ -381,12 +381,12 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     if robot.rig.imposed != "voltage" or not robot.knows(VOLTAGE) or column is None:
         return ""
     ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
-    reached = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
-    read, is_shown = runs[column], np.isfinite(runs[column]) & (reached > 0)
+    highest = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
+    read, is_shown = runs[column], np.isfinite(runs[column]) & (highest > 0)
     is_shown &= np.abs(np.nan_to_num(read)) > 0
     if not is_shown.any():
         return ""
-    share = float(np.median(np.abs(read[is_shown]) / reached[is_shown]))
+    share = float(np.median(np.abs(read[is_shown]) / highest[is_shown]))
     braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
@@ -394,7 +394,7 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     heading, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
     return (
         f"{runs.source} row {row + 1}, {heading}: got {three_digits(abs(read[row]))} rpm, but with the file's "
-        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {heading} "
+        f"torque constant the motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} "
         f"and {supply}, and motor.torque_constant"
     )
 
@@ -412,13 +412,13 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    torque_at_zero, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
-    stall = np.maximum(torque_at_zero + (made - torque_at_zero) * current, 0.0)
+    torque_at_zero, torque_per_ampere = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
+    stall = np.maximum(torque_at_zero + (torque_per_ampere - torque_at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
-    beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
-    if not braked.any() or beyond.sum() <= braked.sum() / 2:
+    exceeds_stall = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
+    if not braked.any() or exceeds_stall.sum() <= braked.sum() / 2:
         return ""
-    row, heading = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
+    row, heading = int(np.flatnonzero(exceeds_stall)[0]), runs.headings.get(LOAD, LOAD)
     return (
         f"{runs.source} row {row + 1}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
         f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{heading}"'

@@ -154,11 +154,11 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     for values in columns.values():
         if not again.size:
             return is_distinct, ()
-        now, before = values[again], values[again - 1]
-        same = now == before
+        values_after, values_before = values[again], values[again - 1]
+        is_equal = values_after == values_before
         if values.dtype.kind == "f":
-            same |= np.isnan(now) & np.isnan(before)
-        again = again[same]
+            is_equal |= np.isnan(values_after) & np.isnan(values_before)
+        again = again[is_equal]
     is_distinct[again] = False
     row_words = (
         f"row {again[0] + 1} is"
@@ -218,9 +218,9 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
             f"{name}: column {other} is missing although {side_columns[0]} is present; give the command of both sides"
         )
     if side_columns and set(columns) & {"duty", "mode"}:
-        beside = min(set(columns) & {"duty", "mode"})
+        extra = min(set(columns) & {"duty", "mode"})
         raise BadData(
-            f"{name}: column {beside} in addition to {side_columns[0]}, which already gives the command of both "
+            f"{name}: column {extra} in addition to {side_columns[0]}, which already gives the command of both "
             "sides; keep one"
         )
 
@@ -461,8 +461,8 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
             )
     alike: dict[tuple[Any, ...], list[int]] = {}
     settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
-    told = [columns[column].tolist() for column in settled]
-    for row, cells in enumerate(zip(*told, strict=True), 1):
+    values_of_columns = [columns[column].tolist() for column in settled]
+    for row, cells in enumerate(zip(*values_of_columns, strict=True), 1):
         alike.setdefault(cells, []).append(row)
     if copied := [rows for rows in alike.values() if len(rows) > 1]:
         others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""

@@ -266,9 +266,9 @@ def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tu
     if len(meant) < len(layout.configurations):  # the names differ only in capitals
         return cells, []
     others = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
-    odd = {c: meant[c.casefold()] for c in others if c.casefold() in meant}
-    notes = [f"{name}: configuration {c} is read as {right}" for c, right in odd.items()]
-    return [odd.get(c, c) for c in cells] if odd else cells, notes
+    renamed = {c: meant[c.casefold()] for c in others if c.casefold() in meant}
+    notes = [f"{name}: configuration {c} is read as {right}" for c, right in renamed.items()]
+    return [renamed.get(c, c) for c in cells] if renamed else cells, notes
 
 
 def _values_without_role(raw: Raw) -> np.ndarray:

@@ -275,9 +275,9 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
     levels: list[np.ndarray] = []
     divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
     for rows in rows_by_run:
-        far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
-        gaps += [int(rows[k]) for k in far]
-        for part in np.split(rows, far + 1):
+        rows_of_gaps = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
+        gaps += [int(rows[k]) for k in rows_of_gaps]
+        for part in np.split(rows, rows_of_gaps + 1):
             found_in = [part]
             for driver in divided_by:
                 found_in = [x for level in found_in for x in _levels_of(runs, driver, level, shortest, drift, step)]
@@ -333,7 +333,7 @@ def _settled_signals_of_log(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
     """Returns the readings of each channel of settled runs. If only an angle is measured, its rate."""
-    none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
+    no_angle, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
     signals = []
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
@@ -342,7 +342,9 @@ def _settled_signals_of_log(
             )
             readings = np.where(is_glitch, np.nan, runs[c.column])
             signals.append(
-                Signal(c, readings, none, _step_of_instrument(runs, c, readings), _reading_size(readings), is_glitch)
+                Signal(
+                    c, readings, no_angle, _step_of_instrument(runs, c, readings), _reading_size(readings), is_glitch
+                )
             )
     have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
@@ -429,8 +431,8 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
 def _recent_rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
     """Rate over the last `2 * half` samples, so that samples after a level do not affect its end."""
     k = np.arange(len(x))
-    before, now = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
-    return (x[now] - x[before]) / (time[now] - time[before])
+    first_row, last_row = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
+    return (x[last_row] - x[first_row]) / (time[last_row] - time[first_row])
 
 
 def _check_alive(runs: Runs, signal: Signal) -> None:
@@ -453,13 +455,13 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
         return is_stuck
     for rows in each:
         readings = signal.shown[rows]
-        same = np.diff(readings) == 0
-        if not len(same) or same.mean() > CHANCE:
+        repeats = np.diff(readings) == 0
+        if not len(repeats) or repeats.mean() > CHANCE:
             limits = (np.nanmin(readings), np.nanmax(readings))  # coarse steps, or at its limit
-            inside = same & ~np.isin(readings[1:], limits)
-            if not len(same) or inside.mean() > CHANCE:
+            repeats_inside = repeats & ~np.isin(readings[1:], limits)
+            if not len(repeats) or repeats_inside.mean() > CHANCE:
                 continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], repeats.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
             if high - low >= STUCK and readings[low] != 0:
                 is_stuck[rows[low : high + 1]] = True
@@ -782,8 +784,10 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
     sd = spread * math.sqrt(_correlation_time(residual) / len(x))
     if signal.step > 0:  # without noise all readings round the same way; noise makes the error of their mean smaller
         # Two readings do not show how often noise moves one to the other.
-        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
-        rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
+        noise_in_steps = (
+            max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
+        )
+        rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * noise_in_steps) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
 
@@ -969,8 +973,8 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
     """
     readings = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
-        none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
-        state = State(none, jnp.ones(()), jnp.asarray(turns), none)
+        zero, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
+        state = State(zero, jnp.ones(()), jnp.asarray(turns), zero)
         speeds = {c.name: _reading(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
         readings[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
     return readings
@@ -979,12 +983,12 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, if known."""
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
-    found = {}
+    inertias = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         at_motor = inertia_at_motor(robot, load)
-        none, one = jnp.zeros(()), jnp.ones(())
+        zero, one = jnp.zeros(()), jnp.ones(())
         rolling = float(load.radius) / ratio
-        states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
+        states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)  # of 1 A, and of 1 rad/s
         currents, speeds = (
             {c.name: _reading(robot, k, c, state) for c in settled_channels(robot)} for state in states
         )
@@ -994,8 +998,8 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
         currents[""] = 1.0  # of the imposed one
         if is_known and speed and at_motor > 0 and constant > 0:
             per_rate = at_motor / constant * currents[current] / speeds[speed]
-            found[name] = Inertia(speed, current, per_rate, least=1e-3)
-    return found
+            inertias[name] = Inertia(speed, current, per_rate, least=1e-3)
+    return inertias
 
 
 def _reading(robot: Robot, configuration: int, channel: Channel, state: State) -> float:

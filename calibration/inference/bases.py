@@ -339,8 +339,8 @@ def window_families(
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
                 first = low + k * size / 2
-                inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
-                offered.append((axis, x, counts & inside & (not sorted_runs)))
+                is_inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
+                offered.append((axis, x, counts & is_inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
             continue
@@ -351,9 +351,9 @@ def window_families(
         offered += [(condition, x, counts & (x == level)) for level in levels]
         offered += [(condition, x, np.zeros_like(counts))] * (MOST_LEVELS - len(levels))
     shapes = [
-        (inside.astype(float), str(Window(axis, float(x[inside].min()), float(x[inside].max()))))
-        for axis, x, inside in offered
-        if FEWEST <= inside.sum() <= 0.5 * counts.sum()
+        (is_inside.astype(float), str(Window(axis, float(x[is_inside].min()), float(x[is_inside].max()))))
+        for axis, x, is_inside in offered
+        if FEWEST <= is_inside.sum() <= 0.5 * counts.sum()
     ]
     if not shapes:
         return ()

@@ -151,11 +151,11 @@ def hold_out_errors(
     percent, unreachable = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
-        inside = held.block == k
-        alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
+        is_in_block = held.block == k
+        alone = [np.where(is_in_block[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = BlockErrors(
             _channel_errors(posed.channels, alone[0], measured, sd, alone[1]),
-            _row_numbers(inside & unreachable),
+            _row_numbers(is_in_block & unreachable),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))

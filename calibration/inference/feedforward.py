@@ -312,8 +312,11 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
         ramp = _is_ramp(_driven_voltages(u))
         for a in range(len(t) - count):
             b = a + count
-            inside = v[a : b + 1]
-            if np.any(np.sign(inside) != np.sign(inside[0])) or np.abs(inside).min() <= smallest_speed:
+            speeds_inside = v[a : b + 1]
+            if (
+                np.any(np.sign(speeds_inside) != np.sign(speeds_inside[0]))
+                or np.abs(speeds_inside).min() <= smallest_speed
+            ):
                 continue
             length = t[b] - t[a]
             if length > 3 * WINDOW and length > 2 * count * step:
@@ -321,7 +324,7 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
             c, s = (length * np.mean(f(place[a : b + 1])) for f in (np.cos, np.sin))
             windows.append({
                 "run": log.run[rows[0]], "row": rows[a], "count": count, "u": driven[b] - driven[a],
-                "x": path[b] - path[a], "T": length, "s": np.sign(inside[0]) * length, "dv": v[b] - v[a],
+                "x": path[b] - path[a], "T": length, "s": np.sign(speeds_inside[0]) * length, "dv": v[b] - v[a],
                 "cos": c, "sin": s, "quasistatic": ramp,
             })  # fmt: skip
     keys = ("run", "row", "count", "u", "x", "T", "s", "dv", "cos", "sin", "quasistatic")
@@ -362,8 +365,8 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
     middle = scored.T @ scored
     for lag in range(1, w["count"][0] + 1):  # weights of Newey and West (1987)
         near = (w["row"][lag:] - w["row"][:-lag] == lag) & (w["run"][lag:] == w["run"][:-lag])
-        beside = (scored[lag:] * near[:, None]).T @ scored[:-lag]
-        middle += (1 - lag / (w["count"][0] + 1)) * (beside + beside.T)
+        lagged_product = (scored[lag:] * near[:, None]).T @ scored[:-lag]
+        middle += (1 - lag / (w["count"][0] + 1)) * (lagged_product + lagged_product.T)
     spread = inverse @ middle @ inverse
     b, kA = solved[0], 1 / solved[0]
     names = [solved[1] / b, solved[2] / b, kA]
@@ -393,9 +396,9 @@ def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, C
     shifts = [*np.arange(-8, 8) / 8, *np.arange(2, 2 * LONGEST / step) / 2]
     for delay in step * np.array(sorted(shifts, key=abs)):
         windows = _motion_windows(log, float(delay))
-        plain = _fit_constants(windows, mechanism)[2]
+        misfit = _fit_constants(windows, mechanism)[2]
         level, bend, cost = _slope_change(windows, mechanism)
-        trials += [(plain, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
+        trials += [(misfit, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
     count = 0.5 * len(trials[0][2]["u"]) / trials[0][2]["count"][0]
 
     def penalised(trial: tuple[float, float, Columns, float, float]) -> float:
@@ -413,7 +416,7 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
 
     A negative change is less acceleration (a current limit), a positive one more (slipping wheels). Sets `demand`.
     """
-    values, _, plain = _fit_constants(w, mechanism)
+    values, _, misfit = _fit_constants(w, mechanism)
     level, bend, cost, material = 0.0, 0.0, np.inf, False
     for _ in range(3):
         demanded_slope = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
@@ -421,8 +424,8 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
         trials = []
         for share in np.linspace(0.15, 0.9, 16):
             limit = share * w["demand"].max()
-            above = w["demand"] > limit
-            if above.sum() >= 3 and (~above).sum() >= WINDOWS:
+            above_limit = w["demand"] > limit
+            if above_limit.sum() >= 3 and (~above_limit).sum() >= WINDOWS:
                 hinge = np.sign(demanded_slope) * np.maximum(w["demand"] - limit, 0) * w["T"]
                 matrix = np.column_stack([_regression_matrix(w, mechanism), hinge])
                 slope = np.linalg.lstsq(matrix, w["dv"], rcond=None)[0]
@@ -430,8 +433,8 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
         if not trials:
             break
         cost, level, slope = min(trials, key=lambda x: x[0])
-        above = w["demand"] > level
-        material = plain - cost > LEAST**2 * np.sum(w["dv"][above] ** 2)
+        above_limit = w["demand"] > level
+        material = misfit - cost > LEAST**2 * np.sum(w["dv"][above_limit] ** 2)
         bend, values = float(slope[-1] / slope[0]), slope[1:] / slope[0]
     return level, bend, cost if material else np.inf
 

@@ -108,10 +108,10 @@ def predict_identifiability(
     posed = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
     z = jnp.zeros(len(names))
     observation = optimizers.observe_at(posed, z)
-    reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
+    is_reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
         np.asarray(observation.status)
     )
-    data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
+    data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(is_reached, float)[:, None])
     about = identifiability.analyse_identifiability(posed, z, data)
     is_prior_bound = identifiability.held_by_prior(about.sd)
     fields = priors.parameters_by_name(robot)
@@ -157,11 +157,11 @@ def _separating_columns(
     table = dataclasses.replace(runs, columns=columns, layout=layout)
     sd = np.ones((len(runs), len(wide.channels)))
     problem = observers.pose_problem(table, wide, posed.coordinates, sd)
-    found = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
-    shown, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in found)
+    linearised = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
+    readings, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in linearised)
     covariances = {}
     for k, channel in enumerate(wide.channels):
-        size = channel.sd_share * np.sqrt(np.mean(shown[:, k] ** 2))
+        size = channel.sd_share * np.sqrt(np.mean(readings[:, k] ** 2))
         if channel not in channels and size > 0:
             rows = np.concatenate([about.jacobian, slopes[:, k] / size, np.eye(len(about.sd))])
             covariances[channel.column] = np.linalg.inv(rows.T @ rows)

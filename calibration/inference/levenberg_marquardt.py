@@ -98,13 +98,13 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
         better = values < lowest
         return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, values, lowest)
 
-    still = jnp.zeros(jacobian.shape[1])
+    zero_step = jnp.zeros(jacobian.shape[1])
 
     def has_changed(carry: tuple) -> Array:
         turns, active, before, _, _ = carry
         return (turns == 0) | (turns < TURNS) & jnp.any(active != before)
 
-    start = jnp.asarray(0), height > 0, height > 0, still, jnp.asarray(jnp.inf)
+    start = jnp.asarray(0), height > 0, height > 0, zero_step, jnp.asarray(jnp.inf)
     return jax.lax.while_loop(has_changed, iterate, start)[3]
 
 

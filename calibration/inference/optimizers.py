@@ -458,14 +458,14 @@ def _search_with_states(
     go_on = _continue_searches_separately if problem.observe.apart else go_on
 
     def search_on_core(core: int) -> dict[int, Any]:
-        assigned, at = SearchQueue(range(core, count, cores), places), idle
+        assigned, states = SearchQueue(range(core, count, cores), places), idle
         while assigned:
             fresh = np.isin(np.arange(places), assigned.fill())
             own_members = jax.tree.map(lambda x: x[assigned.member], members)
             running = int(assigned.taken.sum())
             enough = places - running + (max(1, places // 4) if assigned.waiting else running)
-            at, results = go_on(problem, own_members, fresh, at, np.asarray(enough), step_limit)
-            assigned.leave(*jax.device_get((at[1].over, (results, at[1]))))
+            states, results = go_on(problem, own_members, fresh, states, np.asarray(enough), step_limit)
+            assigned.leave(*jax.device_get((states[1].over, (results, states[1]))))
         return assigned.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step

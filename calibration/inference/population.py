@@ -159,8 +159,12 @@ class MemberRunner:
     def __init__(self, posed: Problem, file: Path | None = None, together: int | None = None) -> None:
         self._together = together or TOGETHER[jax.default_backend() != "cpu"]
         # The noise is excluded, because it may be estimated again during the search.
-        bare = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
-        self._posed, self._file, self._own = posed, file, problem_hash(dataclasses.replace(posed, data=bare))
+        data_without_noise = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
+        self._posed, self._file, self._own = (
+            posed,
+            file,
+            problem_hash(dataclasses.replace(posed, data=data_without_noise)),
+        )
         self._kept: dict[bytes, tuple[np.ndarray, ...]] = {}
         if file is not None and file.exists():
             self._load(file)
@@ -288,10 +292,14 @@ def run_evolution(
             minutes = (time.perf_counter() - start_time) / 60
             tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
-        now = members.run(points, advance)
+        generation = members.run(points, advance)
         z = points if rows is None else np.concatenate([z, points])
-        rows = now if rows is None else MemberObservations(*map(np.concatenate, zip(rows, now, strict=True)))
-        cost = np.concatenate([cost, objective(points, now)])
+        rows = (
+            generation
+            if rows is None
+            else MemberObservations(*map(np.concatenate, zip(rows, generation, strict=True)))
+        )
+        cost = np.concatenate([cost, objective(points, generation)])
         own_cost = cost[-size:]
         search.tell(
             [
@@ -299,7 +307,7 @@ def run_evolution(
                 for d, c in zip(sample, np.where(np.isfinite(own_cost), own_cost, MISSING**2), strict=True)
             ]
         )
-        failed = int(np.sum(members.lost(now).any(-1)))
+        failed = int(np.sum(members.lost(generation).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
         tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
         population = Population(z, *rows, cost, tuple(progress))

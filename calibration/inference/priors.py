@@ -388,9 +388,9 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
         BadConfiguration: there is no such parameter. The message names the option and the choices.
     """
     if word.endswith(".*"):
-        below = [n for n in everything if n.startswith(word[:-1])]
-        if below:
-            return below
+        names_below = [n for n in everything if n.startswith(word[:-1])]
+        if names_below:
+            return names_below
         groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
         raise BadConfiguration(f"{option} {word}: no parameters below it; {allowed_words(word, groups)}")
     if word not in everything:

@@ -65,13 +65,15 @@ def _status_remarks(found: CalibrationResult) -> Iterator[Remark]:
 
 
 def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
-    if near_prior := tuple(name for name in found.undetermined if name not in far):
+    far_names = {
+        name for name, p in found.parameters.items() if abs(p.shift) > FAR
+    }  # these get a remark of their own
+    if near_prior := tuple(name for name in found.undetermined if name not in far_names):
         yield Remark("held_by_prior", names=near_prior)
     if pairs := found.together:
         yield Remark("only_together", pairs=pairs)
     for name, p in found.parameters.items():
-        if name in far:
+        if name in far_names:
             yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="calibration")
     for name, p in found.parameters.items():
         if p.at_bound:

@@ -67,5 +67,8 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
 
 def _median_tail(median: float, count: int) -> float:
     """Probability that the median magnitude of `count` standard normal numbers is at least `median`."""
-    beyond, needed_count = math.erfc(median / math.sqrt(2)), (count + 1) // 2
-    return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(needed_count, count + 1))
+    tail_probability, needed_count = math.erfc(median / math.sqrt(2)), (count + 1) // 2
+    return sum(
+        math.comb(count, k) * tail_probability**k * (1 - tail_probability) ** (count - k)
+        for k in range(needed_count, count + 1)
+    )

@@ -239,10 +239,10 @@ def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
         length: length of the window [s].
     """
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
-    inside = (share > 0) & (share < 1)
+    is_inside = (share > 0) & (share < 1)
     rise = np.pi / length
     derivatives = s**8, 8 * rise * s**7 * c, 8 * rise**2 * s**6 * (7 * c**2 - s**2)
-    return tuple(np.where(inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
+    return tuple(np.where(is_inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
 
 
 def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -289,12 +289,12 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
 
 def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
     """Slope at each point of a cubic through the `count` points around it, within its segment."""
-    out = np.zeros(len(time))
+    slopes = np.zeros(len(time))
     starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
     for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
         wide = min(count, end - begin)
         if wide < FEWEST // 2:
-            out[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
+            slopes[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
             continue
         low = np.clip(np.arange(begin, end) - wide // 2, begin, end - wide)
         for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * wide // 1_000_000):
@@ -304,8 +304,8 @@ def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count:
             powers = (away / scale)[:, :, None] ** np.arange(4)
             normal = np.einsum("nwi,nwj->nij", powers, powers)
             rise = np.einsum("nwi,nw->ni", powers, values[near] - values[row_index])
-            out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
-    return out
+            slopes[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
+    return slopes
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
@@ -448,7 +448,7 @@ def points_and_windows(
     for name, x in mean.items():
         conditions = with_condition(conditions, name, x)
     time, readings, sd = joined["time"], joined["shown"], joined["sd"]
-    since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
+    time_steps = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
     stretch_index = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
     wide, noise, rate = FEWEST, 0.0, np.zeros(len(run))
@@ -463,10 +463,10 @@ def points_and_windows(
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(stretch_index) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
         rate = local_slopes(time, readings[:, plan.motion], piece, wide)
-    turned_angle = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
-    none = np.zeros(len(run))
-    arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], since, time, joined["row"]
-    late = none + delay, none + log.step, drift
+    turned_angle = np.cumsum(np.where(time_steps > 0, 0.5 * (speed + np.roll(speed, 1)) * time_steps, 0.0))
+    zeros = np.zeros(len(run))
+    arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], time_steps, time, joined["row"]
+    late = zeros + delay, zeros + log.step, drift
     windows = [
         _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))
         for r in range(len(parts))
@@ -485,8 +485,8 @@ def _weight_windows(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, 
         length = (time[rows[-1]] - time[rows[0]]) / max(share[-1] - share[0], 1e-12)
         index[k, :n] = rows
         values[3, k, :n] = np.gradient(time[rows])
-        plain = np.array(window_function(share, length)) * values[3, k, :n]
-        values[:3, k, :n] = _exact_weights(plain, share, length)
+        weights = np.array(window_function(share, length)) * values[3, k, :n]
+        values[:3, k, :n] = _exact_weights(weights, share, length)
     return RunWindows(run, index, *values)
 
 
@@ -536,9 +536,9 @@ def _travel_directions(
     if plan.imposed == "motor_speed":
         speed, offset = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
     else:
-        robot, none = problem.base, jnp.zeros(())
+        robot, zero = problem.base, jnp.zeros(())
         chassis = robot.configurations.members[0]
-        rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
+        rolling = State(zero, robot.gearbox.ratio, chassis.radius, zero, distance=chassis.radius)
         per = 1 / float(
             problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
         )

@@ -136,8 +136,8 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     """
     points, conditions = candidates.points, candidates.conditions
     outputs_known = known_outputs(study.robot)
-    shown = tuple(outputs_known[c.name] for c in study.robot.channels)
-    model = dataclasses.replace(study.model, outputs=shown, fidelity="steady", options={})
+    channel_outputs = tuple(outputs_known[c.name] for c in study.robot.channels)
+    model = dataclasses.replace(study.model, outputs=channel_outputs, fidelity="steady", options={})
     p = len(study.inputs.parameters)
     if not p:
         return None
@@ -153,8 +153,8 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     answer = model(values, conditions)
     derivatives = model.derivatives(values, conditions)
     inner = study.inputs.slope[:, :p]
-    jacobian = np.stack([derivatives[o.name] @ inner for o in shown], 1)
-    reading = np.stack([answer.values[o.name] for o in shown], 1)
+    jacobian = np.stack([derivatives[o.name] @ inner for o in channel_outputs], 1)
+    reading = np.stack([answer.values[o.name] for o in channel_outputs], 1)
     finite = np.isfinite(reading).all(1)
     if not finite.any():
         return None

@@ -184,8 +184,8 @@ def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> Sob
     variance, first = terms.variance[replicate_slice], terms.first[replicate_slice]
     second = None
     if terms.second is not None:
-        beyond = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
-        second = ratio_estimate(beyond, variance)
+        interaction = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
+        second = ratio_estimate(interaction, variance)
     return SobolIndices(
         ratio_estimate(first, variance),
         ratio_estimate(terms.total[replicate_slice], variance),

@@ -85,8 +85,8 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     power_needed = np.zeros(len(p))
     for r in speeds:
         v = r.envelope
-        inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
-        power_needed = np.where(inside, np.maximum(power_needed, r.limit or 0.0), power_needed)
+        is_required = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
+        power_needed = np.where(is_required, np.maximum(power_needed, r.limit or 0.0), power_needed)
     robot = params.without_weak_types(robot)
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None

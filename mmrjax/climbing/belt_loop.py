@@ -78,8 +78,8 @@ class BeltLoop(eqx.Module):
         def integral(s: Array) -> Array:
             total = jnp.zeros_like(s)
             for begin, end, radius in zip(self.marks[::2], self.marks[1::2], (self.first, self.second), strict=True):
-                within = jnp.clip(s - begin, 0.0, end - begin)
-                total = total + (within**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
+                length_inside = jnp.clip(s - begin, 0.0, end - begin)
+                total = total + (length_inside**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
             return total
 
         mean = (integral(place + half) - integral(place - half)) / self.grouser_length

@@ -177,13 +177,13 @@ def climb_derivatives(
         (rotated_run, jax.tree.map(lambda x: x[:, :count], changed)),
     )
     offsets = np.linspace(-1, 1, BESIDE)
-    beside = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
-    more = jax.vmap(given)(beside)
+    nearby_values = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
+    more = jax.vmap(given)(nearby_values)
     batch = climb.climb_batch(
         *more, duration=duration, step=step, sample=sample, part=part,
         progress=None if progress is None else lambda share: progress((1 + share) / 2),
     )  # fmt: skip
-    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
+    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(nearby_values)))
     others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
     slope, sd = {}, {}
     for name in gradients:

@@ -380,8 +380,8 @@ def _drive_action(
         low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
     # beyond its range a lever is not driven further
     angles = _convert_lever_angles(*motion.q[LED])
-    above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
-    up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
+    above_range, below_range = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
+    up, down = jnp.stack([above_range[0], below_range[1]]), jnp.stack([below_range[0], above_range[1]])
     low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
     return step_levers(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
 
@@ -440,8 +440,8 @@ def advance_climb(
 
     charge = balances.charge_drawn(robot, run.conditions, signals.total_current)
     current = current_after(robot, _driven(run, on), step, signals)
-    drawn = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
-    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
+    lever_current = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
+    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, lever_current)
 
     pair = run.drive
     # (1 / step) is the compiler's form of a division by a constant: a step passed as an argument gives the same bits
@@ -476,11 +476,11 @@ def advance_climb(
     total = jnp.sum(touching.force)
     adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
-    passed = ClimbRecord(
+    record = ClimbRecord(
         time=time,
         motion=motion,
         current=signals.current,
-        total_current=signals.total_current + drawn,
+        total_current=signals.total_current + lever_current,
         voltage=signals.voltage,
         torque=up * swung.torque,
         lever_current=up * swung.current,
@@ -495,7 +495,7 @@ def advance_climb(
         centre=centre,
         base=_distances_to_outermost_contacts(centre, touching),
     )
-    return after, spent, passed
+    return after, spent, record
 
 
 def _distances_to_outermost_contacts(centre_of_mass: Scalar, at: Footing) -> Pair:
@@ -617,9 +617,9 @@ def advance_samples(
         motion, energy, progress = state
 
         def small(j: Array, carry: Any) -> Any:
-            *after, passed = advance_climb(run, carry[0], first + (k * steps + j) * run.step, carry[1])
-            base = jnp.maximum(passed.base, carry[2].base)
-            return (*after, dataclasses.replace(passed, base=base))
+            *after, record = advance_climb(run, carry[0], first + (k * steps + j) * run.step, carry[1])
+            base = jnp.maximum(record.base, carry[2].base)
+            return (*after, dataclasses.replace(record, base=base))
 
         nothing = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)

@@ -219,24 +219,24 @@ def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Ar
 
     `high` if it does not become negative. Derivatives are implicit, forward and reverse.
     """
-    still = jax.lax.stop_gradient(robot)
+    constant_robot = jax.lax.stop_gradient(robot)
 
     def halve(bracket: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         a, b = bracket
         middle = (a + b) / 2
-        holds = margin(still, middle) > 0
+        holds = margin(constant_robot, middle) > 0
         return (jnp.where(holds, middle, a), jnp.where(holds, b, middle)), None
 
     begin, end = jax.lax.stop_gradient((low, high))
     (a, b), _ = jax.lax.scan(halve, (begin, end), None, length=HALVINGS)
-    at = (a + b) / 2
-    steep = jax.jvp(lambda x: margin(still, x), (at,), (jnp.ones_like(at),))[1]
+    root = (a + b) / 2
+    steep = jax.jvp(lambda x: margin(constant_robot, x), (root,), (jnp.ones_like(root),))[1]
     usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
-    step = margin(robot, at) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
-    edge = at - jnp.where(usable & jnp.isfinite(step), step, 0.0)
+    step = margin(robot, root) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
+    edge = root - jnp.where(usable & jnp.isfinite(step), step, 0.0)
     # A margin that jumps has no root for a Newton step.
-    edge = jnp.where(jnp.abs(edge - at) < 1e-3 * (end - begin) + 1e-9, edge, at)
-    return jnp.where(margin(still, end) > 0, high, edge), margin(still, begin) > 0
+    edge = jnp.where(jnp.abs(edge - root) < 1e-3 * (end - begin) + 1e-9, edge, root)
+    return jnp.where(margin(constant_robot, end) > 0, high, edge), margin(constant_robot, begin) > 0
 
 
 #: Nodes of the integral over the charge.
@@ -307,12 +307,12 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
     chassis = robot_there.chassis(conditions.configuration)
-    stands = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
+    stance = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
     friction = chassis.ground.friction.static * point.adhesion
     rolling_share = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
     # A root of 0 has no derivative.
-    slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
-    tips = stands.width / (2 * stands.height)
+    slides = friction * stance.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
+    tips = stance.width / (2 * stance.height)
     return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 

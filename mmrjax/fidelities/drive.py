@@ -75,8 +75,10 @@ def state_of_unknowns(robot: Robot, y: Unknowns) -> State:
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     first = len(_UNITS) + len(memory)
-    own = dict(zip(("integral", "command"), y[first : first + robot.controller_size], strict=False))
-    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None, **own)
+    controller_states = dict(zip(("integral", "command"), y[first : first + robot.controller_size], strict=False))
+    return State(
+        y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None, **controller_states
+    )
 
 
 #: The signals of an instant, traced once for each kind of robot and shared within a program.
@@ -162,8 +164,8 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
     radius = robot.chassis(conditions.configuration).radius
     turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
     rolling, none = radius * turning / robot.gearbox.ratio, jnp.zeros(())
-    still = State(none, turning, rolling, none, distance=radius * begin.angle)
-    conditions = balances.with_controller_duty(robot, conditions, still)
+    state_without_slip = State(none, turning, rolling, none, distance=radius * begin.angle)
+    conditions = balances.with_controller_duty(robot, conditions, state_without_slip)
     voltage_left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
         share = jnp.abs(balances.bridge_duty(robot, conditions)) if robot.driver.decay == FAST else 1.0

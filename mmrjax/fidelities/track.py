@@ -169,14 +169,14 @@ def _advance_and_record(
     kind = _moving_system_module(run.conditions)
 
     def small(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[Any, Array]]:
-        after, passed, guided = kind.advance(run, motion)
-        return after, (passed, guided)
+        after, record, guided = kind.advance(run, motion)
+        return after, (record, guided)
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
     def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
         after, records = jax.lax.scan(small, motion, None, length=steps)
-        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
-        return after, SampleRecord(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
+        record, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
+        return after, SampleRecord(after, record, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)
 

@@ -370,7 +370,7 @@ def _recorded_course(
     index = jnp.arange(len(ys))
     # Segment of each recorded step: the first one with a larger step count.
     segment = jnp.minimum(jnp.searchsorted(kept, index, side="right"), len(kept) - 1)
-    within = index < kept[-1]
+    is_recorded = index < kept[-1]
     begin_times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
     so_far = {
         name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
@@ -386,12 +386,12 @@ def _recorded_course(
     winding, housing = _winding_and_housing_temperatures(law, ys)
 
     def shown(x: Array) -> Array:
-        return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
+        return jnp.where(is_recorded.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return MissionCourse(
         time=shown(begin_times + ys[:, law.CLOCK]),
-        segment=jnp.where(within, segment, -1),
-        event=jnp.where(within, marks, -1),
+        segment=jnp.where(is_recorded, segment, -1),
+        event=jnp.where(is_recorded, marks, -1),
         distance=shown(so_far["distance"]),
         path=shown(so_far["path"]),
         energy=shown(so_far["drawn"] - so_far["returned"]),

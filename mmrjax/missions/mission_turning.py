@@ -125,15 +125,15 @@ def instant(
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
     copper = copper * robot.driver.ripple(signals.duty)
-    still = jnp.where(stands, 0.0, 1.0)
+    moves = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
-        still * signals.acceleration_wheel * robot.gearbox.ratio,
+        moves * signals.acceleration_wheel * robot.gearbox.ratio,
         *robot.heating(copper, winding, housing),
         demand.integral_rate,
-        still * travel.acceleration,
-        still * travel.acceleration_lateral,
-        still * travel.acceleration_yaw,
+        moves * travel.acceleration,
+        moves * travel.acceleration_lateral,
+        moves * travel.acceleration_yaw,
         motion.yaw_rate,
         balances.charge_drawn(demand.robot, demand.conditions, jnp.asarray(signals.total_current)[0]),
         1.0,

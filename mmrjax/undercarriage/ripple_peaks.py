@@ -94,8 +94,8 @@ def measure_fluctuation(time: Series, values: Series) -> Fluctuation:
 
 
 def _parabola_vertex(values: Series, k: int) -> float:
-    below, middle, above = values[k - 1 : k + 2]
-    return float(k + (below - above) / (2 * (below - 2 * middle + above)))
+    value_before, value_at, value_after = values[k - 1 : k + 2]
+    return float(k + (value_before - value_after) / (2 * (value_before - 2 * value_at + value_after)))
 
 
 def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:

@@ -189,10 +189,10 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
         yield "other units", ", ".join(c.other_units)
     yield "typical noise", f"{100 * c.sd_share:g} % of the reading, which is assumed if you give no noise"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
-    wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
-    if wrong:
-        yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(experiment_words.effect_tests(wrong[0])):
+    sensor_effects = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
+    if sensor_effects:
+        yield "its errors", ", ".join(e.name for e in sensor_effects)
+        for k, test in enumerate(experiment_words.effect_tests(sensor_effects[0])):
             yield "" if k else "on a bench", test
 
 

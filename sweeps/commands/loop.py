@@ -69,7 +69,7 @@ def _run_with_time_limit(
 
 
 def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
-    began, within = time.monotonic(), beside.seconds
+    began, time_budget = time.monotonic(), beside.seconds
     prior_options = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, beside.members)
@@ -78,7 +78,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
     stages: dict[str, Any] = {}
 
     def left() -> float:
-        return max(within - (time.monotonic() - began), 0.0)
+        return max(time_budget - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
         elapsed = time.monotonic() - began
@@ -112,7 +112,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                _report_out_of_time(within, begun=bool(stages))
+                _report_out_of_time(time_budget, begun=bool(stages))
             _report_stored_stages(stages, folder, config.robot)
             raise
         if config.resolve:

@@ -157,10 +157,10 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
         return
     conditions = run.conditions_of_runs(robot, runs, config)
     cell = mission_batch.cell_below_cutoff(robot, conditions, source.profile(robot, conditions), source.start)
-    below = np.flatnonzero(np.isfinite(cell))
-    if len(below):
+    too_low = np.flatnonzero(np.isfinite(cell))
+    if len(too_low):
         raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[below[0]]:.4g} V, below its "
+            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[too_low[0]]:.4g} V, below its "
             f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
         )
 
@@ -196,9 +196,9 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
             is_complete &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             done += count
             advance(count)
-    about = _condition_columns(robot, runs, source, config)
+    conditions_table = _condition_columns(robot, runs, source, config)
     return Missions(
-        {**about, **_concatenate_tables(tables)},
+        {**conditions_table, **_concatenate_tables(tables)},
         _concatenate_tables(segments),
         _concatenate_tables(courses),
         source,
@@ -218,10 +218,10 @@ def _condition_columns(
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
     unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
-    about = {key: nothing if key in unknown else value for key, value in run.condition_table(robot, runs).items()}
+    columns = {key: nothing if key in unknown else value for key, value in run.condition_table(robot, runs).items()}
     if source.surface is not None:
-        about.pop(profiles.SURFACE, None)
-    return about
+        columns.pop(profiles.SURFACE, None)
+    return columns
 
 
 def _segment_rows(
@@ -265,8 +265,8 @@ def _segment_rows(
         "mode",
         *(c for c in mission_batch.mission_columns(source.turns) if c in rows),
     ]
-    reached = time.ravel() > 0
-    return {column: rows[column][reached] for column in (*order, "status", "flags")}
+    is_reached = time.ravel() > 0
+    return {column: rows[column][is_reached] for column in (*order, "status", "flags")}
 
 
 def _segment_of_steps(found: Mission, k: int) -> np.ndarray:

@@ -113,8 +113,8 @@ class _UrdfRobot:
         moved_links = list(self._moved(link))
         inertia, moment, count = 0.0, np.zeros(3), 0
         for name, pose in moved_links:
-            mass, about, first = self._inertial(name, pose, axis)
-            inertia, moment, count = inertia + about, moment + first, count + (mass > 0)
+            mass, inertia_about_axis, first = self._inertial(name, pose, axis)
+            inertia, moment, count = inertia + inertia_about_axis, moment + first, count + (mass > 0)
         named = (
             f"link {link}"
             if len(moved_links) == 1
@@ -123,8 +123,8 @@ class _UrdfRobot:
         if count == 0:
             raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
         if inertia < LEAST_INERTIA:
-            got = f"{round(inertia, 12):g} kg·m² about the axis of {joint}"
-            raise BadConfiguration(f"{self.file}, {named}, <inertia>: got {got}; expected more than 0")
+            inertia_text = f"{round(inertia, 12):g} kg·m² about the axis of {joint}"
+            raise BadConfiguration(f"{self.file}, {named}, <inertia>: got {inertia_text}; expected more than 0")
         radius = self._radius(joint)
         level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
         rolls = radius is not None and level and root_link != FIXED_ROOT and element.get("type") == "continuous"

@@ -78,9 +78,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 report_stage(stages - 1, stages, "the turn over time", slow),
                 progress_bar(1, quiet=not slow) as advance,
             ):
-                told = scale.share_counter(advance, 1)
-                first = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
-                told(1.0)
+                report_share = scale.share_counter(advance, 1)
+                first = jax.device_get(fidelity.histories(robot, conditions, config.options, report_share))
+                report_share(1.0)
             turns, history = None, first.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, readings))
@@ -88,11 +88,11 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
-            stands = posture_words.posture_of_runs(robot, runs, conditions)
+            postures = posture_words.posture_of_runs(robot, runs, conditions)
         notes = []
-        if stands is not None:
-            folder.write_table("posture.csv", stands.table)
-            notes.append(posture_words.posture_sentences(stands))
+        if postures is not None:
+            folder.write_table("posture.csv", postures.table)
+            notes.append(posture_words.posture_sentences(postures))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
         document = turn_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
         return run.write_run_folder(folder, config, result, print_report(document, file))
@@ -143,9 +143,9 @@ def _run_for_demand(
     turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
     for share in LOADED:
         first_guess = turning + share * np.abs(turning).max() * np.sign(belts)
-        found = scipy.optimize.root(off, first_guess, options={"maxfev": TRIED})
-        volts = found.x
-        if np.abs(found.fun).max() < NEAR:  # not NaN
+        solution = scipy.optimize.root(off, first_guess, options={"maxfev": TRIED})
+        volts = solution.x
+        if np.abs(solution.fun).max() < NEAR:  # not NaN
             break
     else:
         volts = np.full(2, np.inf)

@@ -120,26 +120,28 @@ def compare_format(
     """
     joint = situation.joint
     law = law_of(joint, {})
-    inside = situation.inside
-    theta = refit_parameters(law, situation, inside)
+    joint_result = situation.inside
+    theta = refit_parameters(law, situation, joint_result)
     names = tuple(e.name for e in joint.inside)
     fates_found = list(fates)
     for effect in joint.inside:
         without_effect = situation.solve_without_effects((effect.name,))
-        share = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, without_effect)
+        share = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, joint_result, without_effect)
         verdict = HELD if effect.name in held else DROPPED if share < LITTLE else APPROXIMATED
-        how = held.get(effect.name) or approximated(effect.balance)
+        approximation = held.get(effect.name) or approximated(effect.balance)
         if not np.isfinite(share) and effect.name not in held:
-            verdict, how = DROPPED, "it has no effect on these runs, and the format has no term for it"
-        fates_found.append(EffectFate(effect.name, verdict, how, share))
+            verdict, approximation = DROPPED, "it has no effect on these runs, and the format has no term for it"
+        fates_found.append(EffectFate(effect.name, verdict, approximation, share))
     exported = _law_at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
         models[TRANSLATED] = situation.readings(_law_at(law, law.start, situation))
     if names:
-        plain = law_of(joint, dict.fromkeys(names, 0.0))
-        bare = refit_parameters(plain, situation, situation.solve_without_effects(names))
-        models[WITHOUT] = situation.readings(_law_at(plain, bare, situation))
+        law_without_effects = law_of(joint, dict.fromkeys(names, 0.0))
+        refit_without_effects = refit_parameters(
+            law_without_effects, situation, situation.solve_without_effects(names)
+        )
+        models[WITHOUT] = situation.readings(_law_at(law_without_effects, refit_without_effects, situation))
     reference = situation.measured if situation.is_measured else situation.native
     return ExportComparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),

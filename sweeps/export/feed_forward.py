@@ -215,8 +215,8 @@ def c_header(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> str:
     origin = f"Feed-forward of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     # Names come from users, so nothing in them can end the comment.
     words = (" ".join(printable(text).split()) for text in (origin, *notes))
-    about = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
-    return f"""/* {about}
+    comment = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
+    return f"""/* {comment}
  * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of steady motion.
  * When accelerating, add armature * acceleration to it.
  */

@@ -126,7 +126,7 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
         mujoco.approximated_terms,
     )
     motor, name = mujoco.mjcf_motor(drive, compared.refitted), f"{drive.name}_drive"
-    about = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
+    notes = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
@@ -134,7 +134,7 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
 
     def texts_of(drive: DriveJoint) -> dict[str, str]:
         return {
-            "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_for_file_head(runs), name, at, volts),
+            "drive.xml": mujoco.mjcf_fragment(drive, motor, notes, notes_for_file_head(runs), name, at, volts),
             "scene.xml": mujoco.mjcf_scene(
                 drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)
             ),
@@ -177,8 +177,12 @@ def _check_in_mujoco(
 def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
     """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
     times = np.linspace(0.0, START, 26)
-    own = drive.controller
-    conditions = Conditions(voltage=command) if own is None else Conditions(voltage=own.supply_voltage, goal=command)
+    controller = drive.controller
+    conditions = (
+        Conditions(voltage=command)
+        if controller is None
+        else Conditions(voltage=controller.supply_voltage, goal=command)
+    )
     run = drive_batch(
         drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
     )

@@ -146,9 +146,9 @@ class DriveJoint:
         """The same joint in steady travel under a voltage, without the controller and with a rigid gearbox."""
 
         def driven(robot: Robot) -> Robot:
-            motor, own = robot.motor, robot.controller
-            if own is not None and motor.voltage_limit is None:
-                motor = dataclasses.replace(motor, voltage_limit=float(own.supply_voltage * own.limit))
+            motor, controller = robot.motor, robot.controller
+            if controller is not None and motor.voltage_limit is None:
+                motor = dataclasses.replace(motor, voltage_limit=float(controller.supply_voltage * controller.limit))
             rig = dataclasses.replace(robot.rig, imposed="voltage", loose=False)
             return dataclasses.replace(robot, motor=motor, rig=rig, controller=None)
 
@@ -225,10 +225,12 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     one = dataclasses.replace(robot, configurations=members)
     acting = tuple(e for e in robot.effects if _effect_acts(one, e))
     idle = tuple(e.name for e in robot.effects if e not in acting)
-    inside = tuple(e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks)
-    outside = tuple(e for e in acting if e not in inside)
-    one = dataclasses.replace(one, effects=inside)
-    joint = DriveJoint(file, name, one, inside, outside, idle, ())
+    effects_inside = tuple(
+        e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks
+    )
+    outside = tuple(e for e in acting if e not in effects_inside)
+    one = dataclasses.replace(one, effects=effects_inside)
+    joint = DriveJoint(file, name, one, effects_inside, outside, idle, ())
     return dataclasses.replace(joint, parts=tuple(_trace_parts(joint)))
 
 

@@ -275,8 +275,8 @@ def step_lines(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
 
 def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
     """Lines of the controller: the voltage for a goal, and the states after the step."""
-    imposed, own, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
-    assert own is not None
+    imposed, controller, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
+    assert controller is not None
     shown = {"goal_angle": "angle", "goal_speed": "joint_velocity", "goal_current": 'state["current"]'}[imposed]
     last = (
         '- p["controller.kd"] * joint_velocity'
@@ -296,7 +296,7 @@ def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
                 'duty = state["duty"] + (demanded - state["duty"]) * dt / (p["controller.lag"] + dt)',
                 f'voltage = p["{SUPPLY}"] * duty',
             ]
-            if own.lags
+            if controller.lags
             else [f'voltage = p["{SUPPLY}"] * demanded']
         ),
     ]
@@ -453,7 +453,9 @@ def _module_text(
     volts = "voltage at the driver's output [V]: its duty times the voltage of the supply"
     document = _DOCUMENT.replace("{command}", f"goal of the controller: {goal}" if goal else volts)
     rotor = '0.0 * p["motor.inertia"]' if joint.loose else ARMATURE
-    own = "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² (η + 1/η) / 2"
+    armature_words = (
+        "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² (η + 1/η) / 2"
+    )
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
@@ -462,7 +464,7 @@ def _module_text(
         f"{_module_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
         f"{functions_text(joint, library.dialect)}\n\n\n"
         f"def armature(params):\n"
-        f'    """{own}, for the joint\'s own armature [kg·m²]."""\n'
+        f'    """{armature_words}, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
         f"    return {rotor}{added}\n\n\n"
         f"def initial_state({shape_arguments}):\n"

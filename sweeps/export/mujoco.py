@@ -191,8 +191,8 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     if joint.loose:
         how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
         fates.append(EffectFate(PLAY, HELD, how))
-    if own := joint.controller:
-        fates.append(_controller_fate(joint, float(own.lag), float(own.ki)))
+    if controller := joint.controller:
+        fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki)))
     if joint.limit is not None:
         fates.append(EffectFate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]
@@ -296,20 +296,22 @@ def _controller_gains(joint: DriveJoint, found: MjcfMotor) -> tuple[float, ...]:
 
     It wants U = (R/K) (kp e + ki ∫ e dt - kd ω_m) + K ω_m, of the motor's angle. Empty: it gets a voltage.
     """
-    own = joint.controller
-    if own is None or joint.robot.rig.imposed != "goal_angle":
+    controller = joint.controller
+    if controller is None or joint.robot.rig.imposed != "goal_angle":
         return ()
     constant = found.values[CONSTANT]
-    volts, kp, ki, kd = (own.supply_voltage * float(g) / found.ratio for g in (1.0, own.kp, own.ki, own.kd))
+    volts, kp, ki, kd = (
+        controller.supply_voltage * float(g) / found.ratio for g in (1.0, controller.kp, controller.ki, controller.kd)
+    )
     torque = constant / found.values[RESISTANCE]
-    integral_limit = float(own.limit) * found.ratio / float(own.ki) if ki else 0.0
+    integral_limit = float(controller.limit) * found.ratio / float(controller.ki) if ki else 0.0
     return (
         kp * torque,
         ki * torque,
         (kd + constant) * torque,
         0.0,
         integral_limit,
-        volts * found.ratio * float(own.limit),
+        volts * found.ratio * float(controller.limit),
     )
 
 

@@ -244,10 +244,10 @@ def _wrap_texts(fig: Figure) -> bool:
     for written in fig.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible()):
         assert isinstance(written, Text)
         text, box = written.get_text(), Text.get_window_extent(written)  # without an arrow
-        beyond = max(box.x1 - width, -box.x0, 0.0)
-        if beyond > 0 and " " in text and written.get_rotation() == 0:
+        excess_width = max(box.x1 - width, -box.x0, 0.0)
+        if excess_width > 0 and " " in text and written.get_rotation() == 0:
             longest = max(map(len, text.split("\n")))
-            room = 1 - (2 if written.get_horizontalalignment() == "center" else 1) * beyond / box.width
+            room = 1 - (2 if written.get_horizontalalignment() == "center" else 1) * excess_width / box.width
             written.set_text("\n".join(textwrap.wrap(text, max(12, int(longest * room) - 2))))
             wrapped = True
     return wrapped

@@ -270,9 +270,9 @@ def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
         axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
     # Right of the line at t', where that is beside the curve, else of the curve.
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
-    beside = 0 < start.settled < 0.5 * last and start.gets_under_way
-    label_place = (start.settled if beside else start.time[half], start.speed[half])
-    place = (6, 6) if beside else (6, -12)
+    has_room = 0 < start.settled < 0.5 * last and start.gets_under_way
+    label_place = (start.settled if has_room else start.time[half], start.speed[half])
+    place = (6, 6) if has_room else (6, -12)
     axes.annotate("$V_x$ (robot)", label_place, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)

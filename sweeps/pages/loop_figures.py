@@ -110,8 +110,8 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
     grid[-1, 0].grid(axis="x", visible=False)
     varied = own_column == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
     words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
-    within = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
-    grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
+    grouping = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
+    grid[-1, 0].set_xlabel(f"runs, in each group {grouping}; band: ±2σ of the instruments")
     return fig
 
 

@@ -60,12 +60,12 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
         axes[1].set_title(f"current of all motors, and duty{sizes}" if first else "current, and duty")
         _draw_current(axes[1], time, shown_rows, sides, legend=first)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
-        beyond = (
+        limit_words = (
             ""
             if unlimited or _limit_is_near(shown_rows, limit)
             else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
-        axes[2].set_title("temperatures" + (beyond if first else ""))
+        axes[2].set_title("temperatures" + (limit_words if first else ""))
         _draw_temperatures(axes[2], time, shown_rows, limit, legend=first)
         _draw_source(axes[3], time, shown_rows)
         axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
@@ -213,8 +213,8 @@ def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     span = float(charge.max() - charge.min())
     if span > 0.05:
         axes.set_ylim(0, 105)
-    beside = _right_axes(axes, "voltage [V]", BLUE)
-    _draw_curve(beside, time, volts, BLUE, "voltage", 0.8)
+    right_axes = _right_axes(axes, "voltage [V]", BLUE)
+    _draw_curve(right_axes, time, volts, BLUE, "voltage", 0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
         add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)

@@ -43,11 +43,11 @@ def draw_margins(found: CheckResult) -> Figure:
         share = 100 * o.margin / max(abs(requirement_limit(o)), 1e-12)
         length = float(np.clip(share, -LONGEST, LONGEST))
         ax.barh(k, length, height=0.62, color=GREEN if o.met else VERMILION)
-        beyond = "" if abs(share) <= LONGEST or is_narrow() else " (beyond the axis)"
+        beyond_words = "" if abs(share) <= LONGEST or is_narrow() else " (beyond the axis)"
         right = length >= 0
         reached = "" if is_narrow() else f"{reached_value_text(o)}, "
         ax.annotate(
-            f"{reached}{share:+.0f} %{beyond}", (length, k), xytext=(5 if right else -5, 0),
+            f"{reached}{share:+.0f} %{beyond_words}", (length, k), xytext=(5 if right else -5, 0),
             textcoords="offset points", va="center", ha="left" if right else "right", fontsize=8.5, color=INK,
         )  # fmt: skip
     ax.set_yticks(range(len(rows)), [f"{requirement_label(o)} {required_value_text(o)}" for o in rows])

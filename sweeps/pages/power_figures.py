@@ -93,8 +93,8 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     axes.set_yticks(place, names, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    beyond = 1.35 if (slope > 1e-6).any() else 1.1
-    axes.set(xlabel="power [W]", xlim=(0, beyond * float(total.max())))
+    axis_factor = 1.35 if (slope > 1e-6).any() else 1.1
+    axes.set(xlabel="power [W]", xlim=(0, axis_factor * float(total.max())))
     outer_legend(axes, "upper center")
     return fig
 
@@ -111,8 +111,8 @@ def drive_curves(robot: Robot, voltage: float) -> Columns:
     limit or to stall.
     """
     shaft = Shaft(inertia=1e-3, loss_coulomb=0.0)
-    inside = tuple(e for e in robot.effects if e.balance in INSIDE and e.acts_everywhere)
-    bench = dataclasses.replace(robot, configurations=Configurations({"shaft": shaft}), effects=inside)
+    drive_effects = tuple(e for e in robot.effects if e.balance in INSIDE and e.acts_everywhere)
+    bench = dataclasses.replace(robot, configurations=Configurations({"shaft": shaft}), effects=drive_effects)
     motor, gearbox = robot.motor, robot.gearbox
     current = min(float(motor.current_stall(voltage)), float(robot.driver.current_limit))
     torque = np.linspace(0, 1, LOADS, endpoint=False) ** 2 * float(motor.torque_constant * gearbox.ratio) * current

@@ -65,14 +65,14 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     for order in range(1, ORDERS + 1):
         at_end = order * fastest * MM / parts.travel
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
-        inside, last = at_end <= top, place
-        place = fastest if inside else fastest * 0.985 * top / at_end
-        if last - place < (0.08 if is_narrow() else 0.03) * fastest and not inside:
+        is_inside, last = at_end <= top, place
+        place = fastest if is_inside else fastest * 0.985 * top / at_end
+        if last - place < (0.08 if is_narrow() else 0.03) * fastest and not is_inside:
             break  # labels and lines would cover one another
         axes.annotate(
-            f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if inside else (0, -2),
-            textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if inside else "top",
-            bbox=None if inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
+            f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if is_inside else (0, -2),
+            textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if is_inside else "top",
+            bbox=None if is_inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
         )  # fmt: skip
     _draw_mode_bands(axes, found)
     for name, (colour, marker) in _MARKS.items():

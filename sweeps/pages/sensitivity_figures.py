@@ -81,8 +81,8 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                 if np.isfinite(end):
                     ax.barh(-place, end - value[n], left=value[n], color=colour, height=0.66)
                 else:
-                    beside = np.nanmax([value[n], *swing[:, n, i]])
-                    ax.text(beside, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
+                    right_end = np.nanmax([value[n], *swing[:, n, i]])
+                    ax.text(right_end, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
         ax.set_title(_split_label(found.points.label(panel_points[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
@@ -174,8 +174,8 @@ def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityRes
     inner = [
         f"{word} {_range_text(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1
     ]
-    within = f"; within each {' and '.join(inner)}" if inner else ""
-    ax.set_xlabel(f"{along}{within}; grey: no index there", fontsize=8.5)
+    within_words = f"; within each {' and '.join(inner)}" if inner else ""
+    ax.set_xlabel(f"{along}{within_words}; grey: no index there", fontsize=8.5)
 
 
 def _range_text(values: np.ndarray) -> str:

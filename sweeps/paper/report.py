@@ -203,8 +203,8 @@ def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows]
 def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
     current = table["total_current_A"]
-    back = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
-    return robot.sides * (table["supply_voltage_V"] - back) / current
+    back_emf = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
+    return robot.sides * (table["supply_voltage_V"] - back_emf) / current
 
 
 def _paper_rows_table(rows: data.PaperRows) -> Block:

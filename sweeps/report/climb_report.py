@@ -205,8 +205,8 @@ class ClimbResult:
             if self.largest is None:
                 smallest = min(size for size, _ in self.tried)
                 return f"It cannot climb any {self.sought} that was tried. The smallest was {smallest:.0f} mm."
-            beyond = [(s, v) for s, v in self.tried if s > self.largest]
-            next_larger = min(beyond, default=None)
+            larger_sizes = [(s, v) for s, v in self.tried if s > self.largest]
+            next_larger = min(larger_sizes, default=None)
             why = "" if next_larger is None else f"; at {next_larger[0]:.0f} mm it {VERDICTS[next_larger[1]][0]}"
             return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{why}."
         short, meaning = VERDICTS[self.verdict]

@@ -145,8 +145,8 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
             ),
             "path-section",
         )
-    back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
-    returned = f"{back:.3g} Wh returned to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
+    returns, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
+    returned = f"{returns:.3g} Wh returned to the source." if returns > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}. Driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])

@@ -89,8 +89,8 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
         flagged_count = int((settled & (runs["flags"] != "")).sum())
-        beyond = f". {flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
-        limits_words = (beyond if flagged_count else ", all within every limit") if settled.any() else ""
+        exceeding_words = f". {flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
+        limits_words = (exceeding_words if flagged_count else ", all within every limit") if settled.any() else ""
         return f"{settled.sum()} of {len(settled)} runs have an operating point{limits_words}."
     if not settled[0]:
         return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."

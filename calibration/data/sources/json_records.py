@@ -112,12 +112,12 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
         if isinstance(value.get(key), int | float) and value[key] > 0
     ]
     for inner in value if steps else ():
-        below = f"{at}.{inner}." if at else f"{inner}."
-        columns = [path[len(below) :] for path in arrays if path.startswith(below)]
+        prefix = f"{at}.{inner}." if at else f"{inner}."
+        columns = [path[len(prefix) :] for path in arrays if path.startswith(prefix)]
         if RUN in columns and not any(unit_of_clock(column) is not None for column in columns):
-            runs = arrays[below + RUN]
+            runs = arrays[prefix + RUN]
             first = np.maximum.accumulate(np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0))
-            arrays[f"{below}time_s"] = (np.arange(len(runs)) - first) * steps[0]
+            arrays[f"{prefix}time_s"] = (np.arange(len(runs)) - first) * steps[0]
 
 
 def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:

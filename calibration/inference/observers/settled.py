@@ -165,11 +165,11 @@ class SettledRuns(Observer):
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
-            for at in np.argwhere(distance > allowed)[:1]:
-                (one, other, k), at = at.tolist(), tuple(at)
+            for cell in np.argwhere(distance > allowed)[:1]:
+                (one, other, k), cell = cell.tolist(), tuple(cell)
                 first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
                 in_sds = not (noise.estimated[k] or shared[k])
-                deviation = f"{distance[at] / sd[at]:.0f} sd" if in_sds else f"{distance[at] / mean[at]:.0%}"
+                deviation = f"{distance[cell] / sd[cell]:.0f} sd" if in_sds else f"{distance[cell] / mean[cell]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
                 without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
                 torque = [c for c in (LOAD,) if c != column and runs.has(c)]

@@ -630,9 +630,9 @@ class Histories(Observer):
         """
         residual, rows, total = off(), np.asarray(self.rows_of), 0.0
         first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
-        within = (first >= 0) & (second >= 0)
+        has_both = (first >= 0) & (second >= 0)
         for k in range(residual.shape[1]):
-            is_compared = within & counts[first, k] & counts[second, k]
+            is_compared = has_both & counts[first, k] & counts[second, k]
             residual_difference = np.abs(residual[second[is_compared], k] - residual[first[is_compared], k])
             usual = (
                 residual_difference[residual_difference <= JUMP * np.median(residual_difference)]
@@ -963,8 +963,8 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
             if channel.zero_at_rest and field not in state and len(finite):
                 configuration = int(rows[run_rows[0]])
                 radius = float(robot.configurations.members[configuration].radius)
-                none, one = jnp.zeros(()), jnp.ones(())
-                rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
+                zero, one = jnp.zeros(()), jnp.ones(())
+                rolling = State(zero, one, radius / robot.gearbox.ratio, zero, distance=radius)
                 factor = 1 / float(
                     channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling))
                 )
@@ -1026,11 +1026,13 @@ def _check_signs(runs: Runs) -> None:
 
 def _undriven_remarks(runs: Runs) -> list[Remark | str]:
     """Remark on runs on a slope whose motors are not driven."""
-    still = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
-    if not still.any():
+    is_undriven = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
+    if not is_undriven.any():
         return []
     return [
-        Remark("stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))
+        Remark(
+            "stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[is_undriven]))
+        )
     ]
 
 
@@ -1127,8 +1129,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
             begins = np.where(_drive_changes(whole_log, rows, SMALL), np.arange(len(rows)), 0)
-            since = time - time[np.maximum.accumulate(begins)]
-            longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
+            time_in_run = time - time[np.maximum.accumulate(begins)]
+            longest = np.maximum(longest, np.minimum(LATER * time_in_run[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
@@ -1151,8 +1153,8 @@ def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-        far = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
-    ways = np.where(far, np.sign(speeds), 0.0)
+        is_moving = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
+    ways = np.where(is_moving, np.sign(speeds), 0.0)
     return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 

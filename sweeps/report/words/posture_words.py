@@ -108,13 +108,19 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
-    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first))
+    lever_degrees = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first))
     return Postures(
         table,
         level,
         _on_step(step),
         StepMap(
-            ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+            ANGLES,
+            found.height / MM,
+            margin / MM,
+            best,
+            float(ANGLES[front]),
+            float(ANGLES[rear]),
+            (lever_degrees[0], lever_degrees[1]),
         ),
     )
 
@@ -124,7 +130,7 @@ def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dic
 
     On a step it is the best posture, over a gap the levers are flush with the belt, and for the size they are folded.
     """
-    found: dict[str, tuple[Drawn, float, float]] = {}
+    postures: dict[str, tuple[Drawn, float, float]] = {}
     for outcome in outcomes:
         name = outcome.requirement.name
         if name not in ("step_mm", "gap_mm", "length_mm"):
@@ -140,8 +146,8 @@ def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dic
             stands = static_limits.with_lever_angles(conditions, front, rear)
             rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
             drawn = Drawn(jax.device_get(side.with_pitch(rests.pitch)), float(rests.height), 0.0)
-        found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
-    return found
+        postures[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
+    return postures
 
 
 def _on_step(found: static_limits.StepLimit) -> Drawn:

@@ -126,9 +126,9 @@ def _moves(row: Json) -> str:
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
         return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
-    back = "backward " if speed < 0 else ""
+    backward = "backward " if speed < 0 else ""
     return (
-        f"Turns {back}to the {_way(row)} on a circle of {abs(radius):.0f} mm radius, at {abs(speed):.0f} mm/s "
+        f"Turns {backward}to the {_way(row)} on a circle of {abs(radius):.0f} mm radius, at {abs(speed):.0f} mm/s "
         f"and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
     )
 
@@ -136,16 +136,16 @@ def _moves(row: Json) -> str:
 def turn_notes(robot: Robot, row: Json) -> list[str]:
     """Remarks on a turn: effective width, motors that stand or are driven, and exceeded limits."""
     notes = []
-    own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
+    true_width = float(robot.configurations[str(row["configuration"])].turning.width) / MM
     width = float(row["effective_width_mm"])
     if math.isfinite(width) and not _sloping(row) and row["status"] == "converged":
         notes.append(
-            f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: "
-            "the speed difference that the turn needs, relative to the difference without sliding"
+            f"effective track width {width:.0f} mm, {width / true_width:.2f} times the {true_width:.0f} mm between the "
+            "sides: the speed difference that the turn needs, relative to the difference without sliding"
         )
-    if robot.rig.inherits and not BETWEEN <= own * MM <= OVER:
+    if robot.rig.inherits and not BETWEEN <= true_width * MM <= OVER:
         notes.append(
-            f"{own:.0f} mm between the sides is outside the range of the packaged robot's parts, "
+            f"{true_width:.0f} mm between the sides is outside the range of the packaged robot's parts, "
             f"{BETWEEN / MM:.0f} to {OVER / MM:.0f} mm"
         )
     for side in SIDES:
@@ -154,8 +154,8 @@ def turn_notes(robot: Robot, row: Json) -> list[str]:
         if abs(turning) < STANDS:
             notes.append(f"the {side} motor is stalled at {abs(current):.2f} A")
         elif turning * current < 0:
-            back = f", {-power:.1f} W go back to the supply" if power < 0 else ""
-            notes.append(f"the {side} motor is driven by the turn and braked with {abs(current):.2f} A{back}")
+            returned = f", {-power:.1f} W go back to the supply" if power < 0 else ""
+            notes.append(f"the {side} motor is driven by the turn and braked with {abs(current):.2f} A{returned}")
     if float(row["power_supply_W"]) < 0:
         notes.append("the supply has to absorb power")
     notes += [f"{flag}: {words.FLAGS[flag]}" for flag in str(row["flags"]).split(";") if flag]
