@@ -397,10 +397,10 @@ def order_collinearity(
     others = [c for c in conditions if c != VARIABLES["slope"]]
     values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
     _, group_index = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
-    _, cell = np.unique(values, axis=0, return_inverse=True)
-    few = cell.max() + 1 <= FEW_CELLS * len(x)
+    _, cell_index = np.unique(values, axis=0, return_inverse=True)
+    few = cell_index.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
-    level = cell.ravel() if few else group_index.ravel()
+    level = cell_index.ravel() if few else group_index.ravel()
     spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
     polynomials = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
     for span in spans:  # a sorted table's order is the rank

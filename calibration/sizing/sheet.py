@@ -166,16 +166,16 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
     name = _configuration_name(robot, e)
     on_tracks = float(robot.configurations[name].on_tracks) > 0.5
 
-    def same(x: float) -> Float[Array, " points"]:
+    def at_all_points(x: float) -> Float[Array, " points"]:
         return jnp.full(len(payload), x, float)
 
     return EnvelopePoint(
         configuration=jnp.full(len(payload), robot.configurations.index(name)),
-        adhesion=same(adhesion_ratio(e.surface, on_tracks)),
-        adhesion_lateral=same(lateral_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
-        charge=jnp.asarray(charge), charge_end=same(e.charge_end), share=same(requirement.share),
+        adhesion=at_all_points(adhesion_ratio(e.surface, on_tracks)),
+        adhesion_lateral=at_all_points(lateral_ratio(e.surface, on_tracks)), battery=at_all_points(float(e.battery)),
+        charge=jnp.asarray(charge), charge_end=at_all_points(e.charge_end), share=at_all_points(requirement.share),
         slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(warm),
-        tread=same(MM * requirement.tread_mm),
+        tread=at_all_points(MM * requirement.tread_mm),
     )  # fmt: skip
 
 

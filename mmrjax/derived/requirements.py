@@ -311,9 +311,11 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     friction = chassis.ground.friction.static * point.adhesion
     rolling_share = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
     # A root of 0 has no derivative.
-    slides = friction * stance.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
-    tips = stance.width / (2 * stance.height)
-    return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
+    slope_of_sliding = friction * stance.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
+    slope_of_tipping = stance.width / (2 * stance.height)
+    return QuantityValue(
+        jnp.degrees(jnp.arctan(jnp.minimum(slope_of_sliding, slope_of_tipping))), jnp.asarray(CONVERGED)
+    )
 
 
 def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:

@@ -103,20 +103,24 @@ def time_grid(
     longest = np.broadcast_to(longest, max(len(requested_times) - 1, 1))
     longest = longest[np.clip(np.searchsorted(requested_times, times[:-1], side="right") - 1, 0, len(longest) - 1)]
     interval_index = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
-    since, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
+    interval_start, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
     knee = np.maximum((longest - first) / grows, 0.0)
 
     def step_count(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
         young = np.log1p(grows * np.minimum(t, knee) / first) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
-    at, ends, at_knee = step_count(times[:-1] - since), step_count(times[1:] - since), step_count(knee)
+    at, ends, at_knee = (
+        step_count(times[:-1] - interval_start),
+        step_count(times[1:] - interval_start),
+        step_count(knee),
+    )
     instants = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
         even_places = np.linspace(at[k], ends[k], count, endpoint=False)
         young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(even_places, at_knee[k]))
-        instants.append(since[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
+        instants.append(interval_start[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
         instants[-1][0] = times[k]
     all_instants = np.concatenate([*instants, times[-1:]])
     return np.interp(

@@ -276,12 +276,12 @@ def produce_chunks(
         for chunk in chunks:
             prepared.append((chunk, maker.submit(compiled.points, chunk)))
             if len(prepared) > 1:
-                yield _started(compiled, *prepared.popleft(), times, advance)
+                yield _start_chunk(compiled, *prepared.popleft(), times, advance)
         while prepared:
-            yield _started(compiled, *prepared.popleft(), times, advance)
+            yield _start_chunk(compiled, *prepared.popleft(), times, advance)
 
 
-def _started(
+def _start_chunk(
     compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times, advance: Advance | None
 ) -> Piece:
     start = time.perf_counter()

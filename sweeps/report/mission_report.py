@@ -47,7 +47,7 @@ class Missions:
 
     def to_json(self) -> Json:
         """Content of `result.json`: for one run its numbers by name, for several a list of them."""
-        missions = [self._one(k) for k in range(len(self.table["status"]))]
+        missions = [self._run_as_json(k) for k in range(len(self.table["status"]))]
         about = {
             "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
             "segments": self.source.segment_count, "cycles": self.source.cycles,
@@ -55,7 +55,7 @@ class Missions:
         }  # fmt: skip
         return {"profile": about, **(missions[0] if len(missions) == 1 else {"missions": missions})}
 
-    def _one(self, row: int) -> Json:
+    def _run_as_json(self, row: int) -> Json:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
         numbers = {
             c: float(self.table[c][row])
@@ -145,8 +145,8 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
             ),
             "path-section",
         )
-    returns, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
-    returned = f"{returns:.3g} Wh returned to the source." if returns > 1e-6 * first["energy_drawn_Wh"] else (
+    returned_Wh, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
+    returned = f"{returned_Wh:.3g} Wh returned to the source." if returned_Wh > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}. Driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
@@ -260,11 +260,11 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
             )
         )  # fmt: skip
     first = "first cycle" if many else "this segment"
-    heads = [quantity_column(c, group=first) for c in shown_columns] + [
+    headings = [quantity_column(c, group=first) for c in shown_columns] + [
         quantity_column(c, group="all cycles") for c in totals
     ]
-    heads += columns(*["all cycles > share of energy [%] | .1f"] * many)
-    return catalogue.table("mission.segments", answer, *heads)
+    headings += columns(*["all cycles > share of energy [%] | .1f"] * many)
+    return catalogue.table("mission.segments", answer, *headings)
 
 
 def _demand_in_words(found: Missions, k: int) -> str:

@@ -140,8 +140,8 @@ def turn_notes(robot: Robot, row: Json) -> list[str]:
     width = float(row["effective_width_mm"])
     if math.isfinite(width) and not _sloping(row) and row["status"] == "converged":
         notes.append(
-            f"effective track width {width:.0f} mm, {width / true_width:.2f} times the {true_width:.0f} mm between the "
-            "sides: the speed difference that the turn needs, relative to the difference without sliding"
+            f"effective track width {width:.0f} mm, {width / true_width:.2f} times the {true_width:.0f} mm between "
+            "the sides: the speed difference that the turn needs, relative to the difference without sliding"
         )
     if robot.rig.inherits and not BETWEEN <= true_width * MM <= OVER:
         notes.append(
