@@ -11,7 +11,7 @@ from sweeps.pages.figure_style import BLUE, INK, ORANGE, new_figure
 
 
 def quasistatic(found: Feedforward) -> Figure:
-    """Voltage less kA·a over velocity, of windows of the quasistatic tests."""
+    """Voltage minus kA·a over velocity, for windows of the quasistatic tests."""
     w, k = found.windows, found.constants
     slow = w["quasistatic"] if w["quasistatic"].any() else np.ones(len(w["velocity"]), bool)
     voltage = w["voltage_V"] - k["kA"] * w["acceleration"]
@@ -25,7 +25,7 @@ def quasistatic(found: Feedforward) -> Figure:
 
 
 def dynamic(found: Feedforward) -> Figure:
-    """Voltage less kS and kV·v over acceleration."""
+    """Voltage minus kS and kV·v over acceleration."""
     w, k = found.windows, found.constants
     voltage = w["voltage_V"] - k["kV"] * w["velocity"] - k["kS"] * w["direction"]
     a = w["acceleration"]

@@ -26,7 +26,7 @@ from sweeps.pages.figure_style import (
     new_figure,
 )
 
-TAIL = 0.3  # of a run at its end that is looked at for ripple [s]
+TAIL = 0.3  # duration at the end of a run that is evaluated for ripple [s]
 SHOWN = 0.15  # and drawn [s]
 
 
@@ -36,10 +36,10 @@ class GearRun:
 
     Attributes:
         name: heading.
-        on_tracks: or on wheels, status.
+        on_tracks: True on tracks, False on wheels.
         radius: radius of the pulleys [m].
-        time: [s].
-        signals, reactions: over it.
+        time: time of the samples [s].
+        signals, reactions: signals and reactions at these times.
         guide_share: guide share on average at the end [-].
     """
 
@@ -57,7 +57,7 @@ class GearRun:
         return slice(int(np.searchsorted(self.time, self.time[-1] - seconds)), None)
 
     def settled_since(self, instant: float) -> bool:
-        """True if the run after that instant [s] is long enough to look for ripple."""
+        """True if the run after this instant [s] is long enough to evaluate ripple."""
         return bool(instant <= self.time[-1] - TAIL)
 
     @property
@@ -67,7 +67,9 @@ class GearRun:
 
     @property
     def period(self) -> float:
-        """Eq. (34) [s], at the mean speed of the driving pulley. The belt runs on the pulley on wheels too."""
+        """Period of eq. (34) [s] at the mean speed of the driving pulley. The belt also runs on the pulley of wheeled
+        robots.
+        """
         speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
         return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 

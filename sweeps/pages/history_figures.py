@@ -1,4 +1,4 @@
-"""Figures of runs from standstill: current and speeds over time, the inrush marked, the stages of a start shaded."""
+"""Figures of runs from standstill: current and speeds over time, with inrush and stages of the start marked."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from sweeps.pages.figure_style import (
 from sweeps.report.run_tables import UNITS
 from sweeps.report.settle_report import IMPOSED
 
-#: Samples of a segment of a frequency response, and least coherence of a point that is drawn.
+#: Samples per segment of a frequency response, and smallest coherence of drawn points.
 SEGMENT, COHERENT = 256, 0.7
-#: Least rows of a run for a frequency response.
+#: Fewest rows of a run for a frequency response.
 SHORTEST = 32
-#: Most points of a line of a figure, in pairs of the least and the greatest of as many samples.
+#: Most points of a line in a figure, in pairs of the smallest and largest of equally many samples.
 POINTS = 3000
 
 
@@ -114,8 +114,7 @@ class StartRun:
         time: [s].
         current: current of all motors [A].
         speed, theoretical: V and r_k ω_k [mm/s].
-        stages: stages of the start. Current and speeds are drawn, and kept here, times its `sense`. None without
-            numbers.
+        stages: stages of the start. Current and speeds are stored multiplied by its `sense`. None without numbers.
     """
 
     name: str
@@ -154,12 +153,12 @@ class StartRun:
 
     @property
     def peak(self) -> float:
-        """Largest current [A], with the sign that it is drawn with."""
+        """Largest current [A], with the drawn sign."""
         return _largest_magnitude(self.time, self.current)
 
     @property
     def ended(self) -> tuple[float, float]:
-        """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
+        """Current [A] and speed [mm/s] at the end, as means over the last 0.15 s because of ripple."""
         last = last_samples(self.time)
         return float(self.current[last].mean()), float(self.speed[last].mean())
 
@@ -196,7 +195,7 @@ def start_runs(
 
 
 def draw_starts(shown: list[StartRun], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
-    """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded.
+    """One row for each run: inrush enlarged, total current, V and shaft speed, with the stages shaded.
 
     For a run that ends backward, backward is drawn positive.
     """
@@ -268,7 +267,7 @@ def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
         axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
         text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
         axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
-    # Right of the line at t', where that is beside the curve, else of the curve.
+    # Right of the line at t' if it is next to the curve, otherwise right of the curve.
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
     has_room = 0 < start.settled < 0.5 * last and start.gets_under_way
     label_place = (start.settled if has_room else start.time[half], start.speed[half])
@@ -279,7 +278,7 @@ def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
 
 
 def draw_slip(shown: list[StartRun]) -> Figure:
-    """A row for each run: V_x and V_x_teor until after the start, and the slip (33).
+    """One row for each run: V_x and V_x_teor until after the start, and the slip (33).
 
     The slip's mean is drawn over each stage and over t'. For a run that ends backward, backward is drawn positive.
     """
@@ -323,7 +322,7 @@ def draw_slip(shown: list[StartRun]) -> Figure:
 
 
 def _draw_slip_means(speeds: Axes, slip: Axes, start: StartRun, upto: float) -> None:
-    """Mark t' and draw the mean slip of each stage as a level."""
+    """Marks t' and draws the mean slip of each stage as a level."""
     assert start.stages is not None
     for axes in (speeds, slip):
         if 0 < start.settled < upto:
@@ -345,7 +344,7 @@ def _draw_slip_means(speeds: Axes, slip: Axes, start: StartRun, upto: float) -> 
 
 
 def _shade_stages(axes: Axes, start: StartRun, scale: float = 1.0) -> None:
-    """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
+    """Shades the stages behind a plot over time (unit 1/`scale` s), and labels them at the top."""
     if not start.gets_under_way:
         return
     bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
@@ -395,7 +394,7 @@ class ShaftRun:
 
 
 def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[ShaftRun]:
-    """Members of a batch of runs as their instruments show them.
+    """Members of a batch of runs, with the readings of their instruments.
 
     Args:
         read: channels of the robot.
@@ -416,7 +415,7 @@ def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names:
 
 
 def draw_readings_over_time(shown: list[ShaftRun]) -> Figure:
-    """A row for each run, a panel for each channel."""
+    """One row for each run, one panel for each channel."""
     read = channels.channels_named(shown[0].readings)
     fig, grid = new_figure(len(shown), len(read), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
@@ -434,7 +433,7 @@ def frequency_response(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Response of readings to a drive by Welch's method, averaged over runs (the H1 estimate).
 
-    Bendat and Piersol, Random Data (2010), ch. 6. Runs are read at even times, a median interval apart.
+    Bendat and Piersol, Random Data (2010), ch. 6. Runs are resampled at even times, one median interval apart.
 
     Args:
         runs: time [s], shape (rows,), drive, shape (rows,), and readings, shape (readings, rows), of each run.
@@ -461,7 +460,7 @@ def frequency_response(
 
 
 def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
-    """Gain and phase of each channel over the frequency of the drive: measured as points, simulated as lines.
+    """Gain and phase of each channel over frequency: measured as points, simulated as lines.
 
     Args:
         runs: runs with measured and simulated columns.

@@ -1,4 +1,4 @@
-"""Silhouettes of a robot at rest and on the highest step of its posture, and the map of steps over lever angles."""
+"""Silhouettes of a robot at rest and on its highest step, and the map of steps over lever angles."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from sweeps.report.check_report import (
 )
 from sweeps.report.words.posture_words import Drawn, Postures, StepMap
 
-#: Margins beyond are drawn so far [%]; their number says how large they are.
+#: Larger margins are drawn with this length [%], with their value as a number.
 LONGEST = 100.0
 
 
 def draw_margins(found: CheckResult) -> Figure:
-    """A bar for each requirement: its margin in percent of what is required, right where it is met.
+    """One bar for each requirement: margin in percent of the required value, to the right if it is met.
 
     Phone versions omit the values, which are in the page's table.
     """
@@ -76,7 +76,7 @@ def belt_outline(side: SideOutline, belt: tuple[int, int]) -> np.ndarray:
 
 
 def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
-    """Draw a robot on its ground, uphill and forward to the right [mm]. Its centre of mass with gravity's line."""
+    """Draws a robot on its ground, uphill and forward to the right [mm], with centre of mass and line of gravity."""
     side, cosine, sine = shown.side, np.cos(shown.slope), np.sin(shown.slope)
     tilt = np.array([[cosine, sine], [-sine, cosine]])
 
@@ -103,7 +103,7 @@ def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
     axes.set(title=title, aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="mm", ylabel="mm")
 
 
-#: What a robot does where requirements of its geometry ask about it.
+#: Posture of each geometric requirement, in words.
 ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length_mm": "Folded"}
 
 
@@ -128,8 +128,9 @@ def draw_rest_and_step(found: Postures) -> Figure:
 
 
 def draw_highest_steps(over: StepMap) -> Figure:
-    """Highest step and margin of tipping over the angles of front and rear levers, the run's own marked, and the
-    posture of the highest step."""
+    """Highest step and margin of tipping over the angles of front and rear levers, with those of the run marked, and
+    the posture of the highest step.
+    """
     fig, grid = new_figure(2, 2, 7.6)
     maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
     for axes, (values, label) in zip(grid[:, 0], maps, strict=True):

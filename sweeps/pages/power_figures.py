@@ -21,7 +21,7 @@ from mmrjax.model.signals import is_done
 from sweeps.export.joint import UNLIMITED
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
 
-#: Where power goes, with its colour: losses in the order of the chain, then what is left.
+#: Uses of power and their colours: losses in the order of the drivetrain, then useful power.
 ITEMS = {
     "winding and motor friction": ORANGE,
     "gearbox": PURPLE,
@@ -56,12 +56,12 @@ def drawable_runs(runs: Columns) -> np.ndarray:
     )
 
 
-#: Words of an item where the load is a shaft, which takes all that the gearboxes pass on.
+#: Name of an item if the load is a shaft, which receives all output power of the gearboxes.
 ON_SHAFT = {"track and slip": "load"}
 
 
 def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -> Figure:
-    """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
+    """One bar for each run [W], from the motor's losses to the power that lifts the robot or that the load takes."""
     fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], power_by_item(runs)
     labels = {} if has_ground else ON_SHAFT
@@ -99,7 +99,7 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     return fig
 
 
-#: Loads of a curve of the drive, and balances whose effects it has.
+#: Loads of a drive curve, and balances whose effects it includes.
 LOADS = 60
 INSIDE = ("duty", "supply", "electrical", "motor", "gearbox")
 
@@ -125,7 +125,7 @@ def drive_curves(robot: Robot, voltage: float) -> Columns:
 
 
 def operating_points(robot: Robot, runs: Columns) -> Columns:
-    """Torque at the gearbox output, speed and current of one motor in settled runs, out of columns of `runs.csv`."""
+    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`."""
     radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
     output = runs["theoretical_speed_mm_s"] / 1e3 / radius
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -135,7 +135,7 @@ def operating_points(robot: Robot, runs: Columns) -> Columns:
 
 
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
-    """The chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
+    """Chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
     keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
     single_corners = (
         corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys)

@@ -1,4 +1,4 @@
-"""Figure of a resonance map: a Campbell diagram above ripple over speed and payload, on one axis of speed."""
+"""Figure of a resonance map: Campbell diagram, and below it ripple over speed and payload, on a common speed axis."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
         is_inside, last = at_end <= top, place
         place = fastest if is_inside else fastest * 0.985 * top / at_end
         if last - place < (0.08 if is_narrow() else 0.03) * fastest and not is_inside:
-            break  # labels and lines would cover one another
+            break  # labels and lines would overlap
         axes.annotate(
             f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if is_inside else (0, -2),
             textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if is_inside else "top",
@@ -107,7 +107,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
 
 
 def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
-    """A band for each mode, from the least to the greatest frequency over payloads and positions of the belt."""
+    """One band for each mode, from the smallest to the largest frequency over payloads and positions of the belt."""
     others = iter(_OTHERS * 3)
     names = dict.fromkeys(m.name for modes in found.modes.values() for m in modes if m.resonant)
     for name in names:
