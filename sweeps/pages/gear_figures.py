@@ -37,6 +37,7 @@ class GearRun:
     Attributes:
         name: heading.
         on_tracks: True on tracks, False on wheels.
+        status: status of the run.
         radius: radius of the pulleys [m].
         time: time of the samples [s].
         signals, reactions: signals and reactions at these times.

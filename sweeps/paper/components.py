@@ -27,13 +27,13 @@ CONFIGURATION = {TRACKED: BLUE, WHEELED: VERMILION}
 MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}
 
 
-#: No load of the maker's sheet of RE30 310007: speed [rpm], current [A].
+#: No-load speed [rpm] and current [A] in the maker's sheet of RE30 310007.
 SHEET_NO_LOAD = (8810.0, 0.165)
-_GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measured rows, about
+_GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # approximate motor speeds of the measured rows
 
 
 def draw_gearbox_efficiency(robots: dict[str, Robot], rows: data.PaperRows | None) -> Figure:
-    """Fig. 5a: efficiency over output torque. The first robot at two speeds, the others where they differ."""
+    """Fig. 5a: efficiency over output torque. The first robot at two speeds, the others if they differ."""
     fig, grid = new_figure(1, 1, 3.9)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
@@ -211,7 +211,7 @@ def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
 
 
 def draw_idle_track(robots: dict[str, Robot]) -> Figure:
-    """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a line through it."""
+    """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a straight line."""
     fig, grid = new_figure(1, 1, 3.6)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))

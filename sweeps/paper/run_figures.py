@@ -1,4 +1,4 @@
-"""Figures of the paper's runs: over slope (Figs. 28, 29), row by row, and where the energy goes."""
+"""Figures of the paper's runs: over slope (Figs. 28, 29), row by row, and uses of power."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def current_over_slope(robot: Robot, rows: data.PaperRows, certainty: Sequence[S
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1).
 
     Args:
-        certainty: certainty from `data.slope_certainty`.
+        certainty: R² from `data.slope_certainty`.
     """
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
@@ -146,7 +146,7 @@ def draw_energy(used: data.EnergyUse) -> Figure:
     for item in (*data.SPLIT, "other"):
         share = 100 * used.power[item] / used.total
         share = np.where(np.isfinite(share), share, 0.0)
-        if np.abs(share).max() < 0.05:  # not to be seen, and in no legend
+        if np.abs(share).max() < 0.05:  # invisible, and not in the legend
             continue
         axes.barh(
             height, share, left=bar_starts, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6
@@ -178,7 +178,7 @@ def draw_energy(used: data.EnergyUse) -> Figure:
 
 
 def row_parity(rows: data.PaperRows, name: str) -> Figure:
-    """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
+    """Simulated over measured readings for every channel, with raised adhesion and both masses for 4W2T."""
     channels_shown = data.channels_of_paper()
     fig, grid = new_figure(1, len(channels_shown), 3.7)
     kind = rows.conditions["configuration"]
