@@ -18,15 +18,15 @@ from mmrjax.model.quantities import WARMING
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
 
-#: Columns of runs and histories that are of the ground.
+#: Columns of runs and histories about the ground.
 OF_GROUND = (
     "slip", "adhesion_used", "traction_N", "slope_deg", "power_ground_W", "power_lift_W", "efficiency_chassis",
 )  # fmt: skip
-#: Those of travel, which a shaft has where a channel shows it.
+#: Columns of travel, which a shaft has only if a channel shows it.
 OF_TRAVEL = (
     "theoretical_speed_mm_s", "distance_m", "displacement_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
 )  # fmt: skip
-#: Column → parameters on which it rests and which a rig's file may leave open; of a channel over time last.
+#: Column → parameters that it depends on and that a rig file may omit. Channels over time are last.
 RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
 
 

@@ -21,9 +21,9 @@ from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 from sweeps.export.situation import ComparisonRuns
 
-#: Points of an axis on either side of rest; how far beyond the runs the axes reach.
+#: Points of an axis on each side of rest. Ratio of the axes to the range of the runs.
 POINTS, BEYOND = 20, 1.2
-#: Newton steps of the voltage at which a torque is given.
+#: Newton steps for the voltage that gives a torque.
 STEPS = 30
 #: Columns of the table, with their units.
 COLUMNS = {

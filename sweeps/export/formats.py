@@ -45,12 +45,12 @@ class Export:
 
     Attributes:
         format: one of `FORMATS`.
-        joint: what is exported.
+        joint: the exported drive.
         constants: constants of its law.
         posterior: posterior of the robot, if any.
-        files: contents by name.
+        files: contents of the files by name.
         comparison: comparison with the native model.
-        checks: numbers found with the files, by name.
+        checks: results of checks with the files, by name.
     """
 
     format: str
@@ -74,18 +74,18 @@ def export_format(
     seed: int = 0,
     posterior: Posterior | None = None,
 ) -> Export:
-    """Returns the drive of a robot in a format, compared with the native model over runs.
+    """Drive of a robot in a format, compared with the native model over runs.
 
     Args:
         to: one of `FORMATS`.
-        configuration: name, None: the robot's first.
+        configuration: name of the configuration. None: the robot's first.
         data: runs, or the file of a table or log. None: a grid of operating points.
         at: name of the joint in the simulator's model.
         draws, seed: draws and seed of `randomization`.
-        posterior: posterior of the robot. None: that from the folder of its file.
+        posterior: posterior of the robot. None: read from the folder of its file.
 
     Raises:
-        BadConfiguration, BadData: a format, a drive or a table that is refused.
+        BadConfiguration, BadData: the format, drive or table is rejected.
     """
     stated_word(to, FORMATS, "--to")
     if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):

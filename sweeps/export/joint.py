@@ -1,4 +1,4 @@
-"""A robot's drive as the actuator of one joint, its driving wheel or shaft. Parts of its law are expressions."""
+"""A robot's drive as the actuator of one joint, its driving wheel or shaft. The parts of its law are expressions."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import ZERO, Symbol, names_in, trace_function
 
-#: Balances that a joint has; what enters another one belongs to what the joint moves, or to an instrument.
+#: Balances of a joint. Terms in other balances belong to the load or to an instrument.
 INSIDE = ("supply", "electrical", "inductance", "motor", "gearbox", "track", "inertia")
-#: A driver's limit of current from which on there is none [A].
+#: A current limit of the driver of this size means no limit [A].
 UNLIMITED = 1000.0
-#: Variables of the law, and the signals that they are; the output's torques are `load` and, at the wheel, `pull`.
+#: Variables of the law and their signals. Torques of the output are `load` and, at the wheel, `pull`.
 VARIABLES = {
     "current": "current",
     "voltage": "voltage",
@@ -44,14 +44,14 @@ class Part:
     """One equation of the law.
 
     Attributes:
-        name: a word.
-        balance: which it enters, or what it is.
+        name: name of the part.
+        balance: balance that it enters, or its role.
         unit: unit of its value.
-        equation, meaning: equation and meaning in words, from the docstring of what it is made of.
-        value: as an expression.
+        equation, meaning: equation and meaning in words, from a docstring.
+        value: value as an expression.
         slope: its derivative with respect to the variable `by`.
         rate, rate_slope: rate of its memory, and the derivative of the rate with respect to the memory.
-        effect: name of the effect that it is of. Empty: of the robot's base.
+        effect: name of its effect. Empty: part of the base robot.
     """
 
     name: str
@@ -72,9 +72,9 @@ class DriveJoint:
     """A drive as the actuator of a joint.
 
     Attributes:
-        file: the robot and what its file stated.
-        configuration: name of its load.
-        robot: robot with this configuration and the effects inside alone.
+        file: the robot and the content of its file.
+        configuration: name of the configuration.
+        robot: robot with only this configuration and the effects inside the joint.
         inside, outside: effects that enter the balances of a joint, and the others.
         idle: names of effects that do not act on this configuration.
         parts: equations of the law in their order.
@@ -118,7 +118,7 @@ class DriveJoint:
 
     @property
     def controller(self) -> Controller | None:
-        """Controller of its motor."""
+        """Controller of the motor."""
         return self.robot.controller
 
     @property
@@ -160,7 +160,7 @@ class DriveJoint:
         return tuple(p for p in self.parts if p.balance == balance)
 
     def with_robot(self, robot: Robot) -> DriveJoint:
-        """The same joint of a robot with other numbers. Its parts are expressions of names and stay."""
+        """The same joint for a robot with other numbers. Its parts are expressions of names and do not change."""
         return dataclasses.replace(self, robot=robot, inside=robot.effects)
 
     def parameters(self) -> dict[str, params.Parameter]:
@@ -187,14 +187,14 @@ def _symbols_of_part(part: Part) -> list[Symbol]:
 
 
 def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJoint:
-    """Returns the drive of a robot as the actuator of one joint.
+    """Drive of a robot as the actuator of one joint.
 
     Args:
-        configuration: its name. None: the robot's first.
+        configuration: name of the configuration. None: the robot's first.
 
     Raises:
-        BadConfiguration: no such configuration. A drive that is not one joint or that no voltage drives. An effect
-            whose equation has no closed form.
+        BadConfiguration: the configuration does not exist, the drive is not one joint or not driven by voltage, or
+            the equation of an effect has no closed form.
     """
     robot = file.robot
     name = robot.configurations.names[0] if configuration is None else configuration
@@ -375,7 +375,7 @@ def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
 
 
 def memory_grows(part: Part) -> bool:
-    """True if a part's memory grows without end, as a phase does: it has no settled value but its mean, 0."""
+    """True if a part's memory grows without limit, as a phase does. Instead of a settled value it has the mean 0."""
     return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
 
 
@@ -392,7 +392,7 @@ def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float
 def channels_of(joint: DriveJoint) -> tuple[Any, ...]:
     """Channels of the robot's instruments that settled runs show, in the order of their table.
 
-    A rig without any, such as a servo whose angle alone is read, is compared by current and speed of the motor.
+    A rig without any, such as a servo with only an angle sensor, is compared by current and speed of the motor.
     """
     settled = [c for c in EVERY if c.settled]
     own_channels = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)

@@ -26,16 +26,16 @@ from mmrjax.model.signals import Signals
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_in
 from sweeps.export.joint import VARIABLES, DriveJoint, Part, mean_surroundings
 
-#: Draws of the posterior by which intervals are found, and the shares of them below their ends.
+#: Draws from the posterior for intervals, and quantiles of their ends.
 DRAWS, ENDS = 4000, (0.025, 0.975)
 OF_POSTERIOR, OF_PRIOR = "95 % interval", "from the prior (± two sds): no posterior available"
 
 
 def posterior_next_to(joint: DriveJoint) -> Posterior | None:
-    """Returns the posterior next to the robot's file, None if there is no such file.
+    """Posterior next to the robot's file. None if there is no such file.
 
     Raises:
-        BadData: it cannot be read, or is of another robot.
+        BadData: it cannot be read, or belongs to another robot.
     """
     source = Path(joint.file.source)
     path = source.with_name(posterior_file.FILE)
@@ -96,7 +96,7 @@ def _interval_of(
     return max(value - 2 * sd, low), min(value + 2 * sd, high), kind
 
 
-#: Name of the constant of a controller's supply.
+#: Name of the constant with a controller's supply voltage.
 SUPPLY = "controller.supply_voltage"
 _ARGUMENTS = (*VARIABLES, "load", "pull")
 
@@ -106,10 +106,10 @@ class LawConstant:
     """A number of the law.
 
     Attributes:
-        name: dotted.
-        value: [SI].
-        unit, meaning, source: in words.
-        low, high: limits of its interval, None: not known.
+        name: dotted name.
+        value: value [SI].
+        unit, meaning, source: description in words.
+        low, high: limits of its interval. None: not known.
         kind: kind of interval, in words.
     """
 
@@ -124,7 +124,7 @@ class LawConstant:
 
     @property
     def interval(self) -> str:
-        """Its interval in words, empty if unknown."""
+        """Interval in words, empty if unknown."""
         return "" if self.low is None else f"{self.low:.4g} to {self.high:.4g} ({self.kind})"
 
 
@@ -154,12 +154,12 @@ def function_arguments(symbol: Symbol) -> list[str]:
 
 
 def quoted(word: str) -> str:
-    """A word as a literal of Python."""
+    """Word as a Python literal."""
     return f'"{word}"' if re.fullmatch(r"[\w.-]+", word) else repr(word)
 
 
 def _docstring(text: str) -> str:
-    """A text as a docstring: names in it come from users, so nothing in it can end the literal."""
+    """Text as a docstring, escaped because names come from users and could end the literal."""
     return '"""' + printable(text).replace("\\", "\\\\").replace('"', '\\"') + '"""'
 
 
@@ -306,7 +306,7 @@ def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) ->
     """Lines of the torque between motor and load (`Shaft.torque_joint`), one implicit Euler step of the motor's side.
 
     Args:
-        lost: text of what effects of the gearbox lose.
+        lost: text of the losses by gearbox effects.
     """
     value = lambda name: f"p[{quoted(f'{joint.configuration}.{name}')}]"  # noqa: E731
     if joint.load.stiffness > 0:
@@ -334,7 +334,7 @@ def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) ->
         lines += [
             f"half = 0.5 * {value('backlash')}",
             f"beyond = later - {library.clipped('later', 'half')}",
-            # As in the model, damping sets in over a tenth of the backlash, and flanks never pull.
+            # As in the model, damping starts over a tenth of the backlash, and flanks never pull.
             f"share = {library.clipped(f'{prefix}.abs(beyond) / (0.2 * half + 1e-4)', '1.0')}",
             f"stiffness, damping = {prefix}.where(beyond != 0, stiffness, 0.0 * stiffness), share * damping",
         ]
@@ -357,9 +357,11 @@ def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) ->
 
 
 def _inertia_lines(joint: DriveJoint) -> list[str]:
-    """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not.
+    """Lines for the torques that accelerate rotor and wheel. The joint contains their inertia, but losses by torque
+    do not.
 
-    As in the model, the gearbox transmits what is left after the rotor, and its sign is the direction of power.
+    As in the model, the gearbox transmits the torque that remains after the rotor. Its sign is the direction of
+    power.
     """
     wheel = [f"p[{quoted(f'{joint.configuration}.inertia')}]", *map(call_text, joint.of("inertia"))]
     return [
@@ -371,8 +373,8 @@ def _inertia_lines(joint: DriveJoint) -> list[str]:
     ]
 
 
-#: Inertia of the rotor at the output. A load sees it as J i² η or J i² / η, by the direction of power. With their
-#: mean as the joint's armature, the torque left for either one lags a step, and is stable at any load.
+#: Inertia of the rotor at the output: J i² η or J i² / η, depending on the direction of power. With their mean as the
+#: joint's armature, the remaining torque lags by a step and is stable at any load.
 TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
 ARMATURE = f'{TURNING} * 0.5 * (p["gearbox.efficiency_load"] + 1.0 / p["gearbox.efficiency_load"])'
 
@@ -480,7 +482,8 @@ def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
     """Module of the source of a law.
 
     Raises:
-        BadConfiguration: it has more than an import, literals, and functions that call each other and the library.
+        BadConfiguration: the source has more than an import, literals, and functions that call each other and the
+            library.
     """
     tree = ast.parse(source)
     if not _states_a_law(tree):
