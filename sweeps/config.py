@@ -921,7 +921,7 @@ def resolve_further_options(kind: type[C], file: Path | None, options: Json, tru
     """Options of a command that are not part of its configuration. A file may state only their `[solver]` keys.
 
     Args:
-        trust: as of `resolve_configuration`.
+        trust: as in `resolve_configuration`.
 
     Raises:
         BadConfiguration: for the same reasons as `resolve_configuration`.

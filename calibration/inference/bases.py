@@ -153,19 +153,19 @@ def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
-    """Balances of `among` that a robot has. For None, all of them."""
+    """Balances of `among` that a robot has. None: all of them."""
     if robot is None:
         return tuple(among)
     return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot. For None, those of the packaged robot."""
+    """Channels of a robot. None: those of the packaged robot."""
     return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> Names:
-    """Columns of conditions over which a robot's curves are defined. For None, those of the packaged robot."""
+    """Columns of conditions over which a robot's curves are defined. None: those of the packaged robot."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
@@ -179,7 +179,7 @@ class CurveScope:
 
     @classmethod
     def of(cls, robot: Robot | None) -> CurveScope:
-        """All balances and conditions of a robot that travels straight. For None, of the packaged robot."""
+        """All balances and conditions of a robot that travels straight. None: those of the packaged robot."""
         return cls(balances_of(robot), axes_of(robot))
 
     def over(self, columns: Columns) -> CurveScope:

@@ -45,7 +45,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     """Rejects readings that no similar robot gives under these conditions. Returns remarks on other doubts.
 
     The readings of each channel are compared with steady travel of the robot, and of the robot with a tenth and four
-    times its friction. The median factor between readings and that range decides. Of histories, only settled ends are
+    times its friction. The median factor between readings and that range decides. In histories, only settled ends are
     compared.
 
     Raises:

@@ -52,7 +52,7 @@ class Shaft(eqx.Module):
         (-1e4, 1e4), _STATED, relative_sd=0.2,
     )  # fmt: skip
     torque_gravity: Scalar = parameter(
-        0.0, "N·m", "largest torque of gravity on an arm m g l", (0.0, 1e4), _STATED, relative_sd=0.1
+        0.0, "N·m", "largest gravity torque on an arm, m g l", (0.0, 1e4), _STATED, relative_sd=0.1
     )
     angle_zero: Scalar = parameter(
         0.0, "rad", "hanging angle θ_0 of the arm, from the start of a run", (-6.3, 6.3), _STATED, sd=0.05,

@@ -171,7 +171,7 @@ def draw_energy(used: data.EnergyUse) -> Figure:
     axes.set_yticks(height, used.labels, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    remark = "\n* slides on its own adhesion; shown with adhesion raised" if "*" in "".join(used.labels) else ""
+    remark = "\n* slides with its own adhesion; shown with raised adhesion" if "*" in "".join(used.labels) else ""
     axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
     outer_legend(axes, "upper center")
     return fig

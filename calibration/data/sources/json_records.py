@@ -71,7 +71,7 @@ def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
     """Signals of lists and dicts of lists, numbers and arrays.
 
     Raises:
-        BadData: nothing in it is a table.
+        BadData: the content has no table.
     """
     arrays: Json = {}
     _collect(content, "", arrays, name, 1)
