@@ -55,10 +55,14 @@ def has_battery(robot: Robot) -> bool:
 
 def unknown_numbers_sentence(robot: Robot) -> list[str]:
     """Sentences on results that cannot be computed because the robot's file lacks their parameters."""
-    gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
-    lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
-    labels = "; ".join(output.label for output in gone)
-    return [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"] if gone else []
+    unknown_outputs = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
+    lacking = dict.fromkeys(name for output in unknown_outputs for name in robot.unknown(output.rests_on))
+    labels = "; ".join(output.label for output in unknown_outputs)
+    return (
+        [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"]
+        if unknown_outputs
+        else []
+    )
 
 
 def inapplicable_columns(robot: Robot) -> set[str]:
@@ -80,8 +84,8 @@ def drop_inapplicable_columns(robot: Robot, table: Columns) -> Columns:
     """Table without the columns that do not apply to the robot. Columns of its channels are kept."""
     idle = inapplicable_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")
-    gone = {column + end for column in idle for end in ends}
-    return {column: values for column, values in table.items() if column not in gone}
+    dropped = {column + end for column in idle for end in ends}
+    return {column: values for column, values in table.items() if column not in dropped}
 
 
 def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:

@@ -51,10 +51,10 @@ def load_robot(config: RobotPart) -> RobotFile:
     unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
-        wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
+        wide_words = f"± {100 * stated.EXAMPLE_SHARE:g} %"
         notes.append(
             f"{file.name}: these values are still example numbers of the template: {examples}. The fit widens each ± "
-            f"among them to {wide}"
+            f"among them to {wide_words}"
         )
     for note in (*notes, *unlike):
         print_message(note)

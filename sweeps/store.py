@@ -480,7 +480,7 @@ class RunFolder(Folder):
     def keep_chunk(self, name: str, columns: Columns) -> None:
         """Stores a finished chunk, for continuing an interrupted run."""
         file = self.partial / CHUNKS / f"{name}.npz"
-        with writing.replacing(file) as aside, aside.open("wb") as stream:
+        with writing.replacing(file) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
 
     def stage(self, name: str, make: Callable[[], T]) -> T:
@@ -499,8 +499,8 @@ class RunFolder(Folder):
             except stage_files.Unreadable:
                 print_message(f"{file}: damaged, so it is computed again")
         result = make()
-        with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as aside:
-            stage_files.write_stage(aside, result)
+        with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as temporary:
+            stage_files.write_stage(temporary, result)
         return result
 
     def keeps(self, name: str) -> bool:

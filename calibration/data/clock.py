@@ -53,9 +53,9 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
             wraps = np.zeros(len(count))
             wraps[rows_of_falls + 1] = 1.0
             total = np.cumsum(wraps)
-            first = np.zeros(len(count), int)
-            first[1:][~same_run] = np.flatnonzero(~same_run) + 1
-            begins = total[np.maximum.accumulate(first)]  # wraps before the recording of each row began
+            first_row_of_run = np.zeros(len(count), int)
+            first_row_of_run[1:][~same_run] = np.flatnonzero(~same_run) + 1
+            begins = total[np.maximum.accumulate(first_row_of_run)]  # wraps before the recording of each row began
             return count + period * (total - begins), period
     return count, 0.0
 
@@ -167,21 +167,21 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
     run = np.zeros(len(clock), int) if run is None else run
     if isinstance(raw, list):
         _add_days_after_midnight(clock, raw, run)
-    first = np.full(len(names), np.inf)
+    start_time = np.full(len(names), np.inf)
     if len(names) > 1:
-        np.minimum.at(first, run, clock)
+        np.minimum.at(start_time, run, clock)
     else:  # in a tenth of the time
-        first[:] = clock.min()
-    if not first.any():
+        start_time[:] = clock.min()
+    if not start_time.any():
         return (clock / factor if notes else raw), notes
-    passed = np.round(clock - first[run], 9) / factor
+    passed = np.round(clock - start_time[run], 9) / factor
     if of_day:
         return passed, (
             *notes,
             f"{name}: {meaning.shown} is a time of day. Time is counted from the first row of each run",
         )
-    run_index = run[np.flatnonzero(first[run])[0]]
-    time_words = f"{first[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
+    run_index = run[np.flatnonzero(start_time[run])[0]]
+    time_words = f"{start_time[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
     return passed, (
         *notes,
         f"{name}: {meaning.shown} begins at {time_words}. Time is counted from the first row of a run. If the run "
@@ -209,11 +209,11 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
 
 def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
     """Adds a day [s] to times without a date after they fall back by more than half a day within their run."""
-    last: dict[int, float] = {}
+    last_time: dict[int, float] = {}
     for k, (x, run_index) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
-        if _is_time_without_date(cells[k]) and run_index in last:
-            clock[k] = x = x + _DAY * max(math.floor((last[run_index] - x) / _DAY + 0.5), 0)
-        last[run_index] = x
+        if _is_time_without_date(cells[k]) and run_index in last_time:
+            clock[k] = x = x + _DAY * max(math.floor((last_time[run_index] - x) / _DAY + 0.5), 0)
+        last_time[run_index] = x
 
 
 def _is_time_without_date(cell: str) -> bool:

@@ -124,9 +124,9 @@ def _source(source: Any) -> Source:
     if not isinstance(source, str | Path):
         return opening.open_object(source)
     if group := opening.files_of_group(str(source)):
-        first = _source(group[0])
+        first_source = _source(group[0])
         note = f"{source}: {len(group)} files, each a run; these are the signals of {group[0].name}"
-        return dataclasses.replace(first, notes=(note, *first.notes))
+        return dataclasses.replace(first_source, notes=(note, *first_source.notes))
     path, signal_path = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():

@@ -68,8 +68,8 @@ def reason_without_stance(robot: Robot) -> str | None:
 def reason_without_levers(robot: Robot, configuration: str) -> str:
     """Reason why a configuration has no levers, empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
-    others = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
-    return "" if configuration in have else f"{configuration} has no levers; {others}"
+    advice = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
+    return "" if configuration in have else f"{configuration} has no levers; {advice}"
 
 
 def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
@@ -171,8 +171,8 @@ def _check_time_order(runs: Runs) -> None:
 
 def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
     """Median of the four steps around each step."""
-    wide = np.pad(step, 2, constant_values=np.nan)
-    return np.nanmedian([wide[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
+    padded = np.pad(step, 2, constant_values=np.nan)
+    return np.nanmedian([padded[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 
 
 def _check_angle(runs: Runs) -> None:

@@ -84,11 +84,11 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
     if content.startswith((b"#", b"%", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
         return None
     try:
-        first = content[: content.find(b"\n", end + 1)].decode().splitlines()
+        first_lines = content[: content.find(b"\n", end + 1)].decode().splitlines()
     except UnicodeDecodeError:
         return None
-    input_files.check_declared(name, first[0].count(",") + 1)
-    header, row = ([cell_word(cell.strip()) for cell in line.split(",")] for line in (*first, "", "")[:2])
+    input_files.check_declared(name, first_lines[0].count(",") + 1)
+    header, row = ([cell_word(cell.strip()) for cell in line.split(",")] for line in (*first_lines, "", "")[:2])
     if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
         return None
     import pyarrow as pa
@@ -166,16 +166,16 @@ def drop_comments(lines: Sequence[str]) -> list[str]:
 
     If numbers follow the comments, the last comment with as many cells is the header. A row of units may follow it.
     """
-    first = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
-    lines_below = list(lines[first:])
-    if not first or not lines_below:
+    header_row = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
+    lines_below = list(lines[header_row:])
+    if not header_row or not lines_below:
         return lines_below
     if all(line.endswith(";") for line in lines_below) and "," in lines_below[0]:  # the end of a row in MATLAB
         lines_below = [line[:-1] for line in lines_below]
     cells = re.split(_SEPARATOR, lines_below[0])
     if not any(math.isfinite(cell_number(cell)) or cell.strip().lower() in MISSING for cell in cells):
         return lines_below
-    comments = [line.lstrip("#% ") for line in lines[:first]]
+    comments = [line.lstrip("#% ") for line in lines[:header_row]]
     alike = [line for line in comments if len(re.split(_SEPARATOR, line)) == len(cells)] or comments[-1:]
     split = [[cell.strip() for cell in re.split(_SEPARATOR, line)] for line in alike[-2:]]
     has_units = len(split) == 2 and bool(row_of_units(*split))

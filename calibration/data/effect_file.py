@@ -113,11 +113,11 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
             raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is already used; choose another")
         library[effect.name] = effect
     for path, effect in own_effects:
-        others = [name for name in library if name != effect.name]
-        if effect.settles_to and effect.settles_to not in others:
+        other_names = [name for name in library if name != effect.name]
+        if effect.settles_to and effect.settles_to not in other_names:
             raise BadConfiguration(
                 f"{_where(path, effect)}, settles_to: got {effect.settles_to}; "
-                f"{allowed_words(effect.settles_to, others)}"
+                f"{allowed_words(effect.settles_to, other_names)}"
             )
     return library
 
@@ -200,8 +200,12 @@ def _check_effect(path: Path, effect: type[Effect]) -> None:
         default = effect()
     except (Exception, SystemExit) as error:
         raise refuse(f": cannot be created without arguments ({error}); give every field a default") from error
-    acting, configurations = default.configurations, effect.configurations
-    if acting != configurations or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
+    default_configurations, configurations = default.configurations, effect.configurations
+    if (
+        default_configurations != configurations
+        or not isinstance(default_configurations, tuple)
+        or not all(isinstance(c, str) for c in default_configurations)
+    ):
         raise refuse(f', configurations: got {configurations!r}; expected a tuple of names such as ("4W2T",)')
     declared = {p.name: p for p in params.walk_parameters(default)}
     amplitudes = [name for name, p in declared.items() if p.spec.amplitude]
@@ -260,7 +264,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         external = dataclasses.replace(known, battery=jnp.zeros(()))
         try:
             term_at_zero, term_at_size, term_at_double = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
-            late, fed = (term(jnp.asarray(size), s) for s in (points, external))
+            term_of_external_supply, fed = (term(jnp.asarray(size), s) for s in (points, external))
             other = term(jnp.asarray(size), mirrored) * (-1 if effect.balance in ROUND else 1)
             slope = jax.grad(lambda a, s=known: jnp.sum(term(a, s)))(jnp.asarray(0.0))
             at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(points_at_rest)
@@ -271,7 +275,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
             raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
         if term_at_size.shape != ():
             raise refuse(f": its term has shape {term_at_size.shape}; expected a scalar for scalar signals")
-        if not jnp.array_equal(term_at_size, late, equal_nan=True):
+        if not jnp.array_equal(term_at_size, term_of_external_supply, equal_nan=True):
             raise refuse(": its term reads a signal that is computed after its balance; see balances.moving_signals")
         if float(term_at_zero) != 0.0:
             raise refuse(

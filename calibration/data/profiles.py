@@ -380,10 +380,10 @@ class _CellReader:
 
     def held(self, field: str) -> np.ndarray:
         """Numbers of a required column. If values are held between rows, the last row may be empty."""
-        last = len(self) - 1
+        last_row = len(self) - 1
         held_values: list[float] = []
         for row in range(len(self)):
-            ends = row == last and not self.linear and not self.text(field, row)
+            ends = row == last_row and not self.linear and not self.text(field, row)
             held_values.append(held_values[-1] if ends else self.value(field, row))
         return np.array(held_values)
 

@@ -319,12 +319,12 @@ def _units_of_position_and_rate(
 def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
     """Ratio of a position to the integral of a rate, NaN if the position is not that integral."""
     step = np.diff(time)
-    sound = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
-    if sound.sum() < 3:
+    is_usable = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
+    if is_usable.sum() < 3:
         return math.nan
-    sound &= step <= 5 * np.median(step[sound])
-    distance = np.cumsum(np.where(sound, np.diff(place), 0.0))
-    integral = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
+    is_usable &= step <= 5 * np.median(step[is_usable])
+    distance = np.cumsum(np.where(is_usable, np.diff(place), 0.0))
+    integral = np.cumsum(np.where(is_usable, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
     if not np.any(integral):
         return math.nan
     factor = float(distance @ integral / (integral @ integral))

@@ -65,44 +65,48 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
     if with_constant:
         per_volt = 1 / constant / RPM
-        odd = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", odd)
+        doubt = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
+        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", doubt)
         idle = float(motor.friction_coulomb) / constant
-        odd = _reason_if_outside(
+        doubt = _reason_if_outside(
             idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current"
         )
-        yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
+        yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", doubt)
     if with_constant and voltage is not None:
         fastest = voltage / constant
-        odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit. Check torque_constant")
-        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
+        doubt = (
+            "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit. Check torque_constant")
+        )
+        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", doubt)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
-        odd = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
-        yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
+        doubt = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
+        yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", doubt)
     if with_constant and with_resistance:
         size = constant**2 / resistance
-        odd = _reason_if_outside(
+        doubt = _reason_if_outside(
             size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor. Check their units"
         )
-        yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
+        yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", doubt)
         if inertia > 0:
             constant_time = inertia / size
             why = "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
-            odd = _reason_if_outside(constant_time, 5e-4, 0.5, why)
+            doubt = _reason_if_outside(constant_time, 5e-4, 0.5, why)
             yield DerivedFact(
-                "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", odd
+                "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", doubt
             )
 
 
 def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
-    odd = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
+    doubt = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
     if ratio >= STAGES and efficiency > EFFICIENCY:
-        odd = f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
+        doubt = (
+            f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
+        )
     if ratio == 1 and efficiency < 0.9:
-        odd = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
-    yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
+        doubt = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
+    yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", doubt)
 
 
 def _output_torque_at(robot: Robot, current: float) -> float:
@@ -124,15 +128,15 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
-    odd = _reason_if_outside(current, 0, 200, f"check {places}, and the gearbox")
+    doubt = _reason_if_outside(current, 0, 200, f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
-            odd = (
+            doubt = (
                 f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move. "
                 f"Check {places}"
             )
-    yield DerivedFact(what, f"{three_digits(current)} A per motor", odd)
+    yield DerivedFact(what, f"{three_digits(current)} A per motor", doubt)
 
 
 def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
@@ -171,30 +175,30 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     load = robot.configurations[name]
     sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
     rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
-    odd = _reason_if_outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
-    yield DerivedFact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", odd)
+    doubt = _reason_if_outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
+    yield DerivedFact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", doubt)
     guide = float(load.track.guide_friction) * float(load.track.guide_share)
     torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
     yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
     grip = math.degrees(math.atan(static))
-    odd = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
+    doubt = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
     yield DerivedFact(
         f"{name}: steepest slope without sliding",
         f"{grip:.0f}°",
-        odd or _reason_if_outside(grip, 5, 60, "check friction.static"),
+        doubt or _reason_if_outside(grip, 5, 60, "check friction.static"),
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
         return
     pull = _output_torque_at(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
-    odd = "" if climb > 0 else "its motors cannot move it. Check mass, ratio, torque_constant and resistance"
+    doubt = "" if climb > 0 else "its motors cannot move it. Check mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
-    yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
+    yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, doubt)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
-    odd = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
+    doubt = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
+    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", doubt)
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
@@ -457,9 +461,9 @@ def held_sentence(runs: Runs) -> str:
             for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
                 moves = abs(readings[begin]) > MOVES * np.nanmax(np.abs(readings), initial=0.0)
                 if moves and end - begin > HELD * len(rows) and np.ptp(drive[rows[begin:end]]) > HELD * range_ > 0:
-                    column, last = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
+                    column, last_row = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
-                        f"{runs.source} rows {rows[begin] + 1} to {last}, {column}: the same reading while "
+                        f"{runs.source} rows {rows[begin] + 1} to {last_row}, {column}: the same reading while "
                         f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated. Empty "
                         "these cells to use the other rows"
                     )

@@ -275,10 +275,10 @@ def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bo
     if not all(c.settled for c in present) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
         return False
     drive = columns[SUPPLY] * columns.get("duty", 1.0)
-    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+    other_settings = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
 
     def left(readings: np.ndarray, k: int) -> float:
-        return _unexplained_squares(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+        return _unexplained_squares(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *other_settings)])
 
     return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in present)
 
@@ -286,10 +286,10 @@ def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bo
 def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
     """Sum of squared residuals of the readings, fitted by a linear function of the settings."""
     a = np.stack([np.ones(len(readings)), *settings], 1)
-    sound = np.isfinite(readings)
-    if sound.sum() < 3:
+    is_finite = np.isfinite(readings)
+    if is_finite.sum() < 3:
         return 0.0
-    a, readings = a[sound], readings[sound]
+    a, readings = a[is_finite], readings[is_finite]
     return float(np.sum((readings - a @ np.linalg.lstsq(a, readings, rcond=None)[0]) ** 2))
 
 
@@ -416,8 +416,10 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             )
         if wrong.size:
             row = int(wrong[0])
-            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
-            hint = alone if layout.crosses_zero else ""
+            unsigned_advice = (
+                f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
+            )
+            hint = unsigned_advice if layout.crosses_zero else ""
             raise BadData(
                 f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
                 f"{imposed[row]:g} {unit}; expected readings with their signs, negative in reverse{hint}"

@@ -573,11 +573,12 @@ def _settled_end(
     ends = [(s, *finite_means[s.channel.name][:2]) for s in moving]
     if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
-    acting = inertia.get(str(runs["configuration"][rows[0]]))
+    inertia_of_configuration = inertia.get(str(runs["configuration"][rows[0]]))
     lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
     if (
-        acting is not None
-        and (accelerates := _acceleration_reason(acting, finite_means, lasts, imposed, drift)) is not None
+        inertia_of_configuration is not None
+        and (accelerates := _acceleration_reason(inertia_of_configuration, finite_means, lasts, imposed, drift))
+        is not None
     ):
         return out(*accelerates)
     values_by_channel = {s.channel.name: finite_means.get(s.channel.name, (math.nan,) * 3) for s in signals}
@@ -599,10 +600,10 @@ def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, s
     shorter parts drift less.
     """
     parts = _level_parts(time[rows], shortest)
-    first = _first_steady(signals, rows, parts, drift)
-    last = max(len(parts) - 3, first)
+    first_part = _first_steady(signals, rows, parts, drift)
+    last_part = max(len(parts) - 3, first_part)
     ends: list[tuple[float, _End]] = []
-    for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
+    for k in sorted({first_part, *np.linspace(first_part, last_part, TRIES).astype(int).tolist()}):
         end_rows = rows[parts[k][0] :]
         end_means = {s.channel.name: _segment_mean(s, time[end_rows], end_rows) for s in signals}
         left_over = max(_certain_change(s, *end_means[s.channel.name]) for s in signals)
@@ -677,16 +678,18 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
     quarters = [q[np.isfinite(q)] for q in quarters]
     if min(map(len, quarters)) < PART:
         return 0.0
-    first, before, last = np.diff([float(np.mean(q)) for q in quarters]).tolist()
+    first_change, middle_change, last_change = np.diff([float(np.mean(q)) for q in quarters]).tolist()
     place = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
     noise = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
     standard_error = SDS * math.sqrt(2 * _correlation_time(noise) / len(noise)) * float(np.std(noise))
-    earlier, later = (before, last) if abs(last) >= standard_error else (first, before)
+    earlier, later = (
+        (middle_change, last_change) if abs(last_change) >= standard_error else (first_change, middle_change)
+    )
     if abs(later) < standard_error or earlier * later <= 0:
         return 0.0
     fades = min(later / earlier, 0.9)
-    last = abs(last) if abs(last) >= standard_error else min(abs(later) * fades, standard_error)
-    return last * fades / (1 - fades) / _scale_of(signal, mean)
+    last_change = abs(last_change) if abs(last_change) >= standard_error else min(abs(later) * fades, standard_error)
+    return last_change * fades / (1 - fades) / _scale_of(signal, mean)
 
 
 def _reading_size(shown: np.ndarray) -> float:
@@ -712,20 +715,20 @@ def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
 def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
     """First part from which on every channel's mean stays at its final value."""
     ends = parts[-3:]
-    first = len(parts) - len(ends)
+    first_part = len(parts) - len(ends)
     means = np.array([[_plain(s.shown[rows[low:high]]) for low, high in parts] for s in signals])
     tail = np.array([_plain(s.shown[rows[ends[0][0] :]]) for s in signals])
     noise = np.array([_noise_of_mean(s, rows, ends) for s in signals])
     large = np.array([s.largest for s in signals])
     tolerance = np.maximum(0.5 * drift * np.abs(tail), FINE * large)
-    for k in range(first - 1, -1, -1):
+    for k in range(first_part - 1, -1, -1):
         difference = np.abs(means[:, k] - tail)
         count = parts[k][1] - parts[k][0]
         scatter = noise * math.sqrt(1 / max(count, 1) + 1 / (len(rows) - ends[0][0]))
         if np.any(difference > tolerance + SDS * scatter):
             break
-        first = k
-    return first
+        first_part = k
+    return first_part
 
 
 def _plain(x: np.ndarray) -> float:
@@ -752,8 +755,8 @@ def _correlation_time(x: np.ndarray) -> float:
     if len(x) < 4 or power <= 0:
         return 1.0
     longest_lag = min(len(x) // 3, 500)
-    wide = np.fft.rfft(x, 2 * len(x))
-    rho = np.fft.irfft(np.abs(wide) ** 2)[:longest_lag] / (len(x) * power)
+    spectrum = np.fft.rfft(x, 2 * len(x))
+    rho = np.fft.irfft(np.abs(spectrum) ** 2)[:longest_lag] / (len(x) * power)
     total = 1.0
     for k in range(1, longest_lag - 1, 2):
         pair = rho[k] + rho[k + 1]
@@ -950,7 +953,7 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
             f"needs at least {FEWEST}; {direct}log them more often"
         )
     imposed = found.runs.layout.imposed_column
-    others = {
+    message_of_reason = {
         "idle": f"{imposed} is about zero, so nothing drives the motors. Log rows in which they are driven, or, if "
         "another column has the command, name that one under [columns] in the rig file",
         "rest": "no level shows motion above the noise. Use larger commands",
@@ -960,7 +963,7 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
         "mean",
         "undriven": "the driver brakes or coasts in every row. Log rows in which it drives the motors",
     }
-    return f"{source} {rows}, no settled segment: {others[why]}"
+    return f"{source} {rows}, no settled segment: {message_of_reason[why]}"
 
 
 # --- properties of the robot that settling needs ---

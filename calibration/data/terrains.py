@@ -60,9 +60,9 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
     if names is None:
         either = ", or ".join(" and ".join(names) for names in wanted)
         raise BadData(f"{path.name}: got columns {', '.join(header) or 'none'}; expected {either}")
-    for others in wanted:
-        if conflicting := [name for name in others if name in header and name not in names]:
-            ours = ", ".join(name for name in names if name not in others)
+    for other_names in wanted:
+        if conflicting := [name for name in other_names if name in header and name not in names]:
+            ours = ", ".join(name for name in names if name not in other_names)
             raise BadData(
                 f"{path.name}: got columns {', '.join(conflicting)} and {ours}; expected one kind, remove the other"
             )

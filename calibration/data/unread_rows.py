@@ -73,8 +73,8 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
     is_limited = np.zeros(len(runs), bool)
     command, supply = (np.abs(runs["duty"]), np.abs(runs[SUPPLY])) if runs.has("duty") else (drive, drive)
     supply_current = [runs["total_current_A"][:, None]] if runs.has("total_current_A") else []
-    others = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
-    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in others):
+    other_conditions = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
+    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in other_conditions):
         return is_limited
     order = np.argsort(-command, kind="stable")
     for magnitudes in (np.abs(x)[order] for x in (*supply_current, runs.measured())):

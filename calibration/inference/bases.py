@@ -338,8 +338,8 @@ def window_families(
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
-                first = low + k * size / 2
-                is_inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
+                window_start = low + k * size / 2
+                is_inside = (x >= window_start) & ((x < window_start + size) | (k == round(2 / share) - 2))
                 offered.append((axis, x, counts & is_inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
@@ -394,8 +394,8 @@ def order_collinearity(
         return 1.0
     _, configuration = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
     conditions = (*(axes_of(None) if axes is None else axes), *(["duty"] if "duty" in columns else []))
-    others = [c for c in conditions if c != VARIABLES["slope"]]
-    values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
+    other_conditions = [c for c in conditions if c != VARIABLES["slope"]]
+    values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in other_conditions)], 1)
     _, group_index = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
     _, cell_index = np.unique(values, axis=0, return_inverse=True)
     few = cell_index.max() + 1 <= FEW_CELLS * len(x)

@@ -405,8 +405,8 @@ def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, C
         cost, delay, _, level, bend = trial
         if level and abs(bend) < 0.3:
             return np.inf
-        late = CERTAIN if delay > LATE * step else 3.0 * (delay != 0)
-        return float(count * np.log(cost) + late + 2 * CERTAIN * (level > 0))
+        penalty = CERTAIN if delay > LATE * step else 3.0 * (delay != 0)
+        return float(count * np.log(cost) + penalty + 2 * CERTAIN * (level > 0))
 
     return min(trials, key=penalised)[1:]
 

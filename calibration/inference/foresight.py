@@ -151,16 +151,18 @@ def _separating_columns(
     Each sample is assumed to have such a reading, and its sensitivity is simulated.
     """
     channels, rig = posed.base.channels, posed.base.rig
-    wide = dataclasses.replace(posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE)))
-    columns = {**{c.column: np.zeros(len(runs)) for c in wide.channels}, **runs.columns}
-    layout = dataclasses.replace(runs.layout, channels=wide.channels)
+    robot_with_all_channels = dataclasses.replace(
+        posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE))
+    )
+    columns = {**{c.column: np.zeros(len(runs)) for c in robot_with_all_channels.channels}, **runs.columns}
+    layout = dataclasses.replace(runs.layout, channels=robot_with_all_channels.channels)
     table = dataclasses.replace(runs, columns=columns, layout=layout)
-    sd = np.ones((len(runs), len(wide.channels)))
-    problem = observers.pose_problem(table, wide, posed.coordinates, sd)
+    sd = np.ones((len(runs), len(robot_with_all_channels.channels)))
+    problem = observers.pose_problem(table, robot_with_all_channels, posed.coordinates, sd)
     linearised = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
     readings, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in linearised)
     covariances = {}
-    for k, channel in enumerate(wide.channels):
+    for k, channel in enumerate(robot_with_all_channels.channels):
         size = channel.sd_share * np.sqrt(np.mean(readings[:, k] ** 2))
         if channel not in channels and size > 0:
             rows = np.concatenate([about.jacobian, slopes[:, k] / size, np.eye(len(about.sd))])

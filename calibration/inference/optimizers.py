@@ -452,8 +452,8 @@ def _search_with_states(
     """Results of `search_refilling`, with the state of the solver at the end of each search."""
     count, step_limit = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
-    first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
-    idle = _placeholder_searches(problem, first)
+    first_members = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
+    idle = _placeholder_searches(problem, first_members)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
     go_on = _continue_searches_separately if problem.observe.apart else go_on
 
@@ -469,7 +469,7 @@ def _search_with_states(
         return assigned.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step
-        go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), step_limit)
+        go_on(problem, first_members, np.zeros(places, bool), idle, np.asarray(0), step_limit)
     with Threads(cores) as pool:
         results_by_member = {
             k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()
@@ -560,7 +560,7 @@ def search_rollout(
     """
     pin, solver = no_pin(start.shape[0]), _least_squares_solver(data, long=True)
     size = adhesion_penalty_slice(data).stop + start.shape[0]
-    progress, first, last = _initial_progress(solver, start, size, None), None, None
+    progress, first_result, last_result = _initial_progress(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         ahead = progress[1].ahead
@@ -568,18 +568,18 @@ def search_rollout(
         r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
             r, jacobian, observation = linearise_rollout(problem, ahead, data)
-        first = observation if first is None else first
+        first_result = observation if first_result is None else first_result
         progress = _linearised_step(solver, progress, r, jacobian)
         done = bool(progress[1].over)
         if progress[1].rejected == 0:
-            best, last = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
+            best, last_result = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
         if done:
             break
-    assert best is not None and first is not None and last is not None
-    return best, first, last
+    assert best is not None and first_result is not None and last_result is not None
+    return best, first_result, last_result
 
 
 #: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the

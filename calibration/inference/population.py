@@ -184,10 +184,10 @@ class MemberRunner:
         z = np.array([np.frombuffer(key) for key in self._kept])
         arrays: Json = dict(zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True))
         try:
-            with replacing(self._file) as aside, aside.open("wb") as out:
-                np.savez(out, **arrays, identity=np.array(self._own))
-                out.flush()
-                os.fsync(out.fileno())
+            with replacing(self._file) as temporary, temporary.open("wb") as stream:
+                np.savez(stream, **arrays, identity=np.array(self._own))
+                stream.flush()
+                os.fsync(stream.fileno())
         except OSError as error:
             raise BadConfiguration(f"--members {self._file}: cannot be written: {error.strerror}") from None
 

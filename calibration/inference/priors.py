@@ -212,10 +212,12 @@ def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) 
     Args:
         idle: endings of the names of parameters that the data do not show.
     """
-    others = set(robot.configurations) - set(configurations)
+    other_configurations = set(robot.configurations) - set(configurations)
     fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
     own_names = [
-        n for n, _, sd in robot.rig.priors if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *others}
+        n
+        for n, _, sd in robot.rig.priors
+        if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *other_configurations}
     ]
     return _drive_names(
         robot, (n for n in own_names if _leading_parameter(robot, n) is None and not n.endswith(idle))
@@ -402,8 +404,8 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
 
 def _similar_names(word: str, everything: list[str]) -> list[str]:
     """Names to suggest for an unknown one: those with the same last part, or of the same group, or all."""
-    last = word.rsplit(".", 1)[-1]
-    near = [n for n in everything if last and (n.endswith(f".{last}") or last in n)]
+    last_part = word.rsplit(".", 1)[-1]
+    near = [n for n in everything if last_part and (n.endswith(f".{last_part}") or last_part in n)]
     return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
 
 

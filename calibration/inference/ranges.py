@@ -259,8 +259,8 @@ def _slope_unit_remark(runs: Runs, measured: np.ndarray, possible: np.ndarray, r
     if sum(len(g) - 1 for g in several) < 3:
         return
     x, y = (np.concatenate([v[g, k] - np.mean(v[g, k]) for g in several]) for v in (possible, measured))
-    follows = float(x @ y / math.sqrt(max(float((x @ x) * (y @ y)), 1e-300)))
+    correlation = float(x @ y / math.sqrt(max(float((x @ x) * (y @ y)), 1e-300)))
     rise = float(x @ y / max(float(x @ x), 1e-300))
     for unit, size in SLOPES.items():
-        if follows > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
+        if correlation > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
             yield Remark("slopes_in", unit=unit, rise=rise)

@@ -98,9 +98,9 @@ def _block_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for kind, block_errors in found.held_out.items():
         if block_errors.unreachable_rows:
             yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
-    for kind, others in found.held_out_alike.items():
-        if others:
-            yield Remark("same_predictions", kind=kind, others=others)
+    for kind, similar_kinds in found.held_out_alike.items():
+        if similar_kinds:
+            yield Remark("same_predictions", kind=kind, others=similar_kinds)
     for kind, block_errors in found.held_out.items():
         if not all(block.converged for block in block_errors.blocks.values()):
             yield Remark("block_not_converged", kind=kind)

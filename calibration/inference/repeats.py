@@ -41,9 +41,9 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
     pairs = [pair for rows in rows_of_same_conditions(runs) for pair in itertools.pairwise(rows)]
     if len(pairs) < FEWEST:
         return noise, []
-    first, second = np.array(pairs).T
-    difference_in_sds = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(
-        noise.sd[first], noise.sd[second]
+    first_rows, second_rows = np.array(pairs).T
+    difference_in_sds = np.abs(runs.measured()[first_rows] - runs.measured()[second_rows]) / np.hypot(
+        noise.sd[first_rows], noise.sd[second_rows]
     )
     factors, notes = dict[str, float](), list[Remark]()
     for k, channel in enumerate(noise.channels):

@@ -117,8 +117,8 @@ def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan
 
 def _scan_at(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
-    cost, others = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
-    return _sorted_scan(at, np.asarray(cost), np.asarray(others))
+    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
+    return _sorted_scan(at, np.asarray(cost), np.asarray(other_coordinates))
 
 
 def _join_scans(one: Scan, two: Scan) -> Scan:
@@ -172,8 +172,8 @@ def search_lower_minima(
         lower = found
         for k, scan in looked.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
-                alone = np.where(np.arange(len(z)) == k, scan.at[j], z)
-                end = search(min((scan.others[j], alone), key=objective))
+                start = np.where(np.arange(len(z)) == k, scan.at[j], z)
+                end = search(min((scan.others[j], start), key=objective))
                 lower = min(lower, end, key=lambda f: float(f[0].cost))
         if not float(lower[0].cost) < cost_here - WORTH:
             break

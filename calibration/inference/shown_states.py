@@ -167,9 +167,9 @@ class LogPoints(eqx.Module):
 
     def imposed(self, delay: Scalar) -> Conditions:
         """Conditions at another delay, limited to `reach`. Can be differentiated."""
-        conditions, late = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
+        conditions, shift = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
         for name, drift in self.drift.items():
-            conditions = with_condition(conditions, name, getattr(conditions, name) + late * drift)
+            conditions = with_condition(conditions, name, getattr(conditions, name) + shift * drift)
         return conditions
 
 
@@ -261,12 +261,14 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
         times = time[begin:end]
         duration = times[-1] - times[0]
         window_length = min(length, duration)
-        for first in times[0] + np.linspace(
+        for window_start in times[0] + np.linspace(
             0.0, duration - window_length, int((duration - window_length) / (APART * window_length)) + 1
         ):
-            low, high = np.searchsorted(times, (first - 1e-9, first + window_length + 1e-9))
+            low, high = np.searchsorted(times, (window_start - 1e-9, window_start + window_length + 1e-9))
             if high - low >= FEWEST - 1:
-                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / window_length))
+                windows.append(
+                    (np.arange(begin + low, begin + high), (times[low:high] - window_start) / window_length)
+                )
     return windows
 
 
@@ -292,13 +294,13 @@ def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count:
     slopes = np.zeros(len(time))
     starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
     for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
-        wide = min(count, end - begin)
-        if wide < FEWEST // 2:
-            slopes[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
+        width = min(count, end - begin)
+        if width < FEWEST // 2:
+            slopes[begin:end] = np.gradient(values[begin:end], time[begin:end]) if width > 1 else 0.0
             continue
-        low = np.clip(np.arange(begin, end) - wide // 2, begin, end - wide)
-        for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * wide // 1_000_000):
-            near, row_index = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
+        low = np.clip(np.arange(begin, end) - width // 2, begin, end - width)
+        for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * width // 1_000_000):
+            near, row_index = low[part][:, None] + np.arange(width), (begin + part)[:, None]
             away = time[near] - time[row_index]
             scale = np.abs(away).max()
             powers = (away / scale)[:, :, None] ** np.arange(4)
@@ -380,24 +382,24 @@ class _LogArrays:
         begin = np.flatnonzero(np.r_[True, np.diff(stretch) != 0])[: len(rows)]
         place = np.arange(len(rows)) - begin[stretch] if len(rows) else stretch
         block = np.cumsum((place % size == 0) | broken) - 1
-        first, count = np.unique(block, return_index=True, return_counts=True)[1:]
+        first_row, count = np.unique(block, return_index=True, return_counts=True)[1:]
 
         def mean(x: np.ndarray) -> np.ndarray:
-            return np.add.reduceat(x, first, axis=0) / (count if x.ndim == 1 else count[:, None])
+            return np.add.reduceat(x, first_row, axis=0) / (count if x.ndim == 1 else count[:, None])
 
         middle = 0.5 * (times[1:] + times[:-1])
         inner = ~broken[1:]
         low = np.r_[times[:1], np.where(inner, middle, times[1:])]
         high = np.r_[np.where(inner, middle, times[:-1]), times[-1:]]
-        last = first + count - 1
-        cell = np.stack([low[first] - EDGE * self.step, high[last] + EDGE * self.step], 1)
+        last_row = first_row + count - 1
+        cell = np.stack([low[first_row] - EDGE * self.step, high[last_row] + EDGE * self.step], 1)
         return {
-            "row": rows[first + count // 2],
+            "row": rows[first_row + count // 2],
             "time": mean(times),
             "shown": mean(self.measured[rows]),
             "sd": np.sqrt(mean(self.sd[rows] ** 2) / count[:, None]),
             "cell": cell,
-            "stretch": np.where(count == size, stretch[first], -1),
+            "stretch": np.where(count == size, stretch[first_row], -1),
         }
 
     def course(self, cells: list[np.ndarray]) -> ImposedCourse:

@@ -61,10 +61,10 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
     while improved:
         improved = False
         for place in range(count):
-            others = run_indices[:place] + run_indices[place + 1 :]
-            best = _best_candidate(information, others)
-            if _log_determinant(information, [*others, best]) > _log_determinant(information, run_indices) + 1e-9:
-                run_indices = [*others, best]
+            other_runs = run_indices[:place] + run_indices[place + 1 :]
+            best = _best_candidate(information, other_runs)
+            if _log_determinant(information, [*other_runs, best]) > _log_determinant(information, run_indices) + 1e-9:
+                run_indices = [*other_runs, best]
                 improved = True
     ordered: list[int] = []
     for _ in range(count):  # chosen runs, the most informative first
@@ -145,11 +145,11 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     values = np.array(study.values_at(rows))
     # A condition that a candidate states replaces its range in the study. The others are in the middle of their
     # range.
-    first = len(study.inputs.columns) - len(study.inputs.conditions)
+    first_condition = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):
         condition_value = getattr(conditions, name)
         if condition_value is not None:
-            values[:, first + j] = np.asarray(condition_value)
+            values[:, first_condition + j] = np.asarray(condition_value)
     answer = model(values, conditions)
     derivatives = model.derivatives(values, conditions)
     inner = study.inputs.slope[:, :p]

@@ -79,7 +79,7 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     payload, slope = np.linspace(0, most[0], POINTS), np.linspace(0, most[1], POINTS)
     e = asked.envelope
     base = sheet.envelope_points(robot, Requirement("speed_m_s", 0.0, True, e))
-    first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
+    robot_and_point = jax.tree.map(lambda x: np.asarray(x)[-1], base)
     s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
     speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
     power_needed = np.zeros(len(p))
@@ -91,7 +91,7 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None
     for charge in e.charge:
-        points = jax.tree.map(lambda x: jnp.full(len(p), x), first)
+        points = jax.tree.map(lambda x: jnp.full(len(p), x), robot_and_point)
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )

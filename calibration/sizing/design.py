@@ -242,9 +242,9 @@ def _demand_margin(
     if r.name == "slope_deg":
         return jnp.minimum(travels, cell_voltage_ratio)
     if r.name == "payload_kg":
-        hot = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(ratings.temperature)))
+        heat_margin = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(ratings.temperature)))
         torque = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
-        return jnp.min(jnp.stack([travels, cell_voltage_ratio, hot, torque]))
+        return jnp.min(jnp.stack([travels, cell_voltage_ratio, heat_margin, torque]))
     if r.name == "endurance_min":
         return _endurance_margin(r, robot, ratings, states)
     if r.limit is None:  # ratings of the parts, required of every design

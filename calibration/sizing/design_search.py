@@ -173,9 +173,11 @@ def _descend(
             best, at_best = jnp.where(better, f, best), jnp.where(better, x, at_best)
             slope = jnp.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0)
             change, state = adam.update(slope, state)
-            follows = (k + 1) % EVERY == 0
-            multipliers = jnp.where(follows, jnp.clip(multipliers - weight * (g - 1e-3), 0.0, 1e3), multipliers)
-            weight = jnp.where(follows, jnp.minimum(weight * GROWTH, HEAVIEST), weight)
+            updates_multipliers = (k + 1) % EVERY == 0
+            multipliers = jnp.where(
+                updates_multipliers, jnp.clip(multipliers - weight * (g - 1e-3), 0.0, 1e3), multipliers
+            )
+            weight = jnp.where(updates_multipliers, jnp.minimum(weight * GROWTH, HEAVIEST), weight)
             return (jnp.clip(x + change, low, high), state, multipliers, weight, best, at_best), None
 
         x = d.continuous

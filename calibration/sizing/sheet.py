@@ -462,10 +462,10 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
     good = np.flatnonzero(meets(ladder))
     if not good.size:
         return None
-    first = int(good[0])
+    first_place = int(good[0])
     if name == CELLS:
-        return float(ladder[first])
-    a, b = (begin if first == 0 else ladder[first - 1]), ladder[first]
+        return float(ladder[first_place])
+    a, b = (begin if first_place == 0 else ladder[first_place - 1]), ladder[first_place]
     for _ in range(3):
         finer = steps(a, b, ROWS)
         places_that_meet = np.flatnonzero(meets(finer))

@@ -89,15 +89,15 @@ class BeltLoop(eqx.Module):
         """Points of the pitch line [m], at positions `place` from 0 to the length of the belt."""
         a, b, c, d = self.marks
         normal = self.normal(self.turned(place))
-        first = place < (b + c) / 2
-        first = first & (place > -self.run)
+        on_first_pulley = place < (b + c) / 2
+        on_first_pulley = on_first_pulley & (place > -self.run)
         along = jnp.where(
-            first,
+            on_first_pulley,
             jnp.minimum(place - a, 0.0) + jnp.maximum(place - b, 0.0),
             jnp.minimum(place - c, 0.0) + jnp.maximum(place - d, 0.0),
         )
-        radius = jnp.where(first, self.first, self.second)
-        centre = jnp.stack([jnp.where(first, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
+        radius = jnp.where(on_first_pulley, self.first, self.second)
+        centre = jnp.stack([jnp.where(on_first_pulley, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
         return centre + radius[..., None] * normal + along[..., None] * running_direction(normal)
 
     def places(self, drawn: Scalar) -> Float[Array, " grousers"]:

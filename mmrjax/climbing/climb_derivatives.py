@@ -154,9 +154,9 @@ def climb_derivatives(
     )
     records: list[Any] = []
     for k in range(parts):
-        first = jnp.asarray(k * samples * steps * step)
+        first_step = jnp.asarray(k * samples * steps * step)
         (state, record), (state_change, changed) = _advance_part(
-            (run, state), (rotated_run, state_change), first, interval, step_numbers, samples
+            (run, state), (rotated_run, state_change), first_step, interval, step_numbers, samples
         )
         records.append(jax.device_get((record, changed)))
         if progress is not None:
@@ -184,10 +184,10 @@ def climb_derivatives(
         progress=None if progress is None else lambda share: progress((1 + share) / 2),
     )  # fmt: skip
     single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(nearby_values)))
-    others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
+    other_outputs = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
     slope, sd = {}, {}
     for name in gradients:
-        y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
+        y = np.array([float(other[name]) for other in other_outputs]).reshape(-1, BESIDE)
         square, deviations = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
         rise = deviations @ offsets / square
         unexplained_rise = deviations - np.outer(rise, offsets)

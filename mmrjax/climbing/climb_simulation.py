@@ -322,8 +322,8 @@ def climb_instant(
     """
     touching = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
-    bears = touching.force * touching.rolls
-    share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
+    bearing_force = touching.force * touching.rolls
+    share = bearing_force / jnp.maximum(jnp.sum(bearing_force), 1e-9)
     speed = share @ (touching.carried @ motion.v)
     conditions = _driven(run, on)
 
@@ -342,8 +342,8 @@ def _driven(run: ClimbSystem, on: Scalar) -> Conditions:
 
 def _lever_loss(run: ClimbSystem, speed: Array) -> Array:
     """Loss torques of the lever tracks (24) [N·m], at the speeds of their pulleys relative to the levers [rad/s]."""
-    rolls = contact.smooth_sign(run.shape.main.first * speed, run.chassis.speed_still)
-    return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
+    direction = contact.smooth_sign(run.shape.main.first * speed, run.chassis.speed_still)
+    return jnp.asarray(run.lever_track.torque_loss(speed, direction))
 
 
 def _with_lever_current(run: ClimbSystem, motion: ClimbMotion) -> ClimbSystem:
@@ -431,8 +431,8 @@ def advance_climb(
     inverse = jnp.array(
         [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
     ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
-    alone = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
-    swung = _drive_action(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
+    lever_speeds = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
+    swung = _drive_action(run, motion, time, signals.voltage_source, lever_speeds, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
     gained = jnp.concatenate([acceleration - coupling @ led, led])
     v = motion.v + gained
@@ -502,8 +502,8 @@ def _distances_to_outermost_contacts(centre_of_mass: Scalar, at: Footing) -> Pai
     """Distances from the centre of mass to the outermost contacts behind and ahead [m], measured along level
     ground.
     """
-    bears, ahead = at.force > 0, at.place - centre_of_mass
-    return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
+    is_loaded, ahead = at.force > 0, at.place - centre_of_mass
+    return jnp.stack([jnp.max(jnp.where(is_loaded, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
 def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Footing) -> Scalar:
@@ -739,8 +739,10 @@ def climb_batch(
     state = _begin(robot, conditions, terrain, sequence, interval, start)
     records: list[ClimbRecord] = []
     for k in range(parts):
-        first = jnp.asarray(k * samples * steps * step)
-        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, step_numbers, samples)
+        first_step = jnp.asarray(k * samples * steps * step)
+        state, passed = _compiled(
+            robot, conditions, terrain, sequence, state, first_step, interval, step_numbers, samples
+        )
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
         records = [*(records if record else []), jax.device_get(last)]

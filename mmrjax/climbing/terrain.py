@@ -110,8 +110,8 @@ def stairs(rise: Scalar, tread: Scalar, count: int, nose: Scalar = 0.0, size: in
     points: list[tuple[Scalar, Scalar]] = [(-FAR, 0.0)]
     for k in range(count):
         points += [(k * tread, k * rise), (k * tread, (k + 1) * rise)]
-    last = (count - 1) * tread
-    return _terrain_of_points([*points, (last + FAR, count * rise)], last, nose, size)
+    last_edge = (count - 1) * tread
+    return _terrain_of_points([*points, (last_edge + FAR, count * rise)], last_edge, nose, size)
 
 
 def gap(width: Scalar, size: int = 0) -> Terrain:

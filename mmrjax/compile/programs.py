@@ -129,12 +129,12 @@ class Programs:
             return existing.result()
         # The tracing thread may wait for a program of another thread, which must have finished its own tracing.
         with TRACING:
-            first = structure not in self._found
+            is_new = structure not in self._found
             promise = self._found.setdefault(structure, Future())
-            if first:
+            if is_new:
                 leaves, tree = jax.tree.flatten(arguments)
                 make = self._kept(structure, functools.partial(self._obtained, Path(folder), leaves, tree))
-        if first:
+        if is_new:
             promise.set_result(self._kept(structure, make))
         return promise.result()
 

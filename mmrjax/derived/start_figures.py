@@ -122,9 +122,9 @@ def stages_of_start(
     sliding, even = (_moving_means(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
     slipping_instants = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
     slipping = float(time[min(int(slipping_instants[-1]) + 1, len(time) - 1)]) if slipping_instants.size else starting
-    last = speed[last_samples(time)].mean()
-    late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
-    settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
+    final_speed = speed[last_samples(time)].mean()
+    unsettled_instants = np.flatnonzero(np.abs(even - final_speed) > WITHIN * abs(final_speed))
+    settled = float(time[min(int(unsettled_instants[-1]) + 1, len(time) - 1)]) if unsettled_instants.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
     slips = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
     mean_of_start = mean_slip(time, speed, theoretical, 0.0, settled)

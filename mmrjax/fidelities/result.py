@@ -32,8 +32,8 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
     power_ground = sides * signals.traction * signals.speed
     temperature = robot.motor.temperature_settled(signals.current * robot.driver.ripple(signals.duty) ** 0.5)
     limit = robot.motor.temperature_limit
-    hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(HEAT)  # settled or not
-    flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": hot})
+    is_too_hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(HEAT)  # settled or not
+    flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": is_too_hot})
     result = Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,

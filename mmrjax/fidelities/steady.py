@@ -267,12 +267,12 @@ def _state_at_unknowns(
     status = jnp.where(at_rest, STALLED, travel_status(signals.speed, voltage))
     if robot.has_ground:
         exceeds_adhesion = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = (
+        is_sliding = (
             compute_if_needed(exceeds_adhesion, _slides_in_place, detached, jnp.zeros_like(exceeds_adhesion))
             if stands
             else exceeds_adhesion
         )
-        status = jnp.where(exceeds_adhesion, jnp.where(slides, SLIDES, STALLED), status)
+        status = jnp.where(exceeds_adhesion, jnp.where(is_sliding, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
         stands_still &= ~_is_held(conditions) | (sense * unknowns[2] <= 1e-9)  # friction leaves the clamp nothing

@@ -310,8 +310,8 @@ def _segment_end(
     flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
     rise = law.stored(robot, signals) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
-    first, last = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
-    energy_supplied = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
+    energy_before, energy_after = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
+    energy_supplied = jnp.where(conditions.battery > 0.5, energy_after - energy_before, drawn - returned)
     ran = ~before.ended
     time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
     return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept)
@@ -326,8 +326,8 @@ def _assemble_mission(
     by_segment = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
     total, status = jax.tree.map(jnp.sum, by_segment), ends.status
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
-    first = jnp.argmax(bad)
-    outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
+    first_bad = jnp.argmax(bad)
+    outcome = jnp.where(jnp.any(bad), status[first_bad], CONVERGED)
     outcome = jnp.where(c.ended, _early_end_status(c), outcome)
     end = jax.tree.map(lambda x: x[-1], ends.found)
     answer = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)

@@ -130,9 +130,9 @@ def cell_below_cutoff(
 
     Not traceable. The motor current is `start.current`, or 0 if no start is given.
     """
-    battery, first = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
-    other = battery.current_other if first.current_other is None else first.current_other
-    duty = conditions.duty if first.duty is None else first.duty
+    battery, first_row = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
+    other = battery.current_other if first_row.current_other is None else first_row.current_other
+    duty = conditions.duty if first_row.duty is None else first_row.duty
     motors = robot.sides * (Start() if start is None else start).current * duty
     cell = battery.voltage_no_load(conditions.discharge) - (motors + other) * battery.resistance
     is_below = (conditions.battery > 0.5) & (cell < battery.voltage_cutoff)

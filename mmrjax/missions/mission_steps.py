@@ -458,10 +458,10 @@ class _SegmentIntegrator(NamedTuple):
             jnp.maximum(c.peaks, jnp.stack([jnp.asarray(signal_peaks[name]) * jnp.ones(()) for name in law.PEAKS])),
             highest,
         )
-        hot = is_accepted & (within["temperature"] > robot.motor.temperature_limit)
+        is_too_hot = is_accepted & (within["temperature"] > robot.motor.temperature_limit)
         exceedance = law.exceeded(robot, signals)
         exceedance.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
-        flags = flag_mask({**exceedance, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
+        flags = flag_mask({**exceedance, "cut_off": cut_off}) | flag_mask({"too_hot": is_too_hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         has_ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)

@@ -185,8 +185,8 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
 
 
 def exceeded(robot: Robot, found: Signals) -> Scalars:
-    hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
-    return {**result.exceeded_limits(robot, found), "too_hot": hot}
+    is_too_hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
+    return {**result.exceeded_limits(robot, found), "too_hot": is_too_hot}
 
 
 def limited(robot: Robot, y: Array) -> Array:

@@ -119,8 +119,8 @@ class Motor(eqx.Module):
     def current_continuous(self) -> Scalar:
         """Current with a final winding temperature at the permissible limit [A], with the rise of its resistance."""
         allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
-        hot = self.resistance * self.resistance_ratio(self.temperature_limit)
-        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
+        hot_resistance = self.resistance * self.resistance_ratio(self.temperature_limit)
+        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot_resistance, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
         """Rates of the temperatures of winding and housing [K/s], two thermal masses in series.

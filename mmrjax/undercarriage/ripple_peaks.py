@@ -55,11 +55,11 @@ def measure_ripple(time: Series, values: Series) -> Ripple:
     period = float("nan")
     good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max(initial=0.0)]
     if len(good):
-        first = _parabola_vertex(agreement, good[0])
-        period_counts = np.round(good / first)
-        near = np.abs(good / first - period_counts) < 0.2
+        fundamental = _parabola_vertex(agreement, good[0])
+        period_counts = np.round(good / fundamental)
+        near = np.abs(good / fundamental - period_counts) < 0.2
         last = good[near][-1]
-        period = float(_parabola_vertex(agreement, last) / np.round(last / first) * (time[1] - time[0]))
+        period = float(_parabola_vertex(agreement, last) / np.round(last / fundamental) * (time[1] - time[0]))
     return Ripple(float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period)
 
 
@@ -112,8 +112,8 @@ def touchdown_times(
     A grouser that lifts and returns in the middle of the run does not count. Its place has to be in the second half
     of the path, or just at the start of it.
     """
-    bears = np.asarray(grouser) > 0
-    lands = ~bears[:-1] & bears[1:]
+    is_loaded = np.asarray(grouser) > 0
+    lands = ~is_loaded[:-1] & is_loaded[1:]
     length = np.asarray(place).max()
     front = (np.asarray(place)[1:] > length / 2) | (np.asarray(place)[1:] < 0.02 * length)
     return np.sort(np.asarray(time)[1:][np.nonzero(lands & front)[0]])
@@ -342,8 +342,8 @@ def find_crossings(
     for mode in modes:
         if not mode.resonant:
             continue
-        first = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
-        for order in range(first, int(mode.frequency * travel / slowest) + 1):
+        lowest_order = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
+        for order in range(lowest_order, int(mode.frequency * travel / slowest) + 1):
             shows = tuple(p.signal for p in found if (p.payload, p.mode, p.order) == (payload, mode.name, order))
             answer.append(ModeCrossing(mode.name, order, payload, mode.frequency * travel / order, shows))
     return answer

@@ -287,8 +287,8 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Lev
     if config.levers_voltage_V is not None:
         sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))
     if tracked:
-        first = (float(sequence.first[0]), float(np.pi - sequence.first[1]))
-        for option, angle in zip(("front", "rear"), first, strict=True):
+        first_angles = (float(sequence.first[0]), float(np.pi - sequence.first[1]))
+        for option, angle in zip(("front", "rear"), first_angles, strict=True):
             if why := terrains.lever_start_refusal(robot, float(np.degrees(angle))):
                 raise BadConfiguration(f"levers {option}: {why}")
     return sequence

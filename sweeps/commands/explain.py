@@ -240,8 +240,8 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
     yield "nominal", f"{float(parameter.value):g} {spec.unit}. Source: {spec.source}"
     yield "prior", _prior_text(parameter)
     yield "bounds", _bounds_text(spec)
-    first = name.partition(".")[0]
-    part: Any = dict(robot.configurations.items()).get(first, robot)
+    first_part = name.partition(".")[0]
+    part: Any = dict(robot.configurations.items()).get(first_part, robot)
     for step in name.split(".")[:-1]:
         part = getattr(part, step, part)
     equation = " ".join((inspect.getdoc(type(part)) or "").partition("\n\nAttributes:")[0].split())

@@ -142,8 +142,8 @@ def _add_track_model_test(
 def _report_out_of_time(within: float, begun: bool) -> None:
     """Reports that the time budget [s] ended before a verdict. `begun`: True if at least one stage has finished."""
     more = max(5, math.ceil(within / 30))  # with twice the time
-    first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
-    print_message(f"no verdict within {within:g} s{first}")
+    base_words = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
+    print_message(f"no verdict within {within:g} s{base_words}")
 
 
 @contextlib.contextmanager
@@ -172,8 +172,8 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
 
 def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
     """Prints the ranking by regression, the first answer, and writes it to the run folder."""
-    first, *lines = loop_words.ranking_lines(found, brief=brief)
-    timed(first)
+    first_line, *lines = loop_words.ranking_lines(found, brief=brief)
+    timed(first_line)
     for line in lines:
         print_message(line)
     answer = loop_words.regression_verdict(found)

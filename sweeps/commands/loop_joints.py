@@ -127,8 +127,8 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
 
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
     """Columns of a log for one joint, with the joint's name removed, and columns of no joint."""
-    others = tuple(f"{name}." for name in joints if name != joint)
-    joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(others)]
+    other_prefixes = tuple(f"{name}." for name in joints if name != joint)
+    joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(other_prefixes)]
     return dataclasses.replace(
         log,
         name=f"{log.name}, joint {joint}",

@@ -322,7 +322,7 @@ def _course_rows(
     else:
         reading = balances.sensor(robot, signals)
     # Demands act this much later than in the profile, as do the values written next to them.
-    late = float(robot.rig.delay)
+    delay = float(robot.rig.delay)
     segment = course.segment % source.segment_count
     length = np.asarray(found.segments.time[k]).ravel()
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
@@ -339,7 +339,7 @@ def _course_rows(
         }
     return {
         "run_id": np.full(len(picked), name),
-        "time_s": course.time + late,
+        "time_s": course.time + delay,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
         "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),

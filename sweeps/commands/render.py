@@ -84,9 +84,9 @@ def _check_output_file(picture: configuration.Picture) -> None:
 
 def _write_completely(file: Path, draw: Callable[[Path], Any]) -> None:
     """Writes a picture or film completely or not at all."""
-    with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
+    with replacing(file) as temporary, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:
-            draw(aside)
+            draw(temporary)
         except ValueError as error:
-            raise BadConfiguration(f"render: {error}".replace(aside.name, file.name)) from error
+            raise BadConfiguration(f"render: {error}".replace(temporary.name, file.name)) from error
         advance(1)

@@ -63,9 +63,9 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
             `LARGEST` although these equations make them equal.
     """
     if not stated:
-        others = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
+        other_options = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
         raise BadConfiguration(
-            f"--from-sheet: no motor data; expected --no-load-current and at least three of {others}"
+            f"--from-sheet: no motor data; expected --no-load-current and at least three of {other_options}"
         )
     sheet = {name: _parse_quantity(name, text) for name, text in stated.items()}
     drop = _stall_minus_no_load_current(sheet)

@@ -101,9 +101,9 @@ class _UrdfRobot:
             )
         if joint not in turning:
             kind = self.joints[joint].get("type") or "without a type"
-            slides = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
+            advice = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
             raise BadConfiguration(f"--joint: got {joint}, which is {kind}; expected one that turns: "
-                                   f"{list_some(candidates) or 'the file has none'}{slides}")  # fmt: skip
+                                   f"{list_some(candidates) or 'the file has none'}{advice}")  # fmt: skip
         return joint
 
     def numbers(self, joint: str) -> JointNumbers:
@@ -113,8 +113,8 @@ class _UrdfRobot:
         moved_links = list(self._moved(link))
         inertia, moment, count = 0.0, np.zeros(3), 0
         for name, pose in moved_links:
-            mass, inertia_about_axis, first = self._inertial(name, pose, axis)
-            inertia, moment, count = inertia + inertia_about_axis, moment + first, count + (mass > 0)
+            mass, inertia_about_axis, first_moment = self._inertial(name, pose, axis)
+            inertia, moment, count = inertia + inertia_about_axis, moment + first_moment, count + (mass > 0)
         named = (
             f"link {link}"
             if len(moved_links) == 1
@@ -342,5 +342,7 @@ def _compose(outer: Pose, inner: Pose) -> Pose:
 def _hanging_weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
     """As `hanging`, for a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
     across = np.cross(axis, moment)
-    flat = np.cross(across, axis)  # moment without its component along the axis
-    return hanging_torque_and_angle(float(axis @ np.cross(flat, gravity)), float(axis @ np.cross(across, gravity)))
+    moment_across = np.cross(across, axis)  # moment without its component along the axis
+    return hanging_torque_and_angle(
+        float(axis @ np.cross(moment_across, gravity)), float(axis @ np.cross(across, gravity))
+    )

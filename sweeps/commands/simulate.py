@@ -148,23 +148,26 @@ def end_columns_of_histories(robot: Robot, batch: RunBatch) -> Columns:
     columns = run.ending_columns(robot, batch)
     current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
     finite = np.isfinite(current)
-    last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
-    rows = np.arange(len(last))
+    last_sample = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
+    rows = np.arange(len(last_sample))
     motors = float(robot.sides) * np.asarray(history.signals.current)
     limit = float(robot.sides) * float(robot.driver.current_limit)
     columns[PEAK] = np.maximum(
         _peaks_of_runs(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0
     )
-    columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
+    columns["displacement_m"], columns["time_end_s"] = (
+        np.array(history.distance)[rows, last_sample],
+        time[rows, last_sample],
+    )
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
-        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
+        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last_sample], history.signals)
         at_last = outputs.output_columns(
             jax.device_get(result_of_signals(robot, signals, jnp.asarray(status))), robot.channels
         )
         for name, values in at_last.items():
             columns[name] = np.where(empty & finite.any(-1), values, columns[name])
-        after = time[rows, np.minimum(last + 1, finite.shape[-1] - 1)] - time[rows, last]
+        after = time[rows, np.minimum(last_sample + 1, finite.shape[-1] - 1)] - time[rows, last_sample]
         draws = np.asarray(robot.battery.current(signals.total_current))
         time_left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
         time_left = np.where(empty & finite.any(-1), np.clip(np.nan_to_num(time_left), 0.0, after), 0.0)

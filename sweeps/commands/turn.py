@@ -69,7 +69,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 **_turn_table(robot, readings, swept, batch),
             }
             folder.write_table("turns.csv", capabilities.drop_inapplicable_columns(robot, turns))
-            first, history = jax.tree.map(lambda x: x[:1], batch), None
+            first_run, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
             fidelity = fidelities.get_fidelity(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
@@ -79,13 +79,13 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 progress_bar(1, quiet=not slow) as advance,
             ):
                 report_share = scale.share_counter(advance, 1)
-                first = jax.device_get(fidelity.histories(robot, conditions, config.options, report_share))
+                first_run = jax.device_get(fidelity.histories(robot, conditions, config.options, report_share))
                 report_share(1.0)
-            turns, history = None, first.history
+            turns, history = None, first_run.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, readings))
-        columns = {name: np.asarray(values) for name, values in first.columns.items()}
-        table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first), **columns}
+        columns = {name: np.asarray(values) for name, values in first_run.columns.items()}
+        table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first_run), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
             postures = posture_words.posture_of_runs(robot, runs, conditions)
@@ -213,10 +213,10 @@ def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Condit
     """Settled turns in one batch: the requested one, and turns at other duties of the slower side."""
     left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
     outer, shares = max(left, right, key=abs), len(SHARES)
-    others = outer * SHARES
+    other_duties = outer * SHARES
     slower = abs(left) <= abs(right)
-    duty_left = np.concatenate([[left], others if slower else np.full(shares, outer)])
-    duty_right = np.concatenate([[right], np.full(shares, outer) if slower else others])
+    duty_left = np.concatenate([[left], other_duties if slower else np.full(shares, outer)])
+    duty_right = np.concatenate([[right], np.full(shares, outer) if slower else other_duties])
     rows = jax.tree.map(lambda x: np.repeat(np.asarray(x), shares + 1), asked)
     rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
     rows = jax.tree.map(jax.numpy.asarray, rows)

@@ -400,8 +400,8 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
             return local[id(x)]
         return f"({written})" if own_rank < outer else written
 
-    last = text(result)
-    return [*lines, f"{indent}return {last}"]
+    last_text = text(result)
+    return [*lines, f"{indent}return {last_text}"]
 
 
 def _operation_text(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int, str]:

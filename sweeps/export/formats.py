@@ -130,20 +130,22 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
-    follows = drive.robot.rig.imposed == "goal_angle"
+    follows_angle = drive.robot.rig.imposed == "goal_angle"
 
     def texts_of(drive: DriveJoint) -> dict[str, str]:
         return {
             "drive.xml": mujoco.mjcf_fragment(drive, motor, notes, notes_for_file_head(runs), name, at, volts),
             "scene.xml": mujoco.mjcf_scene(
-                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)
+                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows_angle else middle)
             ),
         }
 
     texts = texts_of(drive)
     checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
-    if follows or (drive.loose and drive.controller is None):
-        checks |= _start_difference(drive, texts, GOAL if follows else volts, motor.ratio if follows else 1.0)
+    if follows_angle or (drive.loose and drive.controller is None):
+        checks |= _start_difference(
+            drive, texts, GOAL if follows_angle else volts, motor.ratio if follows_angle else 1.0
+        )
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(

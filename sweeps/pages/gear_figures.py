@@ -130,8 +130,8 @@ def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):
-        last, expected = gear.tail(SHOWN), gear.period
-        time, current = gear.time[last], gear.signals.total_current[last]
+        shown_samples, expected = gear.tail(SHOWN), gear.period
+        time, current = gear.time[shown_samples], gear.signals.total_current[shown_samples]
         axes.plot(1e3 * (time - time[0]), current, color=look[gear.name][0])
         axes.axhline(current.mean(), color=FAINT, lw=0.9)
         low, high = current.min(), current.max()
@@ -150,19 +150,21 @@ def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
 def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Figure:
     """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
     fig, grid = new_figure(2, 1, 5.0, sharex=True)
-    last = gear.tail(SHOWN)
-    time = 1e3 * (gear.time[last] - gear.time[last][0])
-    lands = ripple_peaks.touchdown_times(time, gear.reactions.grouser[last], gear.reactions.place[last])
+    shown_samples = gear.tail(SHOWN)
+    time = 1e3 * (gear.time[shown_samples] - gear.time[shown_samples][0])
+    lands = ripple_peaks.touchdown_times(
+        time, gear.reactions.grouser[shown_samples], gear.reactions.place[shown_samples]
+    )
     upper, lower = grid[:, 0]
-    upper.plot(time, gear.signals.total_current[last], color=BLUE)
+    upper.plot(time, gear.signals.total_current[shown_samples], color=BLUE)
     upper.set(ylabel="total current [A]")
     upper.set_title(title)
     shades = (BLUE, ORANGE, GREEN)
-    loads = gear.reactions.grouser[last]
+    loads = gear.reactions.grouser[shown_samples]
     for j in range(loads.shape[1]):
-        bears = loads[:, j] > 0
-        if bears.any():
-            lower.plot(time, np.where(bears, loads[:, j], np.nan), color=shades[j % 3], lw=1.0)
+        is_loaded = loads[:, j] > 0
+        if is_loaded.any():
+            lower.plot(time, np.where(is_loaded, loads[:, j], np.nan), color=shades[j % 3], lw=1.0)
     lower.set(xlabel="time [ms]", ylabel="normal reaction of a grouser [N]", ylim=(0, None))
     for axes in (upper, lower):
         for instant in lands:
@@ -175,21 +177,21 @@ def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
     fig, grid = new_figure(1, len(shown), 3.2)
     look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):
-        last, colour = gear.tail(SHOWN), look[gear.name][0]
+        shown_samples, colour = gear.tail(SHOWN), look[gear.name][0]
         loads = gear.reactions
         lines = (
             {
-                "all grousers": (loads.grouser[last].sum(-1), colour),
-                "lower guide": (loads.guided[last].sum(-1), ORANGE),
+                "all grousers": (loads.grouser[shown_samples].sum(-1), colour),
+                "lower guide": (loads.guided[shown_samples].sum(-1), ORANGE),
             }
             if gear.on_tracks
             else {
-                "both wheels": (loads.support[last].sum(-1), colour),
-                "front wheel": (loads.support[last, 0], BLUE),
-                "rear wheel": (loads.support[last, 1], GREEN),
+                "both wheels": (loads.support[shown_samples].sum(-1), colour),
+                "front wheel": (loads.support[shown_samples, 0], BLUE),
+                "rear wheel": (loads.support[shown_samples, 1], GREEN),
             }
         )
-        time = 1e3 * (gear.time[last] - gear.time[last][0])
+        time = 1e3 * (gear.time[shown_samples] - gear.time[shown_samples][0])
         top = 0.0
         for words, (values, shade) in lines.items():
             axes.plot(time, values, color=shade, lw=1.4, alpha=0.9)

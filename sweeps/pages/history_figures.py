@@ -159,8 +159,8 @@ class StartRun:
     @property
     def ended(self) -> tuple[float, float]:
         """Current [A] and speed [mm/s] at the end, as means over the last 0.15 s because of ripple."""
-        last = last_samples(self.time)
-        return float(self.current[last].mean()), float(self.speed[last].mean())
+        last_instants = last_samples(self.time)
+        return float(self.current[last_instants].mean()), float(self.speed[last_instants].mean())
 
 
 def start_runs(
@@ -230,13 +230,15 @@ def draw_starts(shown: list[StartRun], current_title: str = "total current", spe
 
 
 def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
-    last, peak = float(start.time[-1]), float(start.current.max())
+    end_time, peak = float(start.time[-1]), float(start.current.max())
     run = start.current[start.time > start.starting]
     run = run[len(run) // 20 :] if len(run) > 20 else start.current
     top = max(1.75 * float(run.max()), 0.1)
     cut = peak > top
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
-    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3)))
+    axes.set(
+        xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3))
+    )
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _shade_stages(axes, start)
     if cut:
@@ -244,32 +246,32 @@ def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
     during = (start.time > start.starting) & (start.time < start.slipping)
     middle = float(np.median(start.current[during])) if during.any() else 0.0
     if (
-        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * last
+        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * end_time
         and start.gets_under_way
     ):
         label_time = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (label_time, middle), xytext=(0, 5), textcoords="offset points", ha="center")
     crest = start.current[last_samples(start.time)].max()
     axes.annotate(
-        f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
+        f"{start.ended[0]:.2f} A", (0.98 * end_time, crest), xytext=(0, 5), ha="right", textcoords="offset points"
     )
 
 
 def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
-    last, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
+    end_time, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
     axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
     axes.plot(start.time, start.speed, color=colour)
-    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
+    axes.set(xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
     axes.set_ylabel("speed [mm/s]")
     _shade_stages(axes, start)
-    axes.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
-    if 0 < start.settled < last and start.gets_under_way:
+    axes.text(0.02 * end_time, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
+    if 0 < start.settled < end_time and start.gets_under_way:
         axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
         text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
-        axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
+        axes.text(start.settled + 0.02 * end_time, 0.1 * start.speed[-1], text, fontsize=8.5)
     # Right of the line at t' if it is next to the curve, otherwise right of the curve.
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
-    has_room = 0 < start.settled < 0.5 * last and start.gets_under_way
+    has_room = 0 < start.settled < 0.5 * end_time and start.gets_under_way
     label_place = (start.settled if has_room else start.time[half], start.speed[half])
     place = (6, 6) if has_room else (6, -12)
     axes.annotate("$V_x$ (robot)", label_place, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
@@ -291,8 +293,12 @@ def draw_slip(shown: list[StartRun]) -> Figure:
             add_corner_note(speeds, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
-        last = float(start.time[-1])
-        upto = min(1.6 * max(start.settled, start.slipping, 0.02 * last), last) if start.gets_under_way else last
+        end_time = float(start.time[-1])
+        upto = (
+            min(1.6 * max(start.settled, start.slipping, 0.02 * end_time), end_time)
+            if start.gets_under_way
+            else end_time
+        )
         speeds.fill_between(start.time, start.speed, start.theoretical, color=colour, alpha=0.15, lw=0)
         speeds.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
         speeds.plot(start.time, start.speed, color=colour)

@@ -147,9 +147,9 @@ def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Chan
                     axes.plot(table["time_s"][run_rows][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
             if column == 0:
                 axes.set_ylabel(f"{channel.label} [σ]")
-        first = run_rows[0]
+        first_row = run_rows[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {_range_text(table[imposed_column(table)][run_rows])} "
+            f"{name}\n{table['configuration'][first_row]} {_range_text(table[imposed_column(table)][run_rows])} "
             f"{UNITS[imposed_column(table)]}"
             + (f" {_range_text(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
         )  # fmt: skip
@@ -223,11 +223,11 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
 def draw_gains(found: DiscoveryResult) -> Figure:
     """Hold-out gain over the refit of each set of effects, by their number, with its standard error."""
     fig, grid = new_figure(1, 1, 2.8)
-    axes, last = grid[0, 0], len(found.gains) - 1
+    axes, last_index = grid[0, 0], len(found.gains) - 1
     axes.axhline(0, color=FAINT, lw=0.8)
     axes.plot(0, 0, "s", ms=5, color=INK, label="refit, nothing added")
     for k, (names, gain) in enumerate(found.gains):
-        proposed = k == last
+        proposed = k == last_index
         error = gain.se if np.isfinite(gain.se) else 0.0
         axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
                       label="proposed, ± standard error" if proposed else None)  # fmt: skip
@@ -244,11 +244,11 @@ def draw_power(found: DiscoveryResult) -> Figure:
     level = found.before.kinds["single"].threshold
     visible = sorted((s for s in found.scores if s.balance in EQUATION), key=lambda s: s.sigmas_per_prior_sd)
     strongest = {EQUATION[s.balance]: s for s in visible if s.sigmas_per_prior_sd > 0}
-    first = {s.name: s for s in visible if s in strongest.values()}
+    shown_effects = {s.name: s for s in visible if s in strongest.values()}
     fig, grid = new_figure(1, 1, 3.2)
     axes, size = grid[0, 0], np.geomspace(0.03, 30, 200)
-    for name, (colour, _) in list(configuration_looks(first).items())[-CURVES:]:
-        shift = size * first[name].sigmas_per_prior_sd
+    for name, (colour, _) in list(configuration_looks(shown_effects).items())[-CURVES:]:
+        shift = size * shown_effects[name].sigmas_per_prior_sd
         chance = scipy.stats.norm.sf(level - shift) + scipy.stats.norm.cdf(-level - shift)
         axes.plot(size, 100 * chance, color=colour, label=name)
     axes.set(xscale="log", xlabel="size [typical sizes]", ylabel="would have been noticed [%]", ylim=(0, 103))
@@ -419,22 +419,22 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
         for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
             if not way.any():
                 continue
-            rows, first = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
+            rows, is_labelled = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
             axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
                           label=words)  # fmt: skip
-            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if first else None)
+            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if is_labelled else None)
             is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
             levels = np.zeros(len(rows)) if is_line else imposed[rows]
             by_level = "" if is_line else f" at each {imposed_label.partition(' [')[0]}"
             for line in (rows[levels == level] for level in np.unique(levels)):
-                law_words = f"new law{by_level}, band of 95 % (±{share:.2g} %)" if first else None
+                law_words = f"new law{by_level}, band of 95 % (±{share:.2g} %)" if is_labelled else None
                 if not (is_line or _turns_once(law[line])):
                     axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
                                   alpha=0.6, label=law_words)  # fmt: skip
                 else:
                     axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_words)
                     axes.fill_between(x[line], (law - band)[line], (law + band)[line], color=BLUE, alpha=0.3, lw=0)
-                first = False
+                is_labelled = False
         axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
     outer_legend(grid[0, 0], "upper left")
     return fig

@@ -53,20 +53,20 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
         _, size, unit = next(t for t in _TIMES if span >= t[0])
         shown_rows = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
         time = shown_rows["time_s"] / size
-        first = column == 0
+        is_first_column = column == 0
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
-        _draw_speed(axes[0], time, shown_rows, linear, legend=first)
+        _draw_speed(axes[0], time, shown_rows, linear, legend=is_first_column)
         sizes = ", sizes of both sides" if "duty_left" in rows else ""
-        axes[1].set_title(f"current of all motors, and duty{sizes}" if first else "current, and duty")
-        _draw_current(axes[1], time, shown_rows, sides, legend=first)
+        axes[1].set_title(f"current of all motors, and duty{sizes}" if is_first_column else "current, and duty")
+        _draw_current(axes[1], time, shown_rows, sides, legend=is_first_column)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         limit_words = (
             ""
             if unlimited or _limit_is_near(shown_rows, limit)
             else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
-        axes[2].set_title("temperatures" + (limit_words if first else ""))
-        _draw_temperatures(axes[2], time, shown_rows, limit, legend=first)
+        axes[2].set_title("temperatures" + (limit_words if is_first_column else ""))
+        _draw_temperatures(axes[2], time, shown_rows, limit, legend=is_first_column)
         _draw_source(axes[3], time, shown_rows)
         axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
     return fig

@@ -100,13 +100,13 @@ def robot_section(file: RobotFile) -> Json:
 def _parameter_section(file: RobotFile, nominal: Robot) -> Section:
     """Parameters of a rig, or those in which a robot differs from the nominal one."""
     end = (Column("unit"), Column("meaning"))
-    first, value = Column("parameter"), "{:.6g}"
+    name_column, value = Column("parameter"), "{:.6g}"
     if not file.robot.rig.inherits:
-        columns = (first, Column("value", form=value), *end, Column("source"))
+        columns = (name_column, Column("value", form=value), *end, Column("source"))
         text = "Its parameters (SI units). Losses and limits that are not in its file are left out."
         rows, table = capabilities.rig_parameters(file), "own"
     else:
-        columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
+        columns = (name_column, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
         rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
     if not rows:
@@ -170,8 +170,8 @@ def _add_contents(page: str) -> str:
         return f'<h2 id="{name}">{found[2]}</h2>'
 
     page = _HEADING.sub(with_id, page)
-    first = page.index("<h2")
-    return f'{page[:first]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'
+    begin = page.index("<h2")
+    return f'{page[:begin]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[begin:]}'
 
 
 def marked_html(text: str) -> Markup:

@@ -69,9 +69,9 @@ _CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], 1)
 
 def belt_outline(side: SideOutline, belt: tuple[int, int]) -> np.ndarray:
     """Corners of the belt around a pair of circles, over its grousers [m]."""
-    wide = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
+    radii = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
     outline = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]
-    points = np.concatenate([c + r * _CIRCLE for c, r in zip(outline, wide, strict=True)])
+    points = np.concatenate([c + r * _CIRCLE for c, r in zip(outline, radii, strict=True)])
     return points[ConvexHull(points).vertices]
 
 

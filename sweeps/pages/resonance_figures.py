@@ -108,11 +108,11 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
 
 def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
     """One band for each mode, from the smallest to the largest frequency over payloads and positions of the belt."""
-    others = iter(_OTHERS * 3)
+    other_colours = iter(_OTHERS * 3)
     names = dict.fromkeys(m.name for modes in found.modes.values() for m in modes if m.resonant)
     for name in names:
         modes = [(p, m) for p, members in found.modes.items() for m in members if m.name == name and m.resonant]
-        colour = _BANDS.get(name) or next(others)
+        colour = _BANDS.get(name) or next(other_colours)
         low, high = min(m.low for _, m in modes), max(m.high for _, m in modes)
         axes.axhspan(low, high, color=colour, alpha=0.13, lw=0, zorder=0)
         ends = (modes[0], modes[-1]) if len(modes) > 1 else (modes[0],)
@@ -167,8 +167,8 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     axes.set(ylim=(-0.5, len(payloads) - 0.5), ylabel="payload [kg]")
     axes.set_yticks(range(len(payloads)), [f"{p:g}" for p in payloads])
     axes.grid(False)
-    others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
-    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in others)
+    other_statuses = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
+    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in other_statuses)
     label = SIGNALS[name].label
     remarks = [] if largest_ripple >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
     remarks += [kinds] if kinds else []

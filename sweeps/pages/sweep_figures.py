@@ -203,9 +203,9 @@ def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
                 color=shade,
                 label=volt or None,
             )
-            gone = pick[~np.isfinite(line)]
-            for status in np.unique(runs["status"][gone]):
-                rows_of_status = gone[runs["status"][gone] == status]
+            missing_rows = pick[~np.isfinite(line)]
+            for status in np.unique(runs["status"][missing_rows]):
+                rows_of_status = missing_rows[runs["status"][missing_rows] == status]
                 axes.plot(
                     runs[variable][rows_of_status],
                     np.full(rows_of_status.size, 0.03 + 0.05 * k),

@@ -49,8 +49,8 @@ class TimeOverlay:
         return float(np.nanmean(shares)) if np.isfinite(shares).any() else float("nan")
 
     def _residual(self, channel: Channel) -> np.ndarray:
-        first = next(iter(self.simulated))
-        return np.asarray(self.table[first + channel.column] - self.table[channel.column])
+        first_prefix = next(iter(self.simulated))
+        return np.asarray(self.table[first_prefix + channel.column] - self.table[channel.column])
 
     def draw(self) -> Figure:
         """Figure of the worst run: for each channel the readings, and below them simulated minus measured."""

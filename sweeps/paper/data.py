@@ -393,11 +393,11 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
         )
         return energy_split(robot, conditions)
 
-    slides = at(np.ones(len(cases)))[0]["status"] == "slides"
-    points, power = at(np.where(slides, [ratio[k] for k in kind], 1.0))
+    is_sliding = at(np.ones(len(cases)))[0]["status"] == "slides"
+    points, power = at(np.where(is_sliding, [ratio[k] for k in kind], 1.0))
     labels = [
         f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(slid)
-        for (c, u, p, s), slid in zip(cases, slides, strict=True)
+        for (c, u, p, s), slid in zip(cases, is_sliding, strict=True)
     ]
     return EnergyUse(labels, power, points["power_supply_W"], points["status"])
 

@@ -175,11 +175,11 @@ def _error_table(errors: list[Json]) -> Block:
 
 def _sliding(robot: Robot, rows: data.PaperRows) -> Iterator[Block]:
     """Note on rows without an operating point with the robot's own adhesion, if there are any."""
-    slides, table = rows.plain["status"] != "converged", rows.conditions
+    is_sliding, table = rows.plain["status"] != "converged", rows.conditions
     sentences = [
         f"{table['configuration'][k]} {table['supply_voltage_V'][k]:.0f} V {table['slope_deg'][k]:.0f}° "
         f"{words.short_status(str(rows.plain['status'][k]))}"
-        for k in np.flatnonzero(slides)
+        for k in np.flatnonzero(is_sliding)
     ]
     if sentences:
         raised = data.raised_adhesion_words(robot, rows.ratio)

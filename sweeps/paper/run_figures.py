@@ -184,7 +184,7 @@ def row_parity(rows: data.PaperRows, name: str) -> Figure:
     kind = rows.conditions["configuration"]
     raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
     has_other_mass = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
-    slides = rows.plain["status"] == "slides"
+    is_sliding = rows.plain["status"] == "slides"
     for k, (axes, channel) in enumerate(zip(grid[0], channels_shown, strict=True)):
         measured = rows.measured[:, k]
         span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
@@ -192,8 +192,8 @@ def row_parity(rows: data.PaperRows, name: str) -> Figure:
         axes.plot(span, span, color="#666666", lw=0.9)
         for c in rows.ratio:
             for pick, face, label in (
-                ((kind == c) & ~slides, CONFIGURATION[c], c),
-                ((kind == c) & slides, "white", f"{c}, adhesion raised"),
+                ((kind == c) & ~is_sliding, CONFIGURATION[c], c),
+                ((kind == c) & is_sliding, "white", f"{c}, adhesion raised"),
             ):
                 axes.plot(
                     measured[pick],

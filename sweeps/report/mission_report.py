@@ -88,9 +88,9 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     """Report of finished missions. The first run is shown in detail."""
     table, source = found.table, found.source
     shown_columns = capabilities.drop_inapplicable_columns(file.robot, table)
-    first, names = {key: value[0] for key, value in table.items()}, _names(table)
+    first_run, names = {key: value[0] for key, value in table.items()}, _names(table)
     answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
-    fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
+    fed = "battery" if np.isfinite(first_run["state_of_charge"]) else "supply"
     cycles, per_cycle = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
     lead = (
@@ -102,7 +102,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
         "runs", shown_columns, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
     )
     endings = run_tables.endings_table(Counter(map(str, table["status"])))
-    is_complete = len(names) == 1 and first["status"] == "converged"
+    is_complete = len(names) == 1 and first_run["status"] == "converged"
     return Document(
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
         answer,
@@ -114,7 +114,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             *([] if is_complete else [endings]),
             *remarks(_charge_left(table)),
         ),
-        page_sections=lambda: _sections(file.robot, found, first, answer),
+        page_sections=lambda: _sections(file.robot, found, first_run, answer),
     )
 
 
@@ -259,8 +259,8 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
                 ", ".join(words.FLAGS[f] for f in flags) or "none",
             )
         )  # fmt: skip
-    first = "first cycle" if many else "this segment"
-    headings = [quantity_column(c, group=first) for c in shown_columns] + [
+    group = "first cycle" if many else "this segment"
+    headings = [quantity_column(c, group=group) for c in shown_columns] + [
         quantity_column(c, group="all cycles") for c in totals
     ]
     headings += columns(*["all cycles > share of energy [%] | .1f"] * many)
@@ -270,10 +270,10 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
 def _demand_in_words(found: Missions, k: int) -> str:
     """Demand of the profile in a segment, in words."""
     source = found.source
-    last = k + 1 if source.linear else k
+    last_row = k + 1 if source.linear else k
 
     def span(values: np.ndarray, factor: float, unit: str) -> str:
-        begin, end = float(values[k]) / factor, float(values[last]) / factor
+        begin, end = float(values[k]) / factor, float(values[last_row]) / factor
         unit = unit if unit == "°" else f"\u00a0{unit}"
         return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
 

@@ -51,8 +51,8 @@ def runs_document(
         notes: remarks on the runs.
     """
     robot, names = file.robot, run_headings(runs)
-    single, first = len(names) == 1, {key: value[0] for key, value in runs.items()}
-    limit_use = limits_used(robot, first) if single else []
+    single, first_run = len(names) == 1, {key: value[0] for key, value in runs.items()}
+    limit_use = limits_used(robot, first_run) if single else []
     endings = run_tables.endings_table(Counter(map(str, runs["status"])))
     table = capabilities.drop_inapplicable_columns(robot, runs)
     shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
@@ -65,7 +65,7 @@ def runs_document(
         sideways=True,
     )  # fmt: skip
     of_runs = Section("The run" if single else "The runs", (shown_table,), "runs-section")
-    blocks += [] if single and first["status"] in words.SETTLED else [endings]
+    blocks += [] if single and first_run["status"] in words.SETTLED else [endings]
     blocks += remarks([*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])])
 
     def sections() -> Iterable[Section]:

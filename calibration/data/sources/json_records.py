@@ -116,8 +116,10 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
         columns = [path[len(prefix) :] for path in arrays if path.startswith(prefix)]
         if RUN in columns and not any(unit_of_clock(column) is not None for column in columns):
             runs = arrays[prefix + RUN]
-            first = np.maximum.accumulate(np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0))
-            arrays[f"{prefix}time_s"] = (np.arange(len(runs)) - first) * steps[0]
+            first_row_of_run = np.maximum.accumulate(
+                np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0)
+            )
+            arrays[f"{prefix}time_s"] = (np.arange(len(runs)) - first_row_of_run) * steps[0]
 
 
 def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
@@ -158,8 +160,8 @@ def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None
     """
     lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
     lengths = [{len(v) for v in episode.values()} for episode in lists]
-    flat = all(not isinstance(x, list | Mapping) for episode in lists for v in episode.values() for x in v[:1])
-    if not flat or any(
+    are_flat = all(not isinstance(x, list | Mapping) for episode in lists for v in episode.values() for x in v[:1])
+    if not are_flat or any(
         len(n) != 1 or max(n) < 2 or episode.keys() != lists[0].keys()
         for n, episode in zip(lengths, lists, strict=True)
     ):

@@ -192,8 +192,8 @@ def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -
         time, values: time and values of the samples, shape (samples,).
     """
     numbers = np.asarray(values, float)
-    sound = np.isfinite(numbers)
-    time, numbers = time[sound], numbers[sound]
+    is_finite = np.isfinite(numbers)
+    time, numbers = time[is_finite], numbers[is_finite]
     resampled = np.full(len(rows), np.nan)
     if not len(time) or not len(rows):
         return resampled

@@ -215,8 +215,8 @@ def signals_of_arrays(
 
 def parent_path(path: str) -> str:
     """Path without its last part."""
-    last = path_parts(path)[-1]
-    return path[: len(path) - len(last)] if path.endswith(last) else ""
+    last_part = path_parts(path)[-1]
+    return path[: len(path) - len(last_part)] if path.endswith(last_part) else ""
 
 
 def sample_count(shape: tuple[int, ...]) -> int:

@@ -290,9 +290,9 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])
-    first = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
+    first_misfits = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
     with Threads(CORES) as cores:
-        misfits = [first, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
+        misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
     by_row = np.sum(np.concatenate([np.asarray(x) for x in misfits])[: len(points)] ** 2, 2)
     by_run = np.zeros((len(points), len(observe.rows_of)))
     np.add.at(by_run.T, np.asarray(observe.run), by_row.T)

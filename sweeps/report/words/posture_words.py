@@ -103,12 +103,12 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
         "overall_length_mm": millimetres * limits.length,
         "overall_height_mm": millimetres * limits.height,
     }
-    first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
-    level = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
-    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first, ANGLES, ANGLES))
+    first_conditions, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
+    level = Drawn(side, float(rests.height[0]), 0.0, float(first_conditions.slope))
+    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first_conditions, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
-    lever_degrees = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first))
+    lever_degrees = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first_conditions))
     return Postures(
         table,
         level,
