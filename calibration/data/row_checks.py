@@ -284,7 +284,7 @@ def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bo
 
 
 def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
-    """Sum of squared residuals of the readings, fitted by a linear function of the settings."""
+    """Sum of squared residuals of the readings after a linear fit over the settings."""
     a = np.stack([np.ones(len(readings)), *settings], 1)
     is_finite = np.isfinite(readings)
     if is_finite.sum() < 3:

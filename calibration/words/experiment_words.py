@@ -35,8 +35,8 @@ SMALL = 0.1
 
 def join_torques(values: Sequence[float]) -> str:
     """«0, 0.2 and 0.4 N·m». In mN·m where all are below `SMALL`."""
-    size, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
-    return join_amounts([menu.round_significant(size * v, 3) for v in values], unit)
+    factor, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
+    return join_amounts([menu.round_significant(factor * v, 3) for v in values], unit)
 
 
 def join_slopes(angles: Sequence[float]) -> str:

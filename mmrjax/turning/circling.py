@@ -269,19 +269,19 @@ def _begin_broyden(held: tuple[Robot, Conditions]) -> _BroydenSearch:
 def _broyden_step(held: tuple[Robot, Conditions], search: _BroydenSearch) -> _BroydenSearch:
     """Next evaluation: at the start, then along each unknown from there, then along the secants."""
     size = search.y.size
-    is_warm = search.looks <= size
+    is_probing = search.looks <= size
     step = (search.inverse * search.rates).sum(-1)
     damped_step = step * _allowed_step_fraction(*held, search.y, step)
-    damped_step = jnp.where(is_warm, ALONG * (np.arange(size) == search.looks - 1), damped_step)
+    damped_step = jnp.where(is_probing, ALONG * (np.arange(size) == search.looks - 1), damped_step)
     residual = _scaled_balance(*held, search.y + damped_step)
     residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - damped_step)
-    gone = search.inverse @ (search.rates - residual)
+    predicted_step = search.inverse @ (search.rates - residual)
     row = damped_step @ search.inverse
-    change = jnp.outer(damped_step - gone, row) / (damped_step @ gone)
+    change = jnp.outer(damped_step - predicted_step, row) / (damped_step @ predicted_step)
     inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
-    y = jnp.where(is_warm, search.y, search.y + damped_step)
-    rates = jnp.where(is_warm & (search.looks > 0), search.rates, residual)
-    return _BroydenSearch(y, rates, inverse, search.looks + 1, ~is_warm & (jnp.max(jnp.abs(step)) < NEAR))
+    y = jnp.where(is_probing, search.y, search.y + damped_step)
+    rates = jnp.where(is_probing & (search.looks > 0), search.rates, residual)
+    return _BroydenSearch(y, rates, inverse, search.looks + 1, ~is_probing & (jnp.max(jnp.abs(step)) < NEAR))
 
 
 def _jacobian_at_rest(conditions: Conditions) -> Float[np.ndarray, "9 9"]:

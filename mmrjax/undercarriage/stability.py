@@ -123,7 +123,7 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
     worst = int(np.argmin(limits))
     if step > limits[worst]:
         raise ValueError(
-            f"step: got {step:g} s; contacts, belt or friction are too stiff for it, the largest stable step is "
+            f"step: got {step:g} s; contacts, belt or friction are too stiff for it; the largest stable step is "
             f"{limits[worst]:.2g} s (run {worst + 1} of {len(limits)}); take {_whole(sample, limits[worst]):g} s, a "
             "softer contact or a larger V_s"
         )

@@ -197,8 +197,10 @@ def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -
     resampled = np.full(len(rows), np.nan)
     if not len(time) or not len(rows):
         return resampled
-    after = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
-    nearest = np.where(time - rows[after - 1] <= rows[np.minimum(after, len(rows) - 1)] - time, after - 1, after)
+    next_row = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
+    nearest = np.where(
+        time - rows[next_row - 1] <= rows[np.minimum(next_row, len(rows) - 1)] - time, next_row - 1, next_row
+    )
     nearest = np.minimum(nearest, len(rows) - 1)
     step = _step(rows)
     near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(step, 1e-9)])
