@@ -515,7 +515,7 @@ class ProfilePart(FidelityPart):
 
     @property
     def options(self) -> dict[str, float]:
-        """Every option of the fidelity. Over a profile it has none."""
+        """Options of the fidelity. With a profile there are none."""
         return super().options if self.profile is None else {}
 
 

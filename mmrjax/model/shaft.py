@@ -1,4 +1,4 @@
-"""Load on a bench: a shaft with inertia, friction, a constant torque and a gravity torque that depends on its angle."""
+"""Load on a bench: a shaft with inertia, friction, a constant torque, and a gravity torque over its angle."""
 
 from __future__ import annotations
 

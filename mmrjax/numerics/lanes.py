@@ -119,7 +119,7 @@ def loop_until(
     loop = _MemberLoop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
 
     def many(numbers: Any, batched: Any, size: int) -> T:
-        """The end of each of `size` members. If these are batched again, all members share the same lanes."""
+        """End states of `size` members. If these are batched again, all members share the same lanes."""
 
         @custom_vmap
         def each(numbers: Any) -> T:

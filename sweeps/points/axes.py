@@ -113,10 +113,10 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
         )
     _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
-    simulated = [robot.configurations.names[int(k)] for k in configuration_indices]
-    imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
+    configuration_names = [robot.configurations.names[int(k)] for k in configuration_indices]
+    imposed.check_turning(robot, {*fixed, *design.names}, configuration_names, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
-        for name in simulated:
+        for name in configuration_names:
             if why := reason_without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own_axis = AXIS[robot.rig.imposed]
