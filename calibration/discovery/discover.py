@@ -34,7 +34,7 @@ from calibration.discovery.classes import (
     signature_cosines,
 )
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
-from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
@@ -67,7 +67,7 @@ from calibration.discovery.result import (
     NoiseVerdict,
     ReadingsOfRows,
 )
-from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics, family_columns
+from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
 from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
@@ -628,8 +628,7 @@ def _with_ammeter_alternatives(
         where: location of its discrepancy. It defines the curve of a mechanism without effects.
     """
     columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
-    if not found.effects:
-        columns = family_columns(linear, bases, bases_room.family_names(bases).index((where.place, where.variable)))
+    columns = columns if found.effects else location_columns(linear, bases, where)
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
     also = ammeter_families(space, *fit, columns, found.families[0], settings)
     families = tuple(dict.fromkeys((*found.families, *also)))
