@@ -42,7 +42,8 @@ _NoCache = Annotated[
 _Config = Annotated[
     Path | None,
     typer.Option(
-        "--config", hidden=True,
+        "--config",
+        hidden=True,
         help="TOML file with the keys of a config.resolved.toml. Options on the command line override it.",
     ),
 ]
@@ -488,6 +489,9 @@ def rig_check(
     columns: _Columns = None,
     effects: _Effects = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of text.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print every table and remark instead of about five lines.")
+    ] = False,
     no_cache: _NoCache = False,
 ) -> int:
     """Check a rig's file, and data for it.
@@ -500,7 +504,7 @@ def rig_check(
     _start_jax(no_cache)
     from sweeps.commands import rig_check as room
 
-    return room.check_rig_file(file, data, tuple(effects or ()), json, columns)
+    return room.check_rig_file(file, data, tuple(effects or ()), json, columns, verbose)
 
 
 @app.command(

@@ -57,6 +57,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             Section("How sure", tuple(_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
+        brief=fit_words.brief_calibration(found),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
-from calibration.described import describe
+from calibration.described import as_paragraph, describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, blocks
@@ -206,20 +206,10 @@ def _advice(found: DiscoveryResult) -> Table:
         for note in remarks_with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
     ]
     against = [note for note in found.remarks if isinstance(note, str)]
-    sentences = [
-        loop_words.largest_share(found),
-        *far,
-        *against[:1],
-    ]  # a sentence begins with a capital, a parameter does not
+    to_check = [loop_words.largest_share(found), *far, *against[:1]]
     rows = [
         ("May I use it?", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
-        (
-            "What to check first",
-            " ".join(
-                [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
-            )
-            or "Nothing unusual.",
-        ),
+        ("What to check first", as_paragraph(to_check) or "Nothing unusual."),
         ("What to do next", _next_step(found, more)),
     ]
     return catalogue.table("loop.advice", rows)

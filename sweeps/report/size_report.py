@@ -108,8 +108,8 @@ COLUMNS = columns(
 )  # fmt: skip
 
 
-#: Motors that the terminal shows.
-SHOWN = 5
+#: Motors in the table of a terminal, and further designs in its few lines.
+SHOWN, NEXT = 5, 2
 _DESIGNS = "The best design, and the best designs with other parts, with the makers' gear ratios and whole cells."
 
 
@@ -133,7 +133,16 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
             *_chart(found),
         ),
+        brief=(lead, *_next_best(found), *(block.text for block in _front(found)[:1] if isinstance(block, Note))),
     )
+
+
+def _next_best(found: SizeResult) -> Names:
+    """A line on the best designs with other parts, none without a design."""
+    designs = [
+        f"{describe_design(f)} ({objective_text(f, found.sizing.objective)})" for f in found.sizing.alternatives
+    ]
+    return (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
 
 
 def _chart(found: SizeResult) -> tuple[Section, ...]:
