@@ -547,7 +547,7 @@ def test_rig_check_of_data_says_the_same_in_words(tmp_path, bench, capsys):
     assert "total_current_A, yours total_current_mA" in out
     assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated from the scatter)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
-    assert "room: without a role" in out and "add output_torque to channels" in out
+    assert "room: not used by the model" in out and "add output_torque to channels" in out
 
 
 def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tmp_path):

@@ -277,7 +277,7 @@ class Layout:
         return (*self._by_name, *(column for _, column, _ in self.mapped))
 
     def nearest(self, name: str, stated: Collection[str]) -> str:
-        """Known column that is most similar to a column without a role, in the unit of `name`.
+        """Known column that is most similar to an unknown column, in the unit of `name`.
 
         It has a similar name, or it is the only condition in that unit. Empty if there is none.
 

@@ -103,7 +103,7 @@ class Runs:
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
-        """The table with the channels of a robot. Columns of other channels become unknown columns without a role.
+        """The table with the channels of a robot. The model does not use columns of other channels.
 
         Raises:
             BadData: the table was read for a robot without a channel of this one, so its column was left out.

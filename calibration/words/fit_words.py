@@ -274,12 +274,12 @@ LISTED = 6
 
 
 def residual_cluster(c: ResidualCluster) -> str:
-    """Residuals that go with a column without a role."""
+    """Residuals that depend on a column that the model does not use."""
     subject = f"residuals of {channels.find_channel(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"
-    role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
+    role = "a column that the model does not use" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
             f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}, {p}), "

@@ -201,10 +201,9 @@ class RigCheck:
         ]
         others = [name for name in self.runs.unknown if name not in names_by_column]
         without = (
-            f"{', '.join(others)}: without a role, so residuals are tested for differences between their values. "
-            "If one has a role, name it under "
+            f"{', '.join(others)}: not used by the model. Residuals are tested for differences between their values. "
+            "To use one, name it under [columns] in the rig's file"
         )
-        without += "[columns] in the rig's file"
         return [*notes, *([without] if others else [])]
 
     def statement(self) -> str:

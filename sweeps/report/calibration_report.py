@@ -114,7 +114,9 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
         catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
-    yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
+    yield from (
+        Section(h, (f,)) for h, f in zip(("Parity", "Residuals against every condition"), figures, strict=True)
+    )
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:

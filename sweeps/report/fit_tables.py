@@ -112,7 +112,7 @@ def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
-    """Columns without a role that residuals go with, if there are any."""
+    """Columns that the model does not use that residuals go with, if there are any."""
     if not clusters:
         return ()
     statements = (f"{c.statement}." for c in clusters)

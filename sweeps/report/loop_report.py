@@ -12,6 +12,7 @@ import numpy as np
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
 from calibration.described import as_paragraph, describe
+from calibration.discovery.experiments import NONE
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, blocks
@@ -189,6 +190,8 @@ def held_out_table(found: DiscoveryResult) -> Table:
 def _next_step(found: DiscoveryResult, more: str) -> str:
     """What to do next. `more`: what follows the name and description of an experiment."""
     after = found.next_experiment
+    if after is not None and after.name == NONE:
+        return f"{after.description}."
     if after is not None:
         return f"**{after.name}**: {after.description}.{more}"
     level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
@@ -208,7 +211,7 @@ def _advice(found: DiscoveryResult) -> Table:
     against = [note for note in found.remarks if isinstance(note, str)]
     to_check = [loop_words.largest_share(found), *far, *against[:1]]
     rows = [
-        ("May I use it?", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
+        ("May I use it for …", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
         ("What to check first", as_paragraph(to_check) or "Nothing unusual."),
         ("What to do next", _next_step(found, more)),
     ]
