@@ -51,11 +51,11 @@ class RigCheck:
     Attributes:
         file: file that was read.
         robot: robot of the file.
-        examples: lines of the file that still have a number of the template, marked as an example.
-        unmarked: other lines with the name and number of a template's example. 0 and 1 may be anyone's.
+        examples: lines of the file that are marked as an example and still have the template's number.
+        unmarked: other lines with the name and number of a template's example, except 0 and 1.
         origins: origins of its numbers.
         facts: values that follow from its numbers.
-        runs: runs of the table, None without one.
+        runs: runs of the table, None without a table.
         foresight: parameters that the table can determine.
         doubts: sentences on doubts about a log: wrong signs, time or current in another unit.
     """
@@ -184,7 +184,7 @@ class RigCheck:
         return rows
 
     def _does_not_apply(self, column: str) -> bool:
-        """True if a column missing from the table does not apply to this rig: ground, or another kind of drive."""
+        """True if a column that the table lacks does not apply to this rig: ground, or another kind of drive."""
         idle = Layout.of(self.robot).idle
         return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
@@ -306,11 +306,11 @@ def _use_of_column(column: str, robot: Robot) -> str:
 def check_rig_file(
     file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None, verbose: bool = False
 ) -> int:
-    """Report how a rig's file was interpreted, and which parameters a table can determine. Returns 0.
+    """Reports how a rig file was interpreted, and which parameters a table can determine. Returns 0.
 
     Raises:
-        BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.
-        BadData: a table that cannot be used with this rig.
+        BadConfiguration: the file cannot be read, or lacks entries. The message lists all of them.
+        BadData: the table cannot be used with this rig.
     """
     if file.is_dir():
         raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
@@ -383,7 +383,7 @@ def _brief(found: RigCheck) -> Names:
             if c["use"] not in ("condition", "not in the table") or (c["use"] == "condition" and c["values"] > 1)
         ]
         unused = f" Not in use: {', '.join(found.runs.unknown)}." * bool(found.runs.unknown)
-        table = (f"{len(found.runs)} rows. Columns in use: {', '.join(used)}.{unused}",)
+        table = (f"{count_noun(len(found.runs), 'row')}. Columns in use: {', '.join(used)}.{unused}",)
     notes = found.remarks()
     check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
     more = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
@@ -410,7 +410,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     settled = {
         *words.SETTLED,
         *(["stalled"] if has_clamped_rows else []),
-    }  # a shaft that is held stands still, as it should
+    }  # a held shaft is meant to stand still
     others = [
         f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]

@@ -1,4 +1,4 @@
-"""The command `size`: search for a robot that meets requirements."""
+"""The command `size`: searches for a robot that meets requirements."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Size, beside: configuration.VerbosePart) -> int:
-    """Search for a design and write a run folder. Returns the exit code.
-
-    The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
+    """Searches for a design and writes a run folder. Returns the exit code: 0 whether or not a design meets
+    everything, 3 if the solver failed at a worst corner of the best design.
     """
     requirements = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)

@@ -1,4 +1,4 @@
-"""The report of a calibration: adequate or not, its parameters, errors before and after, and their certainty."""
+"""Report of a calibration: adequacy, parameters, errors before and after, and their certainty."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _parameters(found: CalibrationResult) -> Table:
 
 
 def _errors(found: CalibrationResult) -> Table:
-    """rms errors before, after, and of rows held out, with the number of rows that each reaches."""
+    """rms errors before and after, and of held-out rows, each with its number of rows."""
     lines = {"before": found.errors_before, "after": found.errors_after}
     lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
     rows = [
