@@ -353,8 +353,9 @@ class _StepPart(eqx.Module):
             still holds the shaft, and the remaining part.
         begin: unknowns at its start.
         lag: lag of the current at its start.
-        since, length: start and length of the part [s]. side, then: direction in which a shaft turns, and after it
-        has waited. before, stages, end: see `RunStates`.
+        since, length: start and length of the part [s].
+        side, then: direction in which a shaft turns, and after it has waited.
+        before, stages, end: see `RunStates`.
     """
 
     turn: Array
@@ -393,14 +394,14 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
             member_decay = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
             first = part.begin - member_decay.begin * _unit_vector_of_current(y)
 
-            def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
+            def solve_next_stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
                 now = functools.partial(law, way=part.side)
                 stage_result = _solve_stage(
                     now, *given, part.length, mean * _unit_vector_of_current(y), member_decay.decay
                 )
                 return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
 
-            stages = jax.lax.scan(stage, (first, first), member_decay.means)[1]
+            stages = jax.lax.scan(solve_next_stage, (first, first), member_decay.means)[1]
             end = stages[1] + member_decay.end * _unit_vector_of_current(y)
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)

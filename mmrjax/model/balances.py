@@ -406,8 +406,9 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
 def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
     """All signals of a robot in motion whose load turns rigidly with its wheels.
 
-    The load's inertia acts at the driving shaft, and traction is what the inertia and the demand need. Args: as for
-    `moving_signals`.
+    The load's inertia acts at the driving shaft, and traction is what the inertia and the demand need.
+
+    Args: as in `moving_signals`.
     """
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)

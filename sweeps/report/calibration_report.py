@@ -1,4 +1,4 @@
-"""The report of a calibration: adequate or not, its parameters, errors before and after, and their certainty."""
+"""Report of a calibration: adequacy, parameters, errors before and after, and their certainty."""
 
 from __future__ import annotations
 
@@ -57,6 +57,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             Section("How sure", tuple(_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
+        brief=fit_words.brief_calibration(found),
     )
 
 
@@ -74,7 +75,7 @@ def _parameters(found: CalibrationResult) -> Table:
 
 
 def _errors(found: CalibrationResult) -> Table:
-    """rms errors before, after, and of rows held out, with the number of rows that each reaches."""
+    """rms errors before and after, and of held-out rows, each with its number of rows."""
     lines = {"before": found.errors_before, "after": found.errors_after}
     lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
     rows = [
@@ -113,7 +114,9 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
         catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
-    yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
+    yield from (
+        Section(h, (f,)) for h, f in zip(("Parity", "Residuals against every condition"), figures, strict=True)
+    )
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:

@@ -1,4 +1,4 @@
-"""The report of `calibrate --feedforward`."""
+"""Report of `calibrate --feedforward`."""
 
 from __future__ import annotations
 
