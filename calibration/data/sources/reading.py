@@ -30,7 +30,7 @@ from mmrjax.model import channels, quantities
 
 #: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
 Mapped = tuple[tuple[str, str, float], ...]
-#: Most values of columns without a role, which are read to find correlations with residuals.
+#: Most values of columns that the model does not use, which are read to find correlations with residuals.
 EXTRA_VALUES = 20_000_000
 #: Ratio of the rms currents along d and q above which the field counts as weakened [-].
 WEAKENED = 0.3
