@@ -133,13 +133,40 @@ def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list
     """Rates of change of the controller's states: its integral (the error, or 0 while it would drive the duty beyond
     its limit), and the lagged duty.
     """
+    none = jnp.zeros_like(state.speed)
     if conditions.goal is None or robot.controller is None:
-        return [jnp.zeros_like(state.speed)] * robot.controller_size
+        return [none] * len(robot.controller_states)
+    if state.clock is not None:
+        return [none] * (len(robot.controller_states) - 1) + [none - 1.0]
+    duty, integrated = _controller_actions(robot, conditions, state)
+    return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
+
+
+def _controller_actions(robot: Robot, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
+    """Duty that a controller wants [-], and the error that it integrates."""
+    assert robot.controller is not None and conditions.goal is not None
     duty = _controller_duty(robot, conditions, state)
     error = conditions.goal - controller_reading(robot, conditions, state)[0]
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
-    integrated = jnp.where(limited | (conditions.open > 0.5), 0.0, error)
-    return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
+    return duty, jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+
+
+#: Share of a controller's period that may be left when a sample is due, for rounding.
+DUE = 1e-6
+
+
+def sampled_controller(robot: Robot, conditions: Conditions, state: State) -> State:
+    """State after a controller with a rate has read it, if a sample is due. Of other controllers the same state."""
+    own = robot.controller
+    if own is None or conditions.goal is None or state.clock is None or state.integral is None:
+        return state
+    duty, error = _controller_actions(robot, conditions, state)
+    pending = state.pending is not None
+    now = state.integral + error / own.rate, state.pending if pending else duty, duty, state.clock + 1 / own.rate
+    was = state.integral, state.command, state.pending, state.clock
+    due = state.clock <= DUE / own.rate
+    after = [None if b is None else jnp.where(due, a, b) for a, b in zip(now, was, strict=True)]
+    return dataclasses.replace(state, **dict(zip(("integral", "command", "pending", "clock"), after, strict=True)))
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
