@@ -193,6 +193,11 @@ REFUSED = {
     ),
     "no such gain": ("kd = 0.1", "kq = 0.1", r"controller\.kq: no such parameter.*controller\.k"),
     "a lag of a held duty": ("kp = ", "rate = 50\nlag = 0.01\nkp = ", r"controller\.lag: got 0\.01 s with rate = 50"),
+    "half a sample": (
+        "kp = ",
+        "rate = 50\nsamples_late = 0.5\nkp = ",
+        r"controller\.samples_late: got 0\.5 with rate = 50; expected 0, or with a rate 1",
+    ),
     "a limit beyond the supply": ("limit = 0.9", "limit = 1.5", r"controller\.limit: got 1\.5; expected 0\.01 to 1"),
 }
 
@@ -218,11 +223,11 @@ SLOW_GOAL = 0.3 * np.sin(np.pi * SLOW) * np.minimum(SLOW, 1)
 WIDE = {"kp = 8.0": 'kp = "7.0 ± 100 %"', "torque_constant = 0.006": 'torque_constant = "0.0065 ± 100 %"'}
 
 
-def servo_log(goal, seed=1):
-    """Goal and angle of 12 bits at 100 Hz, and the states."""
+def servo_log(goal, seed=1, every=0.01, values=servo.TRUE, **sampled):
+    """Goal and angle of 12 bits, and the states."""
     rng, step = np.random.default_rng(seed), 2 * np.pi / 4096
-    times, goal = np.arange(len(goal)) * 0.01, np.round(goal / step) * step
-    angle, states = servo.simulate((times, goal), times, servo.TRUE, 1e-8)
+    times, goal = np.arange(len(goal)) * every, np.round(goal / step) * step
+    angle, states = servo.simulate((times, goal), times, values, 1e-8, **sampled)
     shown = np.round((angle + rng.normal(0, 0.5 * step, len(times))) / step) * step
     return {"time_s": times, "goal_angle_deg": np.degrees(goal), "output_angle_deg": np.degrees(shown)}, states
 
@@ -253,6 +258,28 @@ PRIOR = {
     "torque_constant = 0.006": 'torque_constant = "0.0065 ± 20 %"', "loss_coulomb = 0.02": 'loss_coulomb = "0.03 ± 50 %"',
     "loss_viscous = 0.005": 'loss_viscous = "0.004 ± 50 %"', "resistance = 4.0": 'resistance = "4.0 ± 0"',
 }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [False, True])
+def test_a_log_at_the_rate_of_its_controller_gives_the_gain(tmp_path, late):
+    """A continuous controller with a lag left 5 times the noise and a gain off by 39 %."""
+    slower = {**servo.TRUE, "kp": 2.5, "kd": 0.05}
+    prior = PRIOR | {"kp = 8.0": 'kp = "3.0 ± 30 %"', "kd = 0.1": 'kd = "0.04 ± 50 %"'}
+    text = servo.RIG.format(**servo.TRUE)
+    for old, new in prior.items():
+        text = text.replace(old, new)
+    text = text.replace("kp = ", SAMPLED[late]) + f"[instruments.output_angle]\nquantum = {360 / 4096}\n"
+    t = np.arange(0, 6, PERIOD)
+    goal = np.where(t < 3, 0.8 * (-1.0) ** (t // 0.75), np.sin(5 * t) * np.minimum(t - 3, 1))
+    log = servo_log(goal, every=PERIOD, values=slower, period=PERIOD, late=late)[0]
+    robot = read_rig(tmp_path, text)
+    found = calibrate(records.read_runs(log, robot), robot, starts=2, profiles=False, blocks=False)
+    kp = found.parameters["controller.kp"]
+    assert abs(kp.value - slower["kp"]) < 2 * kp.sd < 0.2
+    shown = np.asarray(Histories.of(records.read_runs(log, robot), found.robot)(found.robot).reading)[:, 0]
+    error = np.sqrt(np.mean((shown - np.radians(log["output_angle_deg"])) ** 2))
+    assert error < 1.2 * 2 * np.pi / 4096 * np.sqrt(0.5**2 + 1 / 12)
 
 
 @pytest.mark.slow

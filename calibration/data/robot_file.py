@@ -398,6 +398,11 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
                 f"{where}, controller.lag: got {float(controller.lag):g} s with rate = {controller.rate:g}; a held "
                 "duty has no lag: leave one of them out"
             )
+        if controller.samples_late not in (0, bool(controller.rate)):
+            raise BadConfiguration(
+                f"{where}, controller.samples_late: got {controller.samples_late:g} with rate = "
+                f"{controller.rate:g}; expected 0, or with a rate 1"
+            )
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=controller)
 
 
