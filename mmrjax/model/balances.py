@@ -137,7 +137,7 @@ def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list
     if conditions.goal is None or robot.controller is None:
         return [none] * len(robot.controller_states)
     if state.clock is not None:
-        return [none] * (len(robot.controller_states) - 1) + [none - 1.0]
+        return [*[none] * (len(robot.controller_states) - 1), none - 1.0]
     duty, integrated = _controller_actions(robot, conditions, state)
     return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
 
@@ -161,12 +161,12 @@ def sampled_controller(robot: Robot, conditions: Conditions, state: State) -> St
     if own is None or conditions.goal is None or state.clock is None or state.integral is None:
         return state
     duty, error = _controller_actions(robot, conditions, state)
-    pending = state.pending is not None
-    now = state.integral + error / own.rate, state.pending if pending else duty, duty, state.clock + 1 / own.rate
-    was = state.integral, state.command, state.pending, state.clock
+    command = duty if state.pending is None else state.pending
+    values = {"integral": state.integral + error / own.rate, "command": command, "clock": state.clock + 1 / own.rate}
+    values |= {} if state.pending is None else {"pending": duty}
     due = state.clock <= DUE / own.rate
-    after = [None if b is None else jnp.where(due, a, b) for a, b in zip(now, was, strict=True)]
-    return dataclasses.replace(state, **dict(zip(("integral", "command", "pending", "clock"), after, strict=True)))
+    changed: Any = {name: jnp.where(due, value, getattr(state, name)) for name, value in values.items()}
+    return dataclasses.replace(state, **changed)
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:

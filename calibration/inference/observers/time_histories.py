@@ -306,8 +306,8 @@ class Histories(Observer):
         jumps, early = _drive_jumps(whole_log, rows_of_whole, robot.rig), 0.0
         if robot.controller is not None and robot.controller.rate:
             period = 1 / robot.controller.rate
-            samples = [np.arange(0.0, whole_log["time_s"][rows[-1]], period) for rows in rows_of_whole]
-            all_jumps = [np.union1d(at, x) for (at, _), x in zip(jumps, samples, strict=True)]
+            instants = [np.arange(0.0, whole_log["time_s"][rows[-1]], period) for rows in rows_of_whole]
+            all_jumps = [np.union1d(at, x) for (at, _), x in zip(jumps, instants, strict=True)]
             jumps, early = [(x, np.ones(len(x))) for x in all_jumps], EARLIEST * period
         grids = [
             time_grid(whole_log["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
