@@ -79,6 +79,13 @@ def test_a_design_that_meets_all_that_can_be_met_is_not_red():
     assert set(verdicts) == {("meets the others", "fair"), ("misses", "bad")}
 
 
+def test_a_terminal_has_few_lines_of_a_sizing(capsys):
+    """All tables are on the page."""
+    terminal_renderer.print_document(size(), brief=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "256 searches" in lines[1]
+
+
 def above_the_bench(rise):
     """The bench's rows, and what compares them with a simulation 4 % above them, the first row without one."""
     measured = records.read_runs("measured")

@@ -272,7 +272,7 @@ def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tu
 
 
 def _values_without_role(raw: Raw) -> np.ndarray:
-    """Values of a column without a role: numbers if every cell is a number, otherwise words."""
+    """Values of a column that the model does not use: numbers if every cell is a number, otherwise words."""
     if isinstance(raw, np.ndarray):
         return raw
     numbers = column_numbers(raw)

@@ -103,7 +103,7 @@ class Runs:
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
-        """Table with the channels of a robot. Columns of other channels become columns without a role.
+        """Table with the channels of a robot. Columns of other channels are not used by the model.
 
         Raises:
             BadData: the table was read for another robot, which lacks a channel of this one.

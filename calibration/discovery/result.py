@@ -446,7 +446,7 @@ class DiscoveryResult:
         hidden: effects that the effects found would hide, the largest first.
         support: tests of the effects' names. None if no name was tested.
         cluster: property that the outliers share. They were then not excluded. None if there is none.
-        residual_clusters: groups of rows with similar residuals, by columns without a role.
+        residual_clusters: groups of rows with similar residuals, by columns that the model does not use.
         before, after: evidence for a missing effect in the residuals without and with the proposal.
         chi2: twice the objective without and with the proposal [σ²].
         readings: number of included readings.

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, has_template_number, is_example
-from calibration.described import describe, sentences
+from calibration.described import as_paragraph, describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
 from calibration.inference.foresight import InformationForecast, ParameterInformation
@@ -38,6 +39,9 @@ from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.report.document import Block, Document, Note, Table, columns, remarks
 from sweeps.report.terminal_renderer import print_document
+
+#: Names of a list in a sentence, and remarks on a terminal.
+NAMED, FEW = 8, 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +76,10 @@ class RigCheck:
         count = int(robot.sides)
         motors = "One motor drives" if count == 1 else f"{count} motors with the same command drive"
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
-        loads = "; ".join(f"{name}: {_load_words(load)}" for name, load in robot.configurations.items())
+        names: dict[str, list[str]] = {}
+        for name, load in robot.configurations.items():
+            names.setdefault(_load_words(load), []).append(name)
+        loads = "; ".join(f"{_few(one)}: {load}" for load, one in names.items())
         imposed = "the voltage (times the duty in histories)"
         words = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}
         words |= {goal: f"the goal of a controller ({goal.removeprefix('goal_')})" for goal in GOALS}
@@ -83,7 +90,7 @@ class RigCheck:
             "free": "start from a fitted state",
         }
         delay = float(rig.delay)
-        late = f", {delay:g} s late" if delay else ""
+        late = f", with a delay of {delay:g} s" if delay else ""
         lines = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
         coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
@@ -120,7 +127,7 @@ class RigCheck:
             if o.why.startswith("the file") and o.sd is None and o.value
         ]
         if loose and not self.robot.rig.inherits:
-            notes.append(f"no ± is given, so the default ± is used: {', '.join(loose)}")
+            notes.append(f"no ± is given, so the default ± is used: {_few(loose)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
             notes.append(
@@ -139,7 +146,7 @@ class RigCheck:
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
             instrument = rig.instrument(channel.name)
-            usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
+            usual = f"{channel.sd_column} of the table, otherwise {100 * channel.sd_share:g} % of the reading"
             rows.append(
                 {
                     "channel": channel.name,
@@ -194,10 +201,9 @@ class RigCheck:
         ]
         others = [name for name in self.runs.unknown if name not in names_by_column]
         without = (
-            f"{', '.join(others)}: without a role, so residuals are tested for differences between their values. "
-            "If one has a role, name it under "
+            f"{', '.join(others)}: not used by the model. Residuals are tested for differences between their values. "
+            "To use one, name it under [columns] in the rig's file"
         )
-        without += "[columns] in the rig's file"
         return [*notes, *([without] if others else [])]
 
     def statement(self) -> str:
@@ -258,7 +264,7 @@ def _noise_source_words(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     words_by_source = {
         "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
-        "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
+        "assumed": f"assumed, {100 * channel.sd_share:g} %, since there is no column {channel.sd_column}",
     }  # fmt: skip
     return words_by_source.get(word, word)
 
@@ -267,6 +273,11 @@ def _default_origin(robot: Robot, origin: NumberOrigin) -> str:
     """Line on a number without ±, with the default prior width that a fit uses."""
     sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first names of a list, and the number of others."""
+    return ", ".join(names[:NAMED]) + f" and {len(names) - NAMED} others" * (len(names) > NAMED)
 
 
 def _load_words(load: Any) -> str:
@@ -292,7 +303,9 @@ def _use_of_column(column: str, robot: Robot) -> str:
     return "condition"
 
 
-def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None) -> int:
+def check_rig_file(
+    file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None, verbose: bool = False
+) -> int:
     """Reports how a rig file was interpreted, and which parameters a table can determine. Returns 0.
 
     Raises:
@@ -307,7 +320,7 @@ def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, 
     if as_json:
         print_json(check.to_json())
     else:
-        print_document(check_document(check))
+        print_document(check_document(check), brief=not verbose)
     return 0
 
 
@@ -356,7 +369,25 @@ def check_document(found: RigCheck) -> Document:
             *remarks(found.remarks()),
             *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
         ),
+        brief=_brief(found),
     )
+
+
+def _brief(found: RigCheck) -> Names:
+    """Lines printed below the answer: the rig, columns of the table, and what to check."""
+    table: Names = ()
+    if found.runs is not None:
+        used = [
+            c["theirs"] or c["column"]
+            for c in found.columns()
+            if c["use"] not in ("condition", "not in the table") or (c["use"] == "condition" and c["values"] > 1)
+        ]
+        unused = f" Not in use: {', '.join(found.runs.unknown)}." * bool(found.runs.unknown)
+        table = (f"{count_noun(len(found.runs), 'row')}. Columns in use: {', '.join(used)}.{unused}",)
+    notes = found.remarks()
+    check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
+    more = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
+    return " ".join(found.understood()), *table, f"{check} --verbose prints all tables{more}."
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:

@@ -57,6 +57,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             Section("How sure", tuple(_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
+        brief=fit_words.brief_calibration(found),
     )
 
 
@@ -113,7 +114,9 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
         catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
-    yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
+    yield from (
+        Section(h, (f,)) for h, f in zip(("Parity", "Residuals against every condition"), figures, strict=True)
+    )
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:

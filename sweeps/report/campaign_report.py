@@ -83,7 +83,7 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
         if len(numbers) and len(figures) < DRAWN:
             spread = catalogue.figure(
                 "campaign.spread", numbers, Column(label, unit).title, values[usable], layout,
-                finding=f"{label} over what varies", words=(label.capitalize(),),
+                finding=f"{label} against the inputs", words=(label.capitalize(),),
             )  # fmt: skip
             figures.append(dataclasses.replace(spread, name=f"spread_{name}"))
     suffix = "" if len(values) == layout.design.points else " drawn at random"

@@ -165,7 +165,7 @@ def comparison_document(found: Comparison) -> Document:
         (
             *_over_time(found),
             Section("Parity", (parity,)),
-            Section("Errors over conditions", (errors,)),
+            Section("Errors against conditions", (errors,)),
             Section("Rows", (_rows(found),)),
         ),
     )

@@ -114,7 +114,7 @@ def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
-    """Section on columns without a role that correlate with residuals, if there are any."""
+    """Section on columns that the model does not use that correlate with residuals, if there are any."""
     if not clusters:
         return ()
     statements = (f"{c.statement}." for c in clusters)

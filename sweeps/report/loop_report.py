@@ -11,7 +11,8 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
-from calibration.described import describe
+from calibration.described import as_paragraph, describe
+from calibration.discovery.experiments import NONE
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, blocks
@@ -188,6 +189,8 @@ def held_out_table(found: DiscoveryResult) -> Table:
 def _next_step(found: DiscoveryResult, more: str) -> str:
     """What to do next. `more`: text after the name and description of an experiment."""
     after = found.next_experiment
+    if after is not None and after.name == NONE:
+        return f"{after.description}."
     if after is not None:
         return f"**{after.name}**: {after.description}.{more}"
     level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
@@ -205,20 +208,10 @@ def _advice(found: DiscoveryResult) -> Table:
         for note in remarks_with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
     ]
     against = [note for note in found.remarks if isinstance(note, str)]
-    sentences = [
-        loop_words.largest_share(found),
-        *far,
-        *against[:1],
-    ]  # capital at the start of a sentence, not of a parameter name
+    to_check = [loop_words.largest_share(found), *far, *against[:1]]
     rows = [
-        ("May I use it?", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
-        (
-            "What to check first",
-            " ".join(
-                [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
-            )
-            or "Nothing unusual.",
-        ),
+        ("May I use it for …", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
+        ("What to check first", as_paragraph(to_check) or "Nothing unusual."),
         ("What to do next", _next_step(found, more)),
     ]
     return catalogue.table("loop.advice", rows)

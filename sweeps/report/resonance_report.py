@@ -342,7 +342,7 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
                 "modes",
             ),
             Section(
-                "Peaks of ripple over speed",
+                "Peaks of ripple against speed",
                 (catalogue.note("resonance.peaks", passing.name, 100 * MATTERS),),
                 "peaks",
             ),

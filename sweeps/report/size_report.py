@@ -108,8 +108,8 @@ COLUMNS = columns(
 )  # fmt: skip
 
 
-#: Number of motors on the terminal.
-SHOWN = 5
+#: Number of motors in the table of a terminal, and of further designs in its few lines.
+SHOWN, NEXT = 5, 2
 _DESIGNS = "The best design, and the best designs with other parts, with the makers' gear ratios and whole cells."
 
 
@@ -133,7 +133,16 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
             *_chart(found),
         ),
+        brief=(lead, *_next_best(found), *_front_in_words(found)),
     )
+
+
+def _next_best(found: SizeResult) -> Names:
+    """A line on the best designs with other parts, none without a design."""
+    designs = [
+        f"{describe_design(f)} ({objective_text(f, found.sizing.objective)})" for f in found.sizing.alternatives
+    ]
+    return (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
 
 
 def _chart(found: SizeResult) -> tuple[Section, ...]:
@@ -179,16 +188,19 @@ def _share_within_limits(c: MarginChart) -> str:
     return f"{within}{c.slope[-1]:.3g}° are within all limits, the nearest is mostly {LIMITS[most]}"
 
 
-def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
+def _front_in_words(found: SizeResult) -> Names:
+    """A sentence on the Pareto front, none without one."""
     front = found.sizing.front
     if not front:
         return ()
     first, second = found.objectives
-    text = (
-        f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
-        f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}"
-    )
     return (
-        Note(f"{text}.", terminal=True),
-        catalogue.figure("size.front", found, finding=text),
+        f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
+        f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}.",
     )
+
+
+def _front(found: SizeResult) -> Iterable[Figure | Note]:
+    for text in _front_in_words(found):
+        yield Note(text, terminal=True)
+        yield catalogue.figure("size.front", found, finding=text)
