@@ -174,9 +174,9 @@ class Robot(eqx.Module):
         return self.rig.loose
 
     @property
-    def controller_size(self) -> int:
-        """Number of states of its controller: the integral of the error, and the duty if that lags."""
-        return 0 if self.controller is None else 1 + self.controller.lags
+    def controller_states(self) -> tuple[str, ...]:
+        """Fields of `State` that its controller has."""
+        return () if self.controller is None else self.controller.states
 
     @property
     def moves_as_one(self) -> bool:
