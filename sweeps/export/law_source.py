@@ -287,17 +287,17 @@ def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
         else '+ p["controller.feed_forward"] * command'
     )
     limit = 'p["controller.limit"]'
-    if own.rate:
+    if rate := controller.rate:
         return [
-            f"# Controller: acts every {1 / own.rate:g} s, in the nearest step, and holds its share of the supply.",
+            f"# Controller: acts every {1 / rate:g} s, in the nearest step, and holds its share of the supply.",
             f"error = command - {shown}",
             f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
             f"demanded = {library.clipped('wanted', limit)}",
             f'due, limited = state["clock"] < 0.5 * dt, ({prefix}.abs(demanded) >= {limit}) & (demanded * error > 0)',
-            f'integral = state["integral"] + {prefix}.where(due & ~limited, error, 0.0 * error) / {own.rate!r}',
-            f'duty = {prefix}.where(due, {_PENDING if own.samples_late else "demanded"}, state["duty"])',
-            *([f"pending = {prefix}.where(due, demanded, {_PENDING})"] if own.samples_late else []),
-            f'clock = {prefix}.where(due, state["clock"] + {1 / own.rate!r}, state["clock"]) - dt',
+            f'integral = state["integral"] + {prefix}.where(due & ~limited, error, 0.0 * error) / {rate!r}',
+            f'duty = {prefix}.where(due, {_PENDING if controller.samples_late else "demanded"}, state["duty"])',
+            *([f"pending = {prefix}.where(due, demanded, {_PENDING})"] if controller.samples_late else []),
+            f'clock = {prefix}.where(due, state["clock"] + {1 / rate!r}, state["clock"]) - dt',
             f'voltage = p["{SUPPLY}"] * duty',
         ]
     return [
