@@ -248,5 +248,5 @@ def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
 
 def test_the_page_of_check_shows_its_figure_with_its_finding(tmp_path):
     page = page_renderer.write_report_page(tmp_path, check()).read_text(encoding="utf-8")
-    assert drawn(page) == {"margins", "chart_of_corners"}
+    assert drawn(page) == {"margins", "chart_of_corners", "drive_plane"}
     assert 'aria-label="2 of 3 requirements are missed: ' in page
