@@ -179,6 +179,9 @@ class Robot(eqx.Module):
         """Number of states of its controller: the integral of the error, and the duty if that lags."""
         return 0 if self.controller is None else 1 + self.controller.lags
 
+    def __dir__(self) -> list[str]:  # methods are the program's own
+        return [field.name for field in dataclasses.fields(self)]
+
     @property
     def moves_as_one(self) -> bool:
         """True if shafts and load stop together: no backlash, elastic joint or ground to slip on."""
