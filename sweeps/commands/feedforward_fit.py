@@ -53,7 +53,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
 
 def voltage_fit(runs: Runs) -> Feedforward | None:
     """Constants of a log of voltage and speed. None for other data, or with too little motion."""
-    if runs.sampled and runs.has("supply_voltage_V"):
+    if runs.sampled and runs.layout.imposed == "voltage":
         with contextlib.suppress(BadData):
             return fit_feedforward(drive_log(runs))
     return None
