@@ -113,7 +113,7 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
         is_kept[empty] = False
         arrays = arrays.rows(
             is_kept,
-            f"{count_noun(len(empty), 'row')} without any reading left out. Row numbers count only the others",
+            f"left out: {count_noun(len(empty), 'row')} without any reading. Row numbers count only the others",
         )
     column_names = [None if m is None else m.column for m in meanings]
     clock = next((raw for c, raw in zip(column_names, arrays.values, strict=True) if c in TIME), None)
@@ -124,7 +124,7 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     if not len(filled_rows) or filled_rows[-1] == len(count) - 1 or not np.nanmax(count) > 0:
         return arrays
     is_kept = np.arange(len(count)) <= filled_rows[-1]
-    note = f"{count_noun(int((~is_kept).sum()), 'row')} at the end left out, because the clock restarts at 0 there"
+    note = f"left out: {count_noun(int((~is_kept).sum()), 'row')} at the end, because the clock restarts at 0 there"
     return arrays.rows(is_kept, note)
 
 
@@ -198,7 +198,7 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
     recording = np.zeros(len(count), int) if run is None else run
     count, period = unwrap_counter(count, recording)
     if period:
-        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}. The time is counted on from there")
+        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}. The wraps are removed")
     count, rows = spread_shared_stamps(count, recording)
     if rows:
         notes.append(

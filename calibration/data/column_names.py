@@ -202,7 +202,7 @@ def check_header(
     for column in (c for c in (*required, *layout.measured_columns) if c not in mapped_columns):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
-            got = f"; is {close[0]} meant?" if close else ""
+            got = f"; did you mean {close[0]}?" if close else ""
             if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
                 got = (
                     "; the columns that drive the two sides can be named in the robot's file under [columns]: "

@@ -50,7 +50,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
         computed += "computed, not measured, and contains no information on torque constant, friction or efficiency"
         if torque == TORQUE:
             columns.pop(torque)
-            notes.append(f"{computed}, so it is left out")
+            notes.append(f"{computed}. It is left out")
         elif runs.sampled or set(shown_columns) <= {current, TORQUE} or current not in shown_columns:
             raise BadData(
                 f"{computed}; remove the column and keep only rows without a load, or give the torque set at the "
@@ -60,7 +60,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             columns[torque] = _load_for_current(runs, robot, shown_columns[current], runs[current])
             columns.pop(current)
             notes.append(
-                f"{computed}, so it is left out. The load of each row follows from {current} and the robot's file, "
+                f"{computed}. It is left out. The load of each row follows from {current} and the robot's file, "
                 "so this current is not a reading either. These rows contribute only voltages and speeds"
             )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))

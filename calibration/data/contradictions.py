@@ -136,7 +136,7 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
     wrong = np.flatnonzero(tells & (along < TOO_SMALL * np.abs(back)))
     if wrong.size > (0 if current else MOST_BRAKING * np.sum(tells)):
         row = int(wrong[0])
-        why = "of the other sign" if along[row] < 0 else "too small"
+        why = "with the wrong sign" if along[row] < 0 else "too small"
         raise BadData(
             f"{runs.source} row {row + 1}, {column}: got {voltage[row]:g} at an imposed {SPEED} of "
             f"{runs[SPEED][row]:g}, {why} for the motors' back-EMF of "

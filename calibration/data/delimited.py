@@ -234,9 +234,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
                     f"{beside or 'whole numbers below a thousand'}; {expectation}"
                 )
-    return rows, (
-        f"{note}, and numbers have decimal commas, which are read as such" if comma else f"{note}; read so",
-    )
+    return rows, (f"{note}, and numbers have decimal commas" if comma else f"{note}; read so",)
 
 
 def _column(rows: list[list[str]], j: int) -> str:

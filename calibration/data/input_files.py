@@ -100,7 +100,9 @@ def check_declared(where: str | Path, columns: int, size: float = 0.0, held: flo
         BadData: there are more than `COLUMNS` columns, or more values than a file of this size can hold.
     """
     if columns > COLUMNS:
-        raise BadData(f"{where}: has {columns:,} columns; expected at most {COLUMNS:,}; export those that you need")
+        raise BadData(
+            f"{where}: has {columns:,} columns; expected at most {COLUMNS:,}; export only those that you need"
+        )
     if size > max(RATIO * held, SMALL):
         raise BadData(
             f"{where}: declares {size / 1e9:.3g} GB of values in a file of {held:,.0f} bytes; expected a file that "
@@ -195,13 +197,13 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
     except (tomllib.TOMLDecodeError, ValueError) as error:  # more digits than Python converts
         raise kind(f"{where}: not a readable TOML file ({error})") from error
     except RecursionError as error:
-        raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
+        raise kind(f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels") from error
     keys = 0
     pending: list[tuple[Json | list[Any], int]] = [(content, 1)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
-            raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels")
+            raise kind(f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels")
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:

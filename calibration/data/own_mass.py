@@ -96,11 +96,11 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     for name, file_mass in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
         if file_mass.varies:
-            why = "; does total_mass_kg leave the payload out?" if file_mass.unladen else ""
+            why = "; does total_mass_kg exclude the payload?" if file_mass.unladen else ""
             notes.append(
                 f"{name}: total_mass_kg minus payload_kg varies from {file_mass.low:.4g} to {file_mass.high:.4g} kg. "
                 f"The fit used the mass of each row. robot.toml contains the median, {file_mass.median:.4g} kg, and "
-                f"does not reproduce the fit in rows of another mass{why}"
+                f"does not reproduce the fit in rows with another mass{why}"
             )
         elif abs(file_mass.median - mass) > ROUNDING:
             notes.append(
@@ -132,5 +132,5 @@ def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
         if f"{name}.mass" in stated:
             raise BadConfiguration(
                 f"--prior {name}.mass: {runs.source} has a column total_mass_kg, which sets the mass of each run; to "
-                "fit the mass, remove that column, else remove the prior"
+                "fit the mass, remove that column, otherwise remove the prior"
             )

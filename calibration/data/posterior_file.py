@@ -202,7 +202,7 @@ def read_posterior(path: Path | str) -> Posterior:
         posterior = _posterior_of_dataset(data)
     except Exception as error:  # a damaged file can make the reader raise anything
         why = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise BadData(f"{path}: not a posterior that can be read ({why})") from error
+        raise BadData(f"{path}: not a readable posterior ({why})") from error
     size = len(posterior)
     sound = (
         posterior.covariance.shape == (size, size)
@@ -216,7 +216,9 @@ def read_posterior(path: Path | str) -> Posterior:
         and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not sound:
-        raise BadData(f"{path}: not a valid covariance, or a number is missing or out of range; write the file again")
+        raise BadData(
+            f"{path}: the covariance is invalid, or a number is missing or out of range; write the file again"
+        )
     return posterior
 
 

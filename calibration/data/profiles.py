@@ -233,7 +233,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     columns = _profile_columns(name, header)
     if len(body) < 2:
         got = "one row" if body else "a header and no rows"
-        raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
+        raise BadData(f"{name}: got {got}; expected at least two rows, the last of which ends the mission")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(

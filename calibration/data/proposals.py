@@ -195,7 +195,7 @@ def _candidate_of_signal(
         if full_scale is None or values.min() > 0.4 * largest:  # pulse widths never become small
             return None
         return ColumnCandidate(
-            signal, quantity, "duty", f"is {full_scale} a whole duty?", float(f"{1 / full_scale:.8g}")
+            signal, quantity, "duty", f"is {full_scale} full duty?", float(f"{1 / full_scale:.8g}")
         )
     if unit is None and quantity == "motor_speed" and largest < SLOW:
         return ColumnCandidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")

@@ -302,7 +302,7 @@ def _parse_limit(value: Any, where: str, quantity: Quantity) -> float | None:
     if value == RATED:
         if quantity.column not in RATINGS:
             raise BadConfiguration(
-                f"{where}: got {RATED!r}; expected a number, only {', '.join(RATINGS)} have a rating"
+                f"{where}: got {RATED!r}; expected a number; only {', '.join(RATINGS)} have a rating"
             )
         return None
     limits = RANGES["slope_deg"][:2] if quantity.unit == "deg" else STATED

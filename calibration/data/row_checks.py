@@ -118,7 +118,7 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     held = columns.get("held", np.zeros(1))
     for row in np.flatnonzero((held != 0) & (held != 1))[:1]:
         raise BadData(
-            f"{name} row {row + 1}, held: got {held[row]:g}; expected 1 where a clamp holds the output, else 0"
+            f"{name} row {row + 1}, held: got {held[row]:g}; expected 1 if a clamp holds the output, otherwise 0"
         )
     for row in np.flatnonzero((held == 1) & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
@@ -320,9 +320,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
         slope = columns["slope_deg"]
         if slope.any():
             row = int(np.flatnonzero(slope)[0])
-            more = (
-                f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
-            )
+            more = f", as in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
             raise BadData(
                 f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; expected "
                 "0, since on a slope the heading keeps changing and a turn never settles. Remove these rows. To "
@@ -463,7 +461,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
     for row, cells in enumerate(zip(*told, strict=True), 1):
         alike.setdefault(cells, []).append(row)
     if copied := [rows for rows in alike.values() if len(rows) > 1]:
-        others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
+        others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
             f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}. "
             "They count as repeats. Remove copies: they make results look more certain than they are"
@@ -475,7 +473,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
             run = runs[np.argmax(several)]
             rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
             row_words = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
-            others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
+            others = f", and {several.sum() - 1} more run_ids are repeated" if several.sum() > 1 else ""
             yield (
                 f"{name}: run_id {run} is in rows {row_words}{others}. Without {', '.join(TIME)} every row is a "
                 "separate run"
@@ -486,7 +484,7 @@ def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterat
     """Note on settled rows in which an unsigned load torque drives a shaft backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
-        more = f", and so in {on.size} rows" if on.size > 1 else ""
+        more = f", as in {on.size} rows" if on.size > 1 else ""
         yield (
             f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
             f"backward{more}: here it drives the shaft. The torque of a brake is negative for backward motion"

@@ -16,7 +16,7 @@ import numpy as np
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
 from calibration.data.runs import Runs
-from calibration.described import report_in_words
+from calibration.described import describe, report_in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import REFIT_FILE, OutOfTime
@@ -25,6 +25,7 @@ from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
 from calibration.inference.details import EquationErrors
+from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.simulation_errors import root_mean_square
 from calibration.words import loop_words
 from calibration.words.step_words import expected_time
@@ -113,6 +114,8 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
                 _report_out_of_time(within, begun=bool(stages))
+                for note in lost_motion_notes(runs, robot):  # then no effect is ranked
+                    print_message(describe(note))
             _report_stored_stages(stages, folder, config.robot)
             raise
         if config.resolve:

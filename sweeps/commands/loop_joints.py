@@ -252,7 +252,7 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
         raise BadConfiguration(
             f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" '
             'and channels = ["motor_current"]: the model\'s torque is valid only for the measured motion; '
-            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench begins one"
+            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench writes a template"
         )
     return one, robot
 

@@ -80,10 +80,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     source.check_supply(config.battery)
     for column in source.stated:
         if column in beside.stated:
-            raise BadConfiguration(
-                f"{OPTIONS[column]}: got it in addition to {source.source}, which contains {column}; keep one of "
-                "the two"
-            )
+            raise BadConfiguration(f"{OPTIONS[column]}: {source.source} contains {column} too; keep one of the two")
     _check_battery_charge(robot, config)
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:

@@ -90,7 +90,7 @@ class RigCheck:
             "free": "start from a fitted state",
         }
         delay = float(rig.delay)
-        late = f", {delay:g} s late" if delay else ""
+        late = f", with a delay of {delay:g} s" if delay else ""
         lines = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
         coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
@@ -146,7 +146,7 @@ class RigCheck:
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
             instrument = rig.instrument(channel.name)
-            usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
+            usual = f"{channel.sd_column} of the table, otherwise {100 * channel.sd_share:g} % of the reading"
             rows.append(
                 {
                     "channel": channel.name,
@@ -264,7 +264,7 @@ def _noise_source_words(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     words_by_source = {
         "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
-        "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
+        "assumed": f"assumed, {100 * channel.sd_share:g} %, since there is no column {channel.sd_column}",
     }  # fmt: skip
     return words_by_source.get(word, word)
 

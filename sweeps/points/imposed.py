@@ -151,7 +151,7 @@ def check_battery(robot: Robot) -> None:
     if robot.rig.imposed != "voltage":
         imposed_words = SAID[robot.rig.imposed].words
         raise BadConfiguration(
-            f"--battery: the {imposed_words} is imposed on this robot, whatever the supply; remove it"
+            f"--battery: the {imposed_words} is imposed on this robot, regardless of the supply; remove --battery"
         )
     if not capabilities.has_battery(robot):
         raise BadConfiguration("--battery: the robot's file has no battery; add [battery], or give --voltage")

@@ -88,9 +88,7 @@ def _profile(name: str, robot: Robot, plan: axes.SweepPlan, where: str) -> Profi
         )
     for field in source.values:
         if field in (*plan.conditions, *plan.design.names):
-            raise BadConfiguration(
-                f"{where}, {field}: got it in addition to {source.source}, which contains it; keep one of the two"
-            )
+            raise BadConfiguration(f"{where}, {field}: {source.source} contains it too; keep one of the two")
     on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
     source.check_supply(bool(on_battery))
     return source.profile(robot, plan.fixed())

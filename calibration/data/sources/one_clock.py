@@ -175,7 +175,7 @@ def signals_on_one_grid(
                 "stamp"
             )
         if period:
-            notes.append(f"{name}: {clock.name} wraps at {period:.10g}. The time is counted on from there")
+            notes.append(f"{name}: {clock.name} wraps at {period:.10g}. The wraps are removed")
         if not clock.unit and unit not in ("", "s"):
             notes.append(f"{name}: {clock.name} has no unit. Its numbers are read as {unit} ({_rate(times[key])})")
     on = rows[is_covered]

@@ -126,7 +126,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     signals = {s.path if len(matching_signals(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
     for signal in signals.values():
         if signal.refused or signal.clock is not None:
-            raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
+            raise BadData(f"{name}, {signal.path}: {signal.refused or 'has its own clock; expected one table'}")
     input_files.check_memory(name, input_files.VALUE * sum(s.length for s in signals.values()))
     values = _in_rows(source, signals)
     units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
@@ -309,7 +309,7 @@ def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Co
             other = next((signals[c].path for c, n in lengths.items() if n == rows), "the time of the others")
             raise BadData(
                 f"{source.name}, {signals[column].path}: has {length} values, and {other} has {rows}; "
-                "expected equal lengths, or time stamps of its own in the same group, an array named time"
+                "expected equal lengths, or its own time stamps, as an array named time in the same group"
             )
     columns = {}
     for column, signal in signals.items():
@@ -336,7 +336,7 @@ def _on_a_grid(
         return not is_measured(column) and column_of[column] not in lines
 
     if not over_time:
-        raise BadData(f"{source.name}: no signal has a column's name; {_how_to_name(source)}")
+        raise BadData(f"{source.name}: no signal has the name of a column; {_how_to_name(source)}")
     time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
     return {"time_s": time, **values, **_in_rows(source, others, len(time))}, notes
 

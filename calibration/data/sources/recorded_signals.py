@@ -145,7 +145,7 @@ def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
     if matches:
         paths_text = ", ".join(s.path for s in matches[:8])
         raise BadData(
-            f"{where}, {name}: got a name of {len(matches)} signals, {paths_text}; expected the path of one of them"
+            f"{where}, {name}: the name fits {len(matches)} signals, {paths_text}; give the path of one of them"
         )
     raise BadData(f"{where}, {name}: no such signal; {suggested_paths(name, [s.path for s in signals])}")
 
