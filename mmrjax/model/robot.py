@@ -178,6 +178,9 @@ class Robot(eqx.Module):
         """Fields of `State` that its controller has."""
         return () if self.controller is None else self.controller.states
 
+    def __dir__(self) -> list[str]:  # methods are the program's own
+        return [field.name for field in dataclasses.fields(self)]
+
     @property
     def moves_as_one(self) -> bool:
         """True if shafts and load stop together: no backlash, elastic joint or ground to slip on."""
