@@ -21,6 +21,7 @@ COMMAND = re.compile(r"(?:^|[^a-z])(?:cmd|command|target|set_?point|ref|referenc
 #: Names of signals that are neither readings nor commands of a drive.
 OTHER = re.compile(
     r"status|flag|error|fault|count|index|stamp|air|wind\b|pitot|latit|longit|altit|gps|ambient|_raw|roll|yaw|gyro|accel"
+    r"|predict|residual|z_?score|fitted"
 )
 #: Quantities that a command may contain, because they are imposed.
 IMPOSED = ("supply_voltage", "duty")
