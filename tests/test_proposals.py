@@ -138,6 +138,23 @@ def test_results_of_a_calculation_are_no_readings():
     }  # fmt: skip
 
 
+def test_letters_within_a_device_name_mean_nothing():
+    """A leg's actuators: `pack` of `Actpack` made the motor's current and voltage those of the supply."""
+    device = "knee[DephyActpack]:"
+    table = {"t": TIME, f"{device}motor_current": 4000 + 99 * WAVE, f"{device}battery_current": 900 + 9 * WAVE}
+    table |= {f"{device}motor_voltage": 7000 + 99 * WAVE, f"{device}battery_voltage": 40000 + 99 * WAVE}
+    assert proposed(table) == {
+        "time_s": "t", **{f"{q}_m{u}": f"{device}{name}" for q, u, name in (
+            ("motor_current", "A", "motor_current"), ("total_current", "A", "battery_current"),
+            ("motor_voltage", "V", "motor_voltage"), ("supply_voltage", "V", "battery_voltage"),
+        )},
+    }  # fmt: skip
+
+
+def test_volts_of_a_sensor_are_no_supply():
+    assert "supply_voltage_V" not in proposed({"t": TIME, "encoder_V": 3 + WAVE, "current_A": 1 + WAVE})
+
+
 def test_a_column_of_a_channel_that_the_robot_lacks_is_reported(tmp_path):
     entry = 'output_torque_Nm = "Torque [Nm]"'
     (tmp_path / "rig.toml").write_text(RIG.replace("[motor]", f"[columns]\n{entry}\n[motor]"))
