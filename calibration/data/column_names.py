@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from calibration.data.input_errors import BadData, allowed_words, parse_number
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: Ratio to the largest allowed value from which another unit is probable.
 FAR = 2.0
@@ -224,6 +225,25 @@ def check_header(
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in mapped_columns], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
+
+
+def unread_channel_notes(name: str, robot: Robot, unread: Collection[str]) -> Names:
+    """Notes on columns that the robot file assigns to a channel that it does not list.
+
+    Args:
+        unread: columns of the table without a meaning.
+    """
+    notes = []
+    for own_column, logger_column, _ in robot.rig.columns:
+        channel = next((c for c in channels.EVERY if own_column in c.columns()), None)
+        if logger_column in unread and channel is not None:
+            braked = channel.name == "output_torque" and not robot.has_ground
+            notes.append(
+                f"{name}, {logger_column}: not read, because the robot file assigns it to {own_column}, and "
+                f'"channels" does not list {channel.name}. Add it there'
+                + (", or assign the column to load_torque_Nm if a brake sets this torque" if braked else "")
+            )
+    return tuple(notes)
 
 
 def check_has_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:

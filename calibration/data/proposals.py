@@ -21,7 +21,10 @@ COMMAND = re.compile(r"(?:^|[^a-z])(?:cmd|command|target|set_?point|ref|referenc
 #: Names of signals that are neither readings nor commands of a drive.
 OTHER = re.compile(
     r"status|flag|error|fault|count|index|stamp|air|wind\b|pitot|latit|longit|altit|gps|ambient|_raw|roll|yaw|gyro|accel"
+    r"|predict|residual|z_?score|fitted"
 )
+#: Names of signals whose unit is that of a sensor's output.
+SENSOR = re.compile(r"encoder|sensor|photo|shunt|adc|therm|gauge")
 #: Quantities that a command may contain, because they are imposed.
 IMPOSED = ("supply_voltage", "duty")
 #: Larger numbers are time stamps or counters. Largest voltage and current without a unit.
@@ -40,10 +43,10 @@ class Meaning(NamedTuple):
 #: The first match wins.
 MEANINGS = tuple(Meaning(quantity, re.compile(pattern)) for quantity, pattern in (
     ("duty", r"duty|pwm|throttle|motor_?(cmd|command)$"),
-    ("supply_voltage", r"(bat|bus|supply|input|pack|dc)[^/]*volt|vbat|vbus|u_?bat|\bvin\b"),
+    ("supply_voltage", r"(?<![a-z])(bat|bus|supply|input|pack|dc)[^/]*volt|vbat|vbus|u_?bat|\bvin\b"),
     ("motor_voltage", r"(motor|phase|winding|terminal)[^/]*(volt|_v\b)"),
     ("supply_voltage", r"volt|\bu\b|^v$"),
-    ("total_current", r"(bat|input|supply|bus|total|dc|pack)[^/]*(cur|amp)|ibat|ibus"),
+    ("total_current", r"(?<![a-z])(bat|input|supply|bus|total|dc|pack)[^/]*(cur|amp)|ibat|ibus"),
     ("motor_current", r"(motor|phase|winding|axis)[^/]*(cur|amp|\bi\b)|i_?mot|\biq\b|\bq[-_](current|a\b)"),
     ("total_current", r"cur|amps?\b|\bi\b"),
     ("output_speed", r"(wheel|output|joint|load)[^/]*(vel|speed|rpm|omega)"),
@@ -171,7 +174,7 @@ def _candidate_of_signal(
     name = _path_words(signal.path)
     matches = [m.quantity for m in MEANINGS if m.pattern.search(name)]
     fitting = [q for q in matches if unit is None or unit in columns[q].values()]
-    if not matches and unit is not None and alone:
+    if not matches and unit is not None and alone and not SENSOR.search(name):
         fitting = [q for q in BY_UNIT if unit in columns[q].values()]
     command = bool(COMMAND.search(name))
     fitting = [q for q in fitting if not OTHER.search(name) and (not command or q in IMPOSED)]

@@ -181,6 +181,9 @@ def runs_of_arrays(
         "is assumed to show only the magnitude, so magnitudes are compared" for i in unsigned
     ))  # fmt: skip
     notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
+    if measured and robot is not None:
+        unread = {c for c, m in zip(header, meanings, strict=True) if m is None}
+        notes = (*notes, *column_names.unread_channel_notes(name, robot, unread))
     headings = {m.column: m.shown for m in meanings if m is not None}
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
