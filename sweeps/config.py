@@ -985,8 +985,8 @@ def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None,
         message = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
         return message if file is None else f"{file.name}: {message}"
     key = str(first["loc"][0])
-    place = ".".join(str(part) for part in first["loc"])
-    option_place = f"{file.name}, {place}" if file is not None and key not in given else called(key)
+    key_path = ".".join(str(part) for part in first["loc"])
+    option_place = f"{file.name}, {key_path}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
         return f"{option_place}: no such key; {allowed_words(key, kind.model_fields)}"
     expectation = first["msg"][0].lower() + first["msg"][1:]

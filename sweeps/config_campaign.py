@@ -70,8 +70,8 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
         conditions: constant conditions, by name.
         axes: axes of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
-        outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags. Empty: the
-            channels. Over a profile columns of `missions.mission_batch.OUTPUTS`, or flags. Empty: its `USUAL`.
+        outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags; empty: the
+            channels. With a profile: columns of `missions.mission_batch.OUTPUTS`, or flags; empty: its `USUAL`.
         storage: type in which outputs are stored.
         compression: compression of the store's chunks.
         obstacle: obstacle that every point climbs, in place of a run of the fidelity.

@@ -106,8 +106,8 @@ def option_parameters(kinds: Iterable[type[BaseModel]], common: Sequence[str]) -
     """
     facts = {name: fact for kind in kinds for name, fact in schema_facts(kind).items() if "const" not in fact}
     words = {name: option_of_field(name, fact).removeprefix("--") for name, fact in facts.items()}
-    places = {word: place for place, word in enumerate(common)}
-    for name in sorted(facts, key=lambda name: places.get(words[name], len(places))):
+    order = {word: place for place, word in enumerate(common)}
+    for name in sorted(facts, key=lambda name: order.get(words[name], len(order))):
         fact, word = facts[name], words[name]
         default, annotation = None, _option_type(fact) | None
         if fact.get("argument"):
@@ -117,7 +117,7 @@ def option_parameters(kinds: Iterable[type[BaseModel]], common: Sequence[str]) -
         else:
             pair = fact.get("type") == "boolean" and fact.get("default") is not False
             names = f"--{word}/--no-{word}" if pair else f"--{word}"
-            declared = typer.Option(names, help=option_help(name, fact), hidden=word not in places)
+            declared = typer.Option(names, help=option_help(name, fact), hidden=word not in order)
         keyword = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, declared])
 

@@ -82,8 +82,8 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     step[np.append(np.diff(recording) != 0, True)] = np.nan
     usual = float(np.nanmedian(step)) if np.isfinite(step).any() else np.nan
     rows_per_stamp = float(np.median(rows))
-    inner = rows[1:-1] if len(rows) > 4 else rows
-    if not np.isfinite(usual) or (np.abs(inner - rows_per_stamp) > 1).mean() > ODD:
+    inner_rows = rows[1:-1] if len(rows) > 4 else rows
+    if not np.isfinite(usual) or (np.abs(inner_rows - rows_per_stamp) > 1).mean() > ODD:
         return time, 0.0
     row_step = np.where(np.isfinite(step), step, usual) / rows
     row_step = np.minimum(row_step, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)

@@ -80,8 +80,8 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
     else:
         low, high = meaning.limits()
         hint = _hint_about_cell(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
-        more = "more than " if column in layout.deviation_columns else ""
-        allowed = f"{more}{low:g} to {high:g}"
+        more_than = "more than " if column in layout.deviation_columns else ""
+        allowed = f"{more_than}{low:g} to {high:g}"
         try:
             parse_number(cell)
         except ValueError:
@@ -203,14 +203,14 @@ def check_header(
     for column in (c for c in (*required, *layout.measured_columns) if c not in mapped_columns):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
-            got = f"; did you mean {close[0]}?" if close else ""
+            suggestion = f"; did you mean {close[0]}?" if close else ""
             if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
-                got = (
+                suggestion = (
                     "; the columns that drive the two sides can be named in the robot's file under [columns]: "
                     + ", ".join(f'{volts} = "motor_{volts}"' for volts in VOLTS)
                 )
             raise BadData(
-                f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
+                f"{name}: column {layout.expected(column)} is missing{suggestion} (required: {', '.join(required)})"
                 + ("" if close else _advice_on_unknown_columns(strange, column))
             )
     if measured and not any(c in mapped_columns for c in layout.measured_columns):

@@ -155,9 +155,9 @@ def find_preset(stated: str | Path) -> Preset:
         try:
             number_values[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
         except ValueError as error:
-            got = f"{key}{equals}{text}"
+            given_text = f"{key}{equals}{text}"
             raise BadConfiguration(
-                f"--columns {name}: got {got}; expected a name and a number, such as pole_pairs=7"
+                f"--columns {name}: got {given_text}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
         return parse_preset(_packaged_text(name), name, number_values)

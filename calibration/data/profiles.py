@@ -232,8 +232,8 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     header, body = rows[0], rows[1:]
     columns = _profile_columns(name, header)
     if len(body) < 2:
-        got = "one row" if body else "a header and no rows"
-        raise BadData(f"{name}: got {got}; expected at least two rows, the last of which ends the mission")
+        row_text = "one row" if body else "a header and no rows"
+        raise BadData(f"{name}: got {row_text}; expected at least two rows, the last of which ends the mission")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
@@ -361,8 +361,8 @@ class _CellReader:
         return self.cells[self.columns[field][0]][row] if self.has(field) else ""
 
     def refuse(self, field: str, row: int, allowed: str) -> NoReturn:
-        got = self.text(field, row) or "an empty cell"
-        raise BadData(f"{self.source} row {row + 1}, {self.columns[field][0]}: got {got}; expected {allowed}")
+        cell_text = self.text(field, row) or "an empty cell"
+        raise BadData(f"{self.source} row {row + 1}, {self.columns[field][0]}: got {cell_text}; expected {allowed}")
 
     def value(self, field: str, row: int) -> float:
         """Number in a cell, in the unit that `Profile` uses."""
@@ -420,12 +420,14 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
     full = {name: 1.0 if name == "duty" else 0.0 for name in shares}
     shares_found = {name: np.full(len(cells), full.get(name, 0.0)) for name in (*shares, *wholes)}
     for row in range(len(cells)):
-        before = modes[-1] if modes else ""
+        mode_before = modes[-1] if modes else ""
         filled = [field for field in DEMANDS if cells.text(field, row)]
-        ends = {field for field in filled if cells.linear and before == DEMANDS[field]}
-        mode = _mode_of_row(cells, row, before, [f for f in filled if f not in ends] or filled)
+        ends = {field for field in filled if cells.linear and mode_before == DEMANDS[field]}
+        mode = _mode_of_row(cells, row, mode_before, [f for f in filled if f not in ends] or filled)
         demands = [field for field in filled if DEMANDS[field] == mode]
-        _check_demands(cells, row, before, mode, demands, [f for f in filled if f not in demands and f not in ends])
+        _check_demands(
+            cells, row, mode_before, mode, demands, [f for f in filled if f not in demands and f not in ends]
+        )
         modes.append(mode)
         if row and cells.linear:  # default end of the ramp to this row
             for name in wholes:
@@ -435,7 +437,7 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
         for field in (*(f for f in ends if f not in demands), *demands):
             shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
         speed, has_yaw_rate = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-        if has_yaw_rate and mode != speed and not (cells.linear and before == speed):
+        if has_yaw_rate and mode != speed and not (cells.linear and mode_before == speed):
             cells.refuse(
                 YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, but this row has mode {mode}"
             )

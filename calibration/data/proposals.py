@@ -250,10 +250,10 @@ def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
         signal.path: _stated_unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)
     }
     pairs = {(of_place, of_rate): seconds for of_place, of_rate, seconds in RATES}
-    for place, rate in itertools.permutations([s for s in signals if seconds_by_unit.get(s.path)], 2):
-        seconds = pairs.get((str(seconds_by_unit[place.path]), str(seconds_by_unit[rate.path])))
-        if seconds is not None and place.length == rate.length == len(count):
-            factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))
+    for clock_signal, rate in itertools.permutations([s for s in signals if seconds_by_unit.get(s.path)], 2):
+        seconds = pairs.get((str(seconds_by_unit[clock_signal.path]), str(seconds_by_unit[rate.path])))
+        if seconds is not None and clock_signal.length == rate.length == len(count):
+            factor = _integral_factor(count, np.asarray(clock_signal.load(), float), np.asarray(rate.load(), float))
             if math.isfinite(factor) and factor > 0:
                 return factor / seconds
     return math.nan

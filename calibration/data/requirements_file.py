@@ -184,8 +184,8 @@ def parse_requirements(text: str, where: str) -> Requirements:
                 f"{where}, {name}: got an empty list; expected a number or tables with least or most"
             )
         for k, table in enumerate(tables):
-            place = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
-            requirements += _requirements_of_entry(name, table, envelope, place)
+            table_name = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
+            requirements += _requirements_of_entry(name, table, envelope, table_name)
     if not requirements:
         raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
     _check_consistent(requirements, envelope, where)
@@ -224,19 +224,19 @@ def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> 
     """Envelope with the stated values in place of those of `base`."""
     envelope: Json = {}
     for key, value in stated.items():
-        place = f"{where}.{key}"
+        key_path = f"{where}.{key}"
         if key not in KEYS:
             raise BadConfiguration(f"{where}, {_unknown_name_error(key, KEYS)}")
         if key in RANGES:
-            envelope[key] = _parse_range(value, place, *RANGES[key])
+            envelope[key] = _parse_range(value, key_path, *RANGES[key])
         elif key == "battery":
             if not isinstance(value, bool):
-                raise BadConfiguration(f"{place}: got {value!r}; expected true or false")
+                raise BadConfiguration(f"{key_path}: got {value!r}; expected true or false")
             envelope[key] = value
         elif key == "surface" and value not in SURFACES:
-            raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")
+            raise BadConfiguration(f"{key_path}: got {value!r}; {allowed_words(str(value), SURFACES)}")
         elif not isinstance(value, str):
-            raise BadConfiguration(f"{place}: got {value!r}; expected the name of a configuration")
+            raise BadConfiguration(f"{key_path}: got {value!r}; expected the name of a configuration")
         else:
             envelope[key] = value
     if "supply_voltage_V" in envelope:

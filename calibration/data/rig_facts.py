@@ -278,11 +278,11 @@ def gap_sentence(runs: Runs) -> str:
         if not (usual > 0 and long.any() and steps.max() > worst):
             continue
         k, worst = int(np.argmax(steps)), float(steps.max())
-        more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
+        other_gaps = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
         sentence = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
-            f"{three_digits(usual)} s is usual{more}. A fit keeps the imposed quantity constant in the gap. If rows "
-            'are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
+            f"{three_digits(usual)} s is usual{other_gaps}. A fit keeps the imposed quantity constant in the gap. If "
+            'rows are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
         )
     return sentence
 
@@ -350,11 +350,11 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     drive, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
     read = np.isfinite(readings).all(1)
-    inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
-    if inner.sum() < ROWS_INNER:
+    is_inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
+    if is_inner.sum() < ROWS_INNER:
         return ""
-    predicted = readings @ np.linalg.lstsq(readings[inner], drive[inner], rcond=None)[0]
-    if np.std(predicted[inner] - drive[inner]) > FITS * np.std(drive[inner]):
+    predicted = readings @ np.linalg.lstsq(readings[is_inner], drive[is_inner], rcond=None)[0]
+    if np.std(predicted[is_inner] - drive[is_inner]) > FITS * np.std(drive[is_inner]):
         return ""
     top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
     limit = float(np.median(np.abs(predicted[top])))

@@ -425,8 +425,8 @@ def _check_setting(where: str, name: str, value: Any) -> Any:
             f"a number, {least:g} to {most:g} {unit} ({meaning})",
         )
     if not allowed:
-        got = f"{value:g}" if name in RATINGS and is_number(value) else repr(value)
-        raise BadConfiguration(f"{where}, {name}: got {got}; expected {expected}")
+        value_text = f"{value:g}" if name in RATINGS and is_number(value) else repr(value)
+        raise BadConfiguration(f"{where}, {name}: got {value_text}; expected {expected}")
     return value
 
 
@@ -474,30 +474,30 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
     For a robot without a base, parameters that it does not state are left out.
     """
-    inherits, nothing = robot.rig.inherits, _base_robot(robot)
-    pack = not inherits and robot.battery.cells == nothing.battery.cells
+    inherits, base_robot = robot.rig.inherits, _base_robot(robot)
+    pack = not inherits and robot.battery.cells == base_robot.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
         "motor": [],
         "gearbox": [],
     }
-    head, more = rig_file.rig_lines(robot.rig)
+    head, rig_tables = rig_file.rig_lines(robot.rig)
     if rig_file.is_default_rig(robot.rig) and inherits and robot.has_ground:
-        head, more = [], {}
+        head, rig_tables = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
         tables[name] = ['load = "shaft"'] if isinstance(load, Shaft) else [f'movers = "{moves}"']
     for effect in robot.effects:
         tables[f"effects.{effect.name}"] = _lines_of_effect(effect)
-    for title, line in _lines_of_parameters(robot, nothing):
+    for title, line in _lines_of_parameters(robot, base_robot):
         tables.setdefault(title, []).append(line)
-    for title, line in _rating_lines(robot, nothing, {name for name, lines in tables.items() if lines}):
+    for title, line in _rating_lines(robot, base_robot, {name for name, lines in tables.items() if lines}):
         tables.setdefault(title, []).append(line)
     lines = [f"# {printable(line)}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if inherits else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors with the same command", *head]
     lines.append(f"configurations = {toml_value(list(robot.configurations))}")
-    for title, table in {**tables, **more}.items():
+    for title, table in {**tables, **rig_tables}.items():
         if not (inherits or table or title in robot.configurations):
             continue
         lines += ["", f"[{title}]", *table]
@@ -572,8 +572,8 @@ def _base_robot(robot: Robot) -> Robot:
     """Base robot of a robot's file."""
     if robot.rig.inherits:
         return paper_robots.nominal()
-    nothing = paper_robots.blank_robot(robot.configurations)
-    return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
+    base_robot = paper_robots.blank_robot(robot.configurations)
+    return params.replace(base_robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
 
 
 def _flatten(content: Json, prefix: str = "") -> list[tuple[str, Any]]:

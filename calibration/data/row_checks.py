@@ -324,11 +324,13 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
         slope = columns["slope_deg"]
         if slope.any():
             row = int(np.flatnonzero(slope)[0])
-            more = f", as in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+            rows_text = (
+                f", as in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
+            )
             raise BadData(
-                f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; expected "
-                "0, since on a slope the heading keeps changing and a turn never settles. Remove these rows. To "
-                "simulate such a turn over time: simulate --model drive --left --right --slope"
+                f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{rows_text}; "
+                "expected 0, since on a slope the heading keeps changing and a turn never settles. Remove these rows."
+                " To simulate such a turn over time: simulate --model drive --left --right --slope"
             )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
@@ -490,8 +492,8 @@ def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterat
     """Note on settled rows in which an unsigned load torque drives a shaft backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
-        more = f", as in {on.size} rows" if on.size > 1 else ""
+        rows_text = f", as in {on.size} rows" if on.size > 1 else ""
         yield (
             f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
-            f"backward{more}: here it drives the shaft. The torque of a brake is negative for backward motion"
+            f"backward{rows_text}: here it drives the shaft. The torque of a brake is negative for backward motion"
         )

@@ -118,11 +118,11 @@ def _refuse_against(
     if counts.sum() < FEWEST or against.sum() <= MOSTLY * counts.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    got, at = (" and ".join(f"{float(f'{x[row]:.4g}'):g}" for x in sides) for sides in (shown, runs.of_sides))
+    both_values, at = (" and ".join(f"{float(f'{x[row]:.4g}'):g}" for x in sides) for sides in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
-        f"{runs.source} row {row + 1}, {column}: got {got} although the left and right sides are driven at {at} "
-        f"{unit} (as in {against.sum()} of {counts.sum()} rows); expected {expected}"
+        f"{runs.source} row {row + 1}, {column}: got {both_values} although the left and right sides are driven at "
+        f"{at} {unit} (as in {against.sum()} of {counts.sum()} rows); expected {expected}"
     )
 
 

@@ -197,8 +197,8 @@ class Runs:
         return self._stacked(tuple(c.sd_column for c in self.channels))
 
     def _stacked(self, columns: Names) -> np.ndarray:
-        nothing = np.full(len(self), np.nan)
-        stacked = [self.columns.get(column, nothing) for column in columns]
+        empty_column = np.full(len(self), np.nan)
+        stacked = [self.columns.get(column, empty_column) for column in columns]
         return np.stack(stacked, 1) * np.asarray([c.factor for c in self.channels])
 
     def missing(self) -> list[str]:

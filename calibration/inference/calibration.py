@@ -140,8 +140,12 @@ def calibrate(
     base, of_product = _with_guide_priors(runs, ready, fidelity)
     coordinates = priors.parameter_coordinates(base, ready.names, {**of_product, **ready.stated})
     posed = observers.pose_problem(runs, base, coordinates, ready.noise.sd, fidelity)
-    more = members is not None or generations is not None
-    evolved = _population_size(posed, ready.names, runs, population, more), generations or GENERATIONS, members
+    has_population_options = members is not None or generations is not None
+    evolved = (
+        _population_size(posed, ready.names, runs, population, has_population_options),
+        generations or GENERATIONS,
+        members,
+    )
     search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress, solver)
     setting = _CalibrationInput(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
     if not free and priors.DELAY not in (*fix, *ready.names):

@@ -101,8 +101,8 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
     zero_step = jnp.zeros(jacobian.shape[1])
 
     def has_changed(carry: tuple) -> Array:
-        turns, active, before, _, _ = carry
-        return (turns == 0) | (turns < TURNS) & jnp.any(active != before)
+        turns, active, active_before, _, _ = carry
+        return (turns == 0) | (turns < TURNS) & jnp.any(active != active_before)
 
     start = jnp.asarray(0), height > 0, height > 0, zero_step, jnp.asarray(jnp.inf)
     return jax.lax.while_loop(has_changed, iterate, start)[3]

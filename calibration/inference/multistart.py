@@ -61,13 +61,13 @@ class StartOutcomes:
     def agreement(self) -> Remark:
         """Remark on how well the starts agree."""
         other = self.converged & ~self._at_best
-        more = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
+        cost_difference = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
         return Remark(
             "agreement",
             starts=len(self.cost),
             agree=self.agree,
             elsewhere=int(other.sum()),
-            more=more,
+            more=cost_difference,
             open=int(np.sum(~self.converged)),
         )
 

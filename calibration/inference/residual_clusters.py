@@ -492,10 +492,10 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
     for power in range(1, DEGREE + 1):
         for x in variables:
             scaled = 2 * (x - x.min()) / np.ptp(x) - 1
-            more = np.concatenate([indicators, scaled[:, None] ** power], 1)
-            if np.linalg.matrix_rank(more, 1e-6 * len(more)) > SHARE * len(runs):
+            added_columns = np.concatenate([indicators, scaled[:, None] ** power], 1)
+            if np.linalg.matrix_rank(added_columns, 1e-6 * len(added_columns)) > SHARE * len(runs):
                 return indicators
-            indicators = more
+            indicators = added_columns
     return indicators
 
 

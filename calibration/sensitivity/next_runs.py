@@ -60,8 +60,8 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
     improved = True
     while improved:
         improved = False
-        for place in range(count):
-            other_runs = run_indices[:place] + run_indices[place + 1 :]
+        for run_number in range(count):
+            other_runs = run_indices[:run_number] + run_indices[run_number + 1 :]
             best = _best_candidate(information, other_runs)
             if _log_determinant(information, [*other_runs, best]) > _log_determinant(information, run_indices) + 1e-9:
                 run_indices = [*other_runs, best]
@@ -72,8 +72,8 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
         ordered.append(max(unordered, key=lambda k: _log_determinant(information, [*ordered, k])))
     values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
     eye = np.eye(size)
-    after = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
-    return ChosenRuns(tuple(ordered), np.diff(values) / (2 * np.log(2)), np.stack(after))
+    covariances = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
+    return ChosenRuns(tuple(ordered), np.diff(values) / (2 * np.log(2)), np.stack(covariances))
 
 
 def _log_determinant(information: np.ndarray, rows: list[int]) -> float:
@@ -162,13 +162,13 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     choice = choose_runs(information_of, candidates.count)
     picked = np.flatnonzero(finite)[list(choice.rows)]
     slope = study.inputs.slope[study.inputs.places][:, :p]
-    after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
+    sd_after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
     outputs = {}
     for name, g in found.by_score.items():
         g = g[np.isfinite(g).all(1)][:, :p]
         variance = np.einsum("pi,kij,pj->kp", g, choice.covariance, g)
         outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(choice.covariance), np.nan)
-    safe_variance = np.where(after[0] > 0, after[0], 1.0)
+    safe_variance = np.where(sd_after[0] > 0, sd_after[0], 1.0)
     next_points = points.at(picked)
     return NextRuns(
         int(finite.sum()),
@@ -176,6 +176,6 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
         next_points,
         choice.gain,
         candidates.words,
-        after / safe_variance,
+        sd_after / safe_variance,
         outputs,
     )

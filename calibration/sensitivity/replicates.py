@@ -55,8 +55,8 @@ def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEs
     mean_denominator = float(np.mean(denominator))
     shape = (-1,) + (1,) * (numerator.ndim - 1)
     if not mean_denominator > 0:
-        nothing = np.full(numerator.shape[1:], np.nan)
-        return IntervalEstimate(nothing, nothing, nothing)
+        undefined = np.full(numerator.shape[1:], np.nan)
+        return IntervalEstimate(undefined, undefined, undefined)
     mean_numerator = np.mean(numerator, 0)
     value = mean_numerator / mean_denominator
     error = (numerator - mean_numerator - value * (denominator - mean_denominator).reshape(shape)) / mean_denominator

@@ -70,7 +70,7 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
-    more = d["mass"] + design.cells * parallel * c["mass"] - base_mass
+    added_mass = d["mass"] + design.cells * parallel * c["mass"] - base_mass
     values: Json = {
         **{f"motor.{key}": d[key] for key in (
             "resistance", "torque_constant", "friction_coulomb", "friction_viscous", "inertia", "inductance",
@@ -79,7 +79,7 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
         "gearbox.ratio": ratio, "gearbox.efficiency_load": d["efficiency"],
         "battery.capacity": parallel * c["capacity"], "battery.voltage_full": c["voltage_full"],
         "battery.resistance": c["resistance"] / parallel,
-        **{f"{name}.mass": chassis.mass + more for name, chassis in robot.configurations.items()},
+        **{f"{name}.mass": chassis.mass + added_mass for name, chassis in robot.configurations.items()},
         f"{configuration}.radius": radius,
     }  # fmt: skip
     rated = Ratings(design.cells, c["cutoff"], d["temperature"], d["torque"])

@@ -436,9 +436,11 @@ def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[P
         ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
         options = [v for end in ends if (v := _nearest_value(held, name, present_values[k], end)) is not None]
         if options:
-            after = min(options, key=lambda v: abs(math.log(v / present_values[k])))
+            nearest_value = min(options, key=lambda v: abs(math.log(v / present_values[k])))
             sense = 1 if held.requirement.least else -1
-            changes.append(ParameterChange(name, float(present_values[k]), after, unit, float(sense * slopes[k])))
+            changes.append(
+                ParameterChange(name, float(present_values[k]), nearest_value, unit, float(sense * slopes[k]))
+            )
     return changes
 
 

@@ -253,10 +253,10 @@ def brief_calibration(found: CalibrationResult) -> Names:
     determined = {name: p for name, p in found.parameters.items() if not p.held_by_prior}
     first = sorted(determined.items(), key=lambda item: -abs(item[1].shift))[:FEW]
     fitted = [f"{name} {p.value:.3g} ± {p.sd:.2g} {p.unit}".rstrip(" -") + f" ({p.shift:+.1f})" for name, p in first]
-    more = f", and {len(determined) - FEW} more" * (len(determined) > FEW)
+    others_text = f", and {len(determined) - FEW} more" * (len(determined) > FEW)
     parameters = (
         f"These runs determine {len(determined)} of {len(found.parameters)} parameters (shift in prior sds): "
-        f"{', '.join(fitted) or 'none'}{more}."
+        f"{', '.join(fitted) or 'none'}{others_text}."
     )
     held_out = []
     for kind in list(found.held_out_alike)[:1]:
@@ -291,10 +291,10 @@ def residual_cluster(c: ResidualCluster) -> str:
     ordered = sorted(c.levels, key=lambda m: -abs(m.mean))[:LISTED]
     mean_levels = [m for m in c.levels if m in ordered]
     level_words = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in mean_levels)
-    more = ", ..." if len(mean_levels) < len(c.levels) else ""
+    dots = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
         f"{subject} differ between the levels of {c.column}{range_}{signs} (simulated minus measured, by level: "
-        f"{level_words}{more}, {p}), {role}. Give each level its own configuration, or find what differs between them"
+        f"{level_words}{dots}, {p}), {role}. Give each level its own configuration, or find what differs between them"
     )
 
 

@@ -18,14 +18,14 @@ def exposure_reason(folder: Path) -> str:
     """
     if not hasattr(os, "geteuid"):  # a system without owners and modes
         return ""
-    place = folder.absolute()
+    absolute_folder = folder.absolute()
     try:
-        for part in (place, *place.parents):
-            if part.exists() and (reason := _folder_exposure_reason(part, part == place)):
+        for part in (absolute_folder, *absolute_folder.parents):
+            if part.exists() and (reason := _folder_exposure_reason(part, part == absolute_folder)):
                 return reason
-        if place.resolve() != place:
-            return exposure_reason(place.resolve())
-        for entry in place.iterdir() if place.is_dir() else ():
+        if absolute_folder.resolve() != absolute_folder:
+            return exposure_reason(absolute_folder.resolve())
+        for entry in absolute_folder.iterdir() if absolute_folder.is_dir() else ():
             if entry.lstat().st_uid != os.geteuid():
                 return f"{entry} belongs to another user"
     except OSError as error:

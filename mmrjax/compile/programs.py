@@ -152,9 +152,9 @@ class Programs:
             name = _program_name(self.function, tree.unflatten([_leaf_structure(x) for x in leaves]))
         except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
             return lambda: None
-        place, loaded = folder / f"{name}.program", None
+        program_file, loaded = folder / f"{name}.program", None
         with contextlib.suppress(Exception):  # an unreadable entry, for any reason, is made again
-            loaded = pickle.loads(place.read_bytes())
+            loaded = pickle.loads(program_file.read_bytes())
         arrays = _arrays(leaves)
         if loaded is not None:
             result, compiled = loaded
@@ -180,7 +180,7 @@ class Programs:
                     serialized = serialize_executable.serialize(program)[0]
                     _write_atomically(_executable(folder, compiled), zlib.compress(serialized, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
-                _write_atomically(place, pickle.dumps((result, compiled)))
+                _write_atomically(program_file, pickle.dumps((result, compiled)))
             return StoredProgram(program, result)
 
         return make

@@ -99,10 +99,10 @@ class QuantityValue(eqx.Module):
 def with_cells(robot: Robot, cells: Scalar) -> Robot:
     """Robot with this number of cells in series, which may be traced. Battery voltages scale with the number."""
     battery = robot.battery
-    more = cells / battery.cells
+    pack_ratio = cells / battery.cells
     battery = dataclasses.replace(
-        battery, curvature=battery.curvature * more, slope=battery.slope * more,
-        voltage_full=battery.voltage_full * more, resistance=battery.resistance * more,
+        battery, curvature=battery.curvature * pack_ratio, slope=battery.slope * pack_ratio,
+        voltage_full=battery.voltage_full * pack_ratio, resistance=battery.resistance * pack_ratio,
     )  # fmt: skip
     return dataclasses.replace(robot, battery=battery)
 

@@ -90,7 +90,7 @@ class TurningResistance(Effect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "m·s", "moment against the turn over load and yaw rate", (-0.01, 0.5),
+        "m·s", "moment against the turn per load and yaw rate", (-0.01, 0.5),
         "a tenth of the friction's moment φ_y L/4 at 4 rad/s (Table 5: 0.03 m)", sd=1e-3,
     )  # fmt: skip
 

@@ -496,7 +496,7 @@ def linearise_run(
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _unit_vector_of_current(end)
 
-        by_begin, rate = jax.jacfwd(lambda y: (_lag_rates(robot, constant, step, y),) * 2, has_aux=True)(begin)
+        lag_by_begin, rate = jax.jacfwd(lambda y: (_lag_rates(robot, constant, step, y),) * 2, has_aux=True)(begin)
         parts = jnp.where(passes, spans, step.length * _WEIGHED)
         lagging = lambda r: (_lag_of_step(r, step, begin[CURRENT], _current_limit(robot), parts, wait),) * 2  # noqa: E731
         by_rate, lag = jax.jacfwd(lagging, has_aux=True)(rate)
@@ -520,7 +520,7 @@ def linearise_run(
         by_decay = lag.means @ gains[:, :, CURRENT]
         lags = jnp.outer(by_rate.begin, -carries[:, CURRENT]) + by_rate.means.T @ by_means
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
-        carries = carries + lags.T @ by_begin
+        carries = carries + lags.T @ lag_by_begin
         if not sampled:
             return places, _stopped_by_clamp(conditions, carries.T).T, gains, lags, None
         return places, carries @ jax.jacfwd(functools.partial(start, step))(before), gains, lags, carries

@@ -216,13 +216,15 @@ def check_robot(robot: Robot) -> None:
     for parameter, value in zip(concrete, jax.device_get([p.value for p in concrete]), strict=True):
         spec = parameter.spec
         if np.ndim(value) or np.asarray(value).dtype.kind not in "biuf":
-            got = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
-            raise UsageError(f"{parameter.name}: got {got}; expected one number; for several robots use jax.vmap")
-        place = _first_outside(value, *spec.bounds)
-        if place is not None:
+            value_text = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
+            raise UsageError(
+                f"{parameter.name}: got {value_text}; expected one number; for several robots use jax.vmap"
+            )
+        outside = _first_outside(value, *spec.bounds)
+        if outside is not None:
             low, high = spec.bounds
             raise UsageError(
-                f"{parameter.name}{place[0]}: got {place[1]:.6g}; expected {low:g} to {high:g} {spec.unit} "
+                f"{parameter.name}{outside[0]}: got {outside[1]:.6g}; expected {low:g} to {high:g} {spec.unit} "
                 f"({spec.meaning})"
             )
 

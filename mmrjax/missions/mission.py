@@ -237,11 +237,11 @@ def mission(
         one-sided.
     """
     begin, law = Start() if start is None else start, motion_law(conditions, profile)
-    nothing = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
+    no_peaks = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
 
     def run_segment(carry: IntegrationState, k: Array) -> tuple[IntegrationState, _SegmentEnd]:
         segment = profile.row(k)
-        fresh = carry._replace(peaks=nothing, flags=jnp.asarray(0))
+        fresh = carry._replace(peaks=no_peaks, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
         c = integrate_segment(law, robot, conditions, segment, fresh, tolerance, most_steps)
         segment_end = _segment_end(law, robot, conditions, segment, carry, c, beginning)
@@ -249,7 +249,7 @@ def mission(
         return carry, segment_end
 
     order = jnp.tile(jnp.arange(profile.segment_count), profile.cycles)
-    c, segment_ends = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
+    c, segment_ends = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, no_peaks, keep), order)
     return _assemble_mission(law, robot, conditions, profile, c, segment_ends)
 
 

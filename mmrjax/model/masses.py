@@ -82,8 +82,8 @@ def _belt_part(gear: RunningGear, radius: Scalar) -> _RigidPart:
     straights = 2 * base * (base**2 / 12 + radius**2)
     arcs = 2 * radius * (jnp.pi * base**2 / 4 + 2 * base * radius + jnp.pi * radius**2)
     loop = mass * (straights + arcs) / (2 * base + 2 * jnp.pi * radius)
-    nothing = jnp.zeros_like(mass)
-    return _RigidPart(mass, nothing, nothing, loop - mass * radius**2)
+    zero_mass = jnp.zeros_like(mass)
+    return _RigidPart(mass, zero_mass, zero_mass, loop - mass * radius**2)
 
 
 def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Scalar]:
@@ -136,14 +136,14 @@ def _parts_of_robot(
     inertia_pulley = kind.inertia / 2
     belt = _belt_part(gear, robot.radius_pulley)
     levers = _lever_parts(gear, tracked, *lever_angles(gear, conditions))
-    nothing = jnp.zeros_like(belt.mass)
-    payload = _RigidPart(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, nothing)
+    zero_mass = jnp.zeros_like(belt.mass)
+    payload = _RigidPart(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, zero_mass)
     weighs = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
     body = _RigidPart(weighs, gear.centre_offset, gear.centre_height, weighs * gear.body_gyration**2)
 
-    pulleys = [_RigidPart(pulley, side * gear.wheelbase / 2, nothing, inertia_pulley) for side in (1.0, -1.0)]
+    pulleys = [_RigidPart(pulley, side * gear.wheelbase / 2, zero_mass, inertia_pulley) for side in (1.0, -1.0)]
     folded = [
-        body._replace(inertia=nothing),
+        body._replace(inertia=zero_mass),
         belt,
         *_lever_parts(gear, tracked, jnp.pi, jnp.pi),
         *pulleys,

@@ -156,9 +156,9 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
     for k, name in enumerate(robot.configurations):
         shares = {}
         for c in robot.channels:
-            before, after = float(without.reading[c.name][k]), float(with_it.reading[c.name][k])
-            if np.isfinite(after) and before:
-                shares[c.label] = 100 * (after / before - 1)
+            reading_without, reading_with = float(without.reading[c.name][k]), float(with_it.reading[c.name][k])
+            if np.isfinite(reading_with) and reading_without:
+                shares[c.label] = 100 * (reading_with / reading_without - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):
             changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
             yield f"change of the readings at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"

@@ -83,8 +83,10 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
 
     def timed(text: str) -> None:
         elapsed = time.monotonic() - began
-        more = expected_time(text, elapsed)
-        print_message(f"{elapsed:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
+        seconds_left = expected_time(text, elapsed)
+        print_message(
+            f"{elapsed:4.0f} s  {text}{'' if seconds_left is None else f' (about {seconds_left:.0f} s more)'}"
+        )
 
     with (
         open_folder("loop", config, robot, beside, runs) as folder,
@@ -144,8 +146,10 @@ def _add_track_model_test(
 
 def _report_out_of_time(within: float, begun: bool) -> None:
     """Reports that the time budget [s] ended before a verdict. `begun`: True if at least one stage has finished."""
-    more = max(5, math.ceil(within / 30))  # with twice the time
-    base_words = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
+    suggested_minutes = max(5, math.ceil(within / 30))  # with twice the time
+    base_words = (
+        "" if begun else f", and no fit of the base model; allow more time, such as --within {suggested_minutes}min"
+    )
     print_message(f"no verdict within {within:g} s{base_words}")
 
 
@@ -164,13 +168,13 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
         if wanted():
             raise OutOfTime
 
-    before = signal.signal(signal.SIGALRM, ring)
+    handler_before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3), 1.0)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, handler_before)
 
 
 def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:

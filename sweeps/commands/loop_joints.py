@@ -292,14 +292,16 @@ def run_joints(
     folder = beside.out or store.default_path("loop")
     code, rows = 0, []
     for name, (one, robot) in robots.items():
-        place, table = folder / name, runs[name]
-        is_finished = not beside.force and store.is_finished(place, store.run_identity("loop", one, robot, table))
-        print_message(f"joint {name}{f': finished in {place}, kept' if is_finished else ''}")
+        run_folder, table = folder / name, runs[name]
+        is_finished = not beside.force and store.is_finished(
+            run_folder, store.run_identity("loop", one, robot, table)
+        )
+        print_message(f"joint {name}{f': finished in {run_folder}, kept' if is_finished else ''}")
         for note in table.notes:
             print_message(note)
         if not is_finished:
-            code = max(code, loop(one, beside.model_copy(update={"out": place}), robot, table))
-        rows.append(_row(name, place))
+            code = max(code, loop(one, beside.model_copy(update={"out": run_folder}), robot, table))
+        rows.append(_row(name, run_folder))
     answer = " ".join(f"{name}: {answer}" for name, answer, *_ in rows)
     document = Document(f"Joints of {config.model.name}", answer, (catalogue.table("loop.joints", rows),))
     store.print_report(document)(folder)

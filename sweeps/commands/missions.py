@@ -215,10 +215,12 @@ def _condition_columns(
     robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
 ) -> Columns:
     """Conditions of the runs, empty if the profile states them or the battery determines them."""
-    nothing = np.full(len(runs), np.nan)
+    empty_column = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
     unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
-    columns = {key: nothing if key in unknown else value for key, value in run.condition_table(robot, runs).items()}
+    columns = {
+        key: empty_column if key in unknown else value for key, value in run.condition_table(robot, runs).items()
+    }
     if source.surface is not None:
         columns.pop(profiles.SURFACE, None)
     return columns

@@ -386,8 +386,8 @@ def _brief(found: RigCheck) -> Names:
         table = (f"{count_noun(len(found.runs), 'row')}. Columns in use: {', '.join(used)}.{unused}",)
     notes = found.remarks()
     check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
-    more = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
-    return " ".join(found.understood()), *table, f"{check} --verbose prints all tables{more}."
+    further_remarks = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
+    return " ".join(found.understood()), *table, f"{check} --verbose prints all tables{further_remarks}."
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:

@@ -83,8 +83,10 @@ def check_mujoco_model(source: Path) -> None:
         except (ElementTree.ParseError, ValueError, LookupError) as error:
             raise BadConfiguration(f"{file}: not a readable XML file ({error}); expected MuJoCo's XML") from error
         file_names = [element.get("file", "") for tag in NESTED for element in roots[file].iter(tag)]
-        inner = {(base / name).resolve() for name in file_names if name for base in (source.parent, file.parent)}
-        pending += [path for path in inner if path.exists() and path not in roots]
+        model_files = {
+            (base / name).resolve() for name in file_names if name for base in (source.parent, file.parent)
+        }
+        pending += [path for path in model_files if path.exists() and path not in roots]
     compilers = [element for root in roots.values() for element in root.iter("compiler")]
     folders = [element.get(key, "") for element in compilers for key in FOLDERS]
     count = 0
@@ -200,10 +202,10 @@ class _MujocoModel:
 
     def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
         """Inertia of the rotating parts, and their weight as `hanging`, with other joints in the reference pose."""
-        model, data, place = self.model, self.data, self.model.jnt_qposadr[joint]
+        model, data, position_index = self.model, self.data, self.model.jnt_qposadr[joint]
         weights = []
         for angle in (np.pi / 2, 0.0):
-            data.qpos[place] = model.qpos0[place] + angle
+            data.qpos[position_index] = model.qpos0[position_index] + angle
             self.library.mj_forward(model, data)
             weights.append(-float(data.qfrc_bias[dof]))
         mass = np.zeros((model.nv, model.nv))

@@ -87,10 +87,10 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         if histories is not None and robot.has_ground:
             assert histories.history is not None  # the fidelity was asked for it
             stages = stages_of_histories(robot, histories.history, runs.configurations(robot))
-            nothing: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+            empty_history: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
             under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(histories.result.status)]
             further["starts"] = [
-                {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
+                {"run_id": str(name), **(s.to_json() if s is not None and goes else empty_history)}
                 for name, s, goes in zip(run.run_names(runs), stages, under_way, strict=True)
             ]
         if PEAK in table:

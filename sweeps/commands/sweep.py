@@ -225,12 +225,12 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     if not chunks_left:
         return
     total = sum(job.blocks.count(k) for k in own_chunks)
-    before = total - sum(job.blocks.count(k) for k in chunks_left)
-    if before:
-        print_message(f"{store.partial}: resumes after {before:,} of {total:,} points")
+    points_before = total - sum(job.blocks.count(k) for k in chunks_left)
+    if points_before:
+        print_message(f"{store.partial}: resumes after {points_before:,} of {total:,} points")
     times = scale.Times()
     try:
-        with progress_bar(total, quiet=False, done=before, rate=True) as advance:
+        with progress_bar(total, quiet=False, done=points_before, rate=True) as advance:
             if pool is not None:
                 chunks = pool.produce(job, chunks_left)
             else:

@@ -226,7 +226,7 @@ def _evaluate_jaxpr(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.nd
     values.update(zip(jaxpr.invars, arguments, strict=True))
     for eqn in jaxpr.eqns:
         x, name, p = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
-        inner = next((p[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in p), None)
+        inner_jaxpr = next((p[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in p), None)
         if name in _SIMPLE:
             results = [_map_elements(lambda *a, op=_SIMPLE[name]: apply_operation(op, *a), *x)]
         elif name in _SAME:
@@ -264,9 +264,11 @@ def _evaluate_jaxpr(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.nd
             results = [_map_elements(lambda *terms: _sum_of_symbols(terms), *flat)]
         elif name == "dot_general":
             results = [_dot(x[0], x[1], p["dimension_numbers"])]
-        elif inner is not None:
-            closed = hasattr(inner, "consts")
-            results = _evaluate_jaxpr(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
+        elif inner_jaxpr is not None:
+            closed = hasattr(inner_jaxpr, "consts")
+            results = _evaluate_jaxpr(
+                inner_jaxpr.jaxpr if closed else inner_jaxpr, inner_jaxpr.consts if closed else (), x
+            )
         else:
             results = [_shape_primitive(name, x, p)]
         values.update(zip(eqn.outvars, results, strict=True))

@@ -105,8 +105,8 @@ class TableLaw(eqx.Module):
         high = jnp.where(way > 0, self.speed[-1], 0.0) + 0 * command
         for _ in range(50):
             middle = 0.5 * (low + high)
-            more = self._read(self.voltage, middle, load) < command
-            low, high = jnp.where(more, middle, low), jnp.where(more, high, middle)
+            needs_more = self._read(self.voltage, middle, load) < command
+            low, high = jnp.where(needs_more, middle, low), jnp.where(needs_more, high, middle)
         speed = 0.5 * (low + high)
         return self._read(self.current, speed, load), speed
 

@@ -160,7 +160,7 @@ def _check_in_mujoco(
 ) -> dict[str, float]:
     """Largest differences of MuJoCo C from the format's law, and errors of both on the same runs [%]."""
     rows = np.unique(np.linspace(0, len(runs.command) - 1, min(CHECKED, len(runs.command))).astype(int))
-    got = mujoco.settle_in_mujoco(texts, motor, runs, found.exported, rows.tolist())
+    mujoco_results = mujoco.settle_in_mujoco(texts, motor, runs, found.exported, rows.tolist())
     law = JointResult(found.exported.current[rows], found.exported.speed[rows])
     native = JointResult(runs.inside.current[rows], runs.inside.speed[rows])
 
@@ -170,9 +170,9 @@ def _check_in_mujoco(
     return {
         "runs settled in MuJoCo C": float(len(rows)),
         "current, law against native [%]": apart(law.current, native.current),
-        "current, MuJoCo C against native [%]": apart(got.current, native.current),
+        "current, MuJoCo C against native [%]": apart(mujoco_results.current, native.current),
         "speed, law against native [%]": apart(law.speed, native.speed),
-        "speed, MuJoCo C against native [%]": apart(got.speed, native.speed),
+        "speed, MuJoCo C against native [%]": apart(mujoco_results.speed, native.speed),
     }
 
 
@@ -189,8 +189,8 @@ def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: floa
         drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
     )
     native = np.asarray(run.signals.angle)[0]
-    got = mujoco.angles_in_mujoco(texts, command * ratio, times)
-    share = 100 * float(np.sqrt(np.mean((got - native) ** 2)) / np.sqrt(np.mean(native**2)))
+    mujoco_angles = mujoco.angles_in_mujoco(texts, command * ratio, times)
+    share = 100 * float(np.sqrt(np.mean((mujoco_angles - native) ** 2)) / np.sqrt(np.mean(native**2)))
     return {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
 
 

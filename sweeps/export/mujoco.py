@@ -505,9 +505,9 @@ def _body_text(inertia: float, weight: float, angle: float) -> str:
     arm = inertia * gravity / (2 * weight)  # the mass on its arm has half of the inertia
     mass = weight / (gravity * arm)
     rest = inertia - mass * arm**2
-    place = _numbers_text(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
+    position_text = _numbers_text(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
     return (
-        f'      <inertial pos="{place}" mass="{_numbers_text(mass)}" '
+        f'      <inertial pos="{position_text}" mass="{_numbers_text(mass)}" '
         f'diaginertia="{_numbers_text(rest, rest, rest)}"/>\n'
     )
 

@@ -330,7 +330,7 @@ def _axes_geometry(fig: Figure, axes: Axes) -> Json:
     """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)
-    place = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]
+    axes_box = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]
     # an inner axis has its label at the edge of its row or column, or of the figure
     column = [a.xaxis for a in fig.axes if a.get_position().x0 == axes.get_position().x0]
     row = [a.yaxis for a in fig.axes if a.get_position().y0 == axes.get_position().y0]
@@ -341,7 +341,7 @@ def _axes_geometry(fig: Figure, axes: Axes) -> Json:
     ):
         labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
         positions[name] = {**_axis_range(axis), "label": next(filter(None, labels), "").split("\n")[0]}
-    return {"box": [round(v, 1) for v in place], **positions}
+    return {"box": [round(v, 1) for v in axes_box], **positions}
 
 
 def _has_names(axis: Axis) -> bool:

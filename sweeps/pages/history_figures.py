@@ -217,10 +217,10 @@ def draw_starts(shown: list[StartRun], current_title: str = "total current", spe
         zoom.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * float(start.current[early].min())), top))
         zoom.set(xlabel="time [ms]", ylabel="total current [A]")
         if early[peak]:
-            place = (1e3 * start.time[peak], start.current[peak])
-            zoom.plot(*place, "o", ms=5, color=colour)
+            peak_point = (1e3 * start.time[peak], start.current[peak])
+            zoom.plot(*peak_point, "o", ms=5, color=colour)
             zoom.annotate(
-                f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
+                f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", peak_point, xytext=(8, -2),
                 textcoords="offset points", fontsize=8.5, va="top",
             )  # fmt: skip
         _shade_stages(zoom, start, 1e3)
@@ -273,8 +273,10 @@ def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
     has_room = 0 < start.settled < 0.5 * end_time and start.gets_under_way
     label_place = (start.settled if has_room else start.time[half], start.speed[half])
-    place = (6, 6) if has_room else (6, -12)
-    axes.annotate("$V_x$ (robot)", label_place, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
+    label_offset = (6, 6) if has_room else (6, -12)
+    axes.annotate(
+        "$V_x$ (robot)", label_place, xytext=label_offset, textcoords="offset points", color=colour, fontsize=8.5
+    )
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 

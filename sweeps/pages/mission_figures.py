@@ -236,13 +236,13 @@ def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> 
     bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(energy, 1e-12)]
     fig, grid = new_figure(1, 1, 0.9 + 0.34 * len(bars))
     axes = grid[0, 0]
-    place = np.arange(len(bars), dtype=float)
+    bar_positions = np.arange(len(bars), dtype=float)
     widths = np.array([bar[1] for bar in bars])
-    axes.barh(place, widths, height=0.7, color=[bar[2] for bar in bars])
-    for y, (_, width, _) in zip(place, bars, strict=True):
+    axes.barh(bar_positions, widths, height=0.7, color=[bar[2] for bar in bars])
+    for y, (_, width, _) in zip(bar_positions, bars, strict=True):
         share = f" ({100 * width / energy:.1f} %)" if energy > 0 else ""
         axes.text(max(width, 0.0), y, f"  {width:.3g} Wh{share}", va="center", fontsize=8.5)
-    axes.set_yticks(place, [bar[0] for bar in bars], fontsize=9)
+    axes.set_yticks(bar_positions, [bar[0] for bar in bars], fontsize=9)
     axes.invert_yaxis()
     axes.grid(False, axis="y")
     axes.axvline(0, color="#666666", lw=0.8)

@@ -69,12 +69,12 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     supply, slope = power_sources(runs)
     total = supply + slope
     bar_starts = np.zeros(len(names))
-    place = np.arange(len(names), dtype=float)
+    bar_positions = np.arange(len(names), dtype=float)
     for item, colour in ITEMS.items():
         value = np.maximum(parts[item], 0.0)
         if value.max() > 1e-6:
             axes.barh(
-                place,
+                bar_positions,
                 value,
                 left=bar_starts,
                 height=0.7,
@@ -83,15 +83,15 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
                 ec="white",
                 lw=0.6,
             )
-        for y, x, width in zip(place, bar_starts, value, strict=True):
+        for y, x, width in zip(bar_positions, bar_starts, value, strict=True):
             if width >= 0.04 * total.max():
                 ink = "white" if colour in _DARK else "black"
                 axes.text(x + width / 2, y, f"{width:.1f}", ha="center", va="center", fontsize=8, color=ink)
         bar_starts = bar_starts + value
-    for y, watts, supplied_power, falls in zip(place, total, supply, slope, strict=True):
+    for y, watts, supplied_power, falls in zip(bar_positions, total, supply, slope, strict=True):
         text = f"{supplied_power:.1f} W" + (f" + {falls:.1f} W from the slope" if falls > 1e-6 else "")
         axes.text(watts, y, f"  {text}", va="center", fontsize=8.5)
-    axes.set_yticks(place, names, fontsize=8.5)
+    axes.set_yticks(bar_positions, names, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
     axis_factor = 1.35 if (slope > 1e-6).any() else 1.1

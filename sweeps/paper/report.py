@@ -216,8 +216,8 @@ def _paper_rows_table(rows: data.PaperRows) -> Block:
     by_row = []
     for k, letters in enumerate(row_reasons(ROBOTS["nominal"](), rows)):
         names = ("configuration", "supply_voltage_V", "total_mass_kg", "slope_deg")
-        second = abs(own_mass[k] - table["total_mass_kg"][k]) > 0.05
-        for first, mass in ((True, table["total_mass_kg"][k]), (False, own_mass[k]))[: 1 + second]:
+        has_other_mass = abs(own_mass[k] - table["total_mass_kg"][k]) > 0.05
+        for first, mass in ((True, table["total_mass_kg"][k]), (False, own_mass[k]))[: 1 + has_other_mass]:
             cells: list[object] = [table[n][k] if first else "" for n in names]
             cells[2] = mass
             for bench, paper, plain, found in zip(

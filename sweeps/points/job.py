@@ -111,8 +111,8 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
         try:
             fidelity.check(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], conditions), task.options)
         except ValueError as error:
-            place = ", ".join(f"{n} {v:g}" for n, v in zip(plan.design.names, values, strict=True))
-            raise BadConfiguration(f"--model {task.model}: at {place}: {error}") from error
+            point_text = ", ".join(f"{n} {v:g}" for n, v in zip(plan.design.names, values, strict=True))
+            raise BadConfiguration(f"--model {task.model}: at {point_text}: {error}") from error
 
 
 def store_layout(config: Campaign, job: scale.Job) -> Layout:

@@ -124,8 +124,8 @@ def identity_differences(
         keys = [key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key)]
         if keys:
             changes = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:most]]
-            more = f" and {len(keys) - most} more" if len(keys) > most else ""
-            differences.append(f"{section} ({', '.join(changes)}{more})")
+            others_text = f" and {len(keys) - most} more" if len(keys) > most else ""
+            differences.append(f"{section} ({', '.join(changes)}{others_text})")
     return "; ".join(differences)
 
 
@@ -356,9 +356,11 @@ class SweepStore(Folder):
 
     def _altered(self, folder: Path) -> dict[Path, bytes]:
         """Files of metadata and axes that differ from those of `create_store`, with their correct content."""
-        with tempfile.TemporaryDirectory() as place:
-            create_store(Path(place) / STORE, self.layout)
-            file_contents = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
+        with tempfile.TemporaryDirectory() as scratch_folder:
+            create_store(Path(scratch_folder) / STORE, self.layout)
+            file_contents = {
+                p.relative_to(scratch_folder): p.read_bytes() for p in Path(scratch_folder).rglob("*") if p.is_file()
+            }
         contents = {folder / name: content for name, content in file_contents.items()}
         return {p: content for p, content in contents.items() if not p.is_file() or p.read_bytes() != content}
 

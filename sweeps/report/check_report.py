@@ -53,9 +53,9 @@ class CheckResult:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
         verb = "is" if len(missed) == 1 else "are"
         shortfalls = "; ".join(f"{requirement_label(o)} {shortfall_text(o)}" for o in missed[:NAMED])
-        more = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
+        others_text = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
         worst = ":" if len(missed) <= NAMED else ". Worst:"
-        return f"{len(missed)} of {number} requirements {verb} missed{worst} {shortfalls}{more}."
+        return f"{len(missed)} of {number} requirements {verb} missed{worst} {shortfalls}{others_text}."
 
     def to_json(self) -> Json:
         """`result.json`."""
@@ -180,8 +180,8 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
         brief += range(len(rows), len(rows) + min(len(o.change), SHOWN))
         rows += [(f"{requirement_label(o)} {required_value_text(o)}", *_change(c)) for c in o.change]
     hopeless = [f"{requirement_label(o)} {required_value_text(o)}" for o in found.missed if not o.change]
-    more = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
-    title = f"changes of a single parameter that would meet them{more}"
+    others_text = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
+    title = f"changes of a single parameter that would meet them{others_text}"
     hopeless_sentence = f"No change of a single parameter within its bounds meets {', '.join(hopeless)}."
     return (
         catalogue.note("check.changes"),

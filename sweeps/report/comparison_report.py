@@ -86,9 +86,9 @@ def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = N
     }
     if not measured.layout.complete and measured.has("surface"):
         table["surface"] = measured["surface"]
-    nothing = np.full(len(measured), np.nan)
+    empty_column = np.full(len(measured), np.nan)
     for channel in measured.channels:
-        table[channel.column] = measured.columns.get(channel.column, nothing)
+        table[channel.column] = measured.columns.get(channel.column, empty_column)
         if measured.has(channel.sd_column):
             table[channel.sd_column] = measured[channel.sd_column]
         table[f"simulated_{channel.column}"] = simulated[channel.column]

@@ -133,14 +133,14 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     limits = run_tables.limits_table(mission_limits(robot, first), "this mission")
     yield Section("Over time", (course, limits, catalogue.note("run.warming")), "course-section")
     if source.turns:
-        place = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
+        x_y_yaw = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
         sides = [[first[f"{name}_{side}_{unit}"] for side in channels.SIDES]
                  for name, unit in (("rms_current", "A"), ("winding_peak", "C"))]  # fmt: skip
         heat = catalogue.text("mission.heat", *sides[1]) if robot.knows(WARMING) else ""
         yield Section(
             "From above",
             (
-                catalogue.figure("mission.path", robot, first, *place, words=(first["turned_deg"],)),
+                catalogue.figure("mission.path", robot, first, *x_y_yaw, words=(first["turned_deg"],)),
                 catalogue.figure("mission.sides", rows, words=sides[0], more=heat),
             ),
             "path-section",

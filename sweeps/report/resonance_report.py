@@ -296,8 +296,8 @@ def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], what: s
         order = f"{members[0].order} × {what}" if members[0].order else f"{span_text(first, last, 1)} Hz"
         how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
         texts.append(f"{span_text(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
-    more = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
-    return "; ".join(texts) + more
+    others_text = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
+    return "; ".join(texts) + others_text
 
 
 def span_text(low: float, high: float, unit: float = MM) -> str:

@@ -186,7 +186,7 @@ def endings_table(
 
 def limits_table(limits: Sequence[Json], what: str) -> Table:
     """Table of the use of each limit: value, limit, and share that is used."""
-    rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
+    rows = [(limit["words"], limit["value"], limit["limit"], _percent_used(limit)) for limit in limits]
     return catalogue.table("run.limits", rows, f"{what} |")
 
 
@@ -214,7 +214,7 @@ def warming_share(value: float, limit: float, ambient: float) -> float:
     return 100 * (value - ambient) / max(limit - ambient, 1.0)
 
 
-def _used(limit: Json) -> Cell | str:
+def _percent_used(limit: Json) -> Cell | str:
     if limit["percent"] is None:
         return f"not checked: the robot's file has no `{limit['unstated']}`"
     return Cell(limit["percent"], "over" if limit["percent"] > 100 else "bar")

@@ -213,8 +213,8 @@ def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[
     if len(chain) < len(names):
         yield catalogue.note("runs.chains", len(chain), len(names), CHAINS)
     picked = {key: value[chain] for key, value in runs.items()}
-    more = catalogue.text("runs.on_ground" if robot.has_ground else "runs.on_shaft")
-    yield catalogue.figure("runs.power", picked, [names[k] for k in chain], robot.has_ground, more=more)
+    chain_end_text = catalogue.text("runs.on_ground" if robot.has_ground else "runs.on_shaft")
+    yield catalogue.figure("runs.power", picked, [names[k] for k in chain], robot.has_ground, more=chain_end_text)
 
 
 def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:

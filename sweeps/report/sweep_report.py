@@ -116,6 +116,6 @@ def _extremes(runs: Columns, names: Iterable[str]) -> Table:
         k = int(settled[np.nanargmax(np.abs(runs[c][settled]))])
         column = quantity_column(c)
         (value,) = run_tables.quantity_cells({c: runs[c][k : k + 1]}, c)
-        place = "; ".join(_levels(runs, axis, slice(k, k + 1)) for axis in _axes(runs))
-        rows.append((f"largest {column.heading}", f"{column.text(value)} {column.unit}".strip(), place))
+        levels_text = "; ".join(_levels(runs, axis, slice(k, k + 1)) for axis in _axes(runs))
+        rows.append((f"largest {column.heading}", f"{column.text(value)} {column.unit}".strip(), levels_text))
     return catalogue.table("sweep.extremes", rows)

@@ -121,9 +121,9 @@ def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarra
         return [(path, value)]
     fields: list[tuple[str, np.ndarray]] = []
     for k, element in enumerate(np.ravel(value)):
-        place = path if value.size == 1 else f"{path}[{k}]"
+        field_path = path if value.size == 1 else f"{path}[{k}]"
         for field in value.dtype.names:
-            fields += _structure_fields(f"{place}.{field}", np.asarray(element[field]))
+            fields += _structure_fields(f"{field_path}.{field}", np.asarray(element[field]))
     return fields
 
 
@@ -167,10 +167,10 @@ def _add_group(
     seen: set[int],
 ) -> None:
     """Adds the arrays and units of a group. A group with several paths is read only under the first one."""
-    place = h5py.h5o.get_info(group.id).addr
-    if place in seen:
+    address = h5py.h5o.get_info(group.id).addr
+    if address in seen:
         return
-    seen.add(place)
+    seen.add(address)
     for key in group:
         if not _inside(group, key, name):
             continue

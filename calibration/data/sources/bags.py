@@ -68,10 +68,10 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
             clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", _column(read, ""), "ns")
             for field, words, refused in _message_fields(first_message, ""):
                 if field != _STAMP:
-                    place = f"{topic}.{field}"
+                    field_path = f"{topic}.{field}"
                     signals.append(
                         Signal(
-                            place,
+                            field_path,
                             count,
                             _column(read, field),
                             _field_unit(kind, field),

@@ -69,13 +69,15 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
                 block, begin = stream.read(2**22), byte
             if len(block) - (byte - begin) < 3:
                 break
-            after = byte + 3 + int.from_bytes(block[byte - begin : byte - begin + 2], "little")
-            if after > size:
+            next_message = byte + 3 + int.from_bytes(block[byte - begin : byte - begin + 2], "little")
+            if next_message > size:
                 break
             if block[byte - begin + 2 : byte - begin + 3] == b"F":
-                topic, _, fields = block[byte - begin + 3 : after - begin].decode("utf-8", "replace").partition(":")
+                topic, _, fields = (
+                    block[byte - begin + 3 : next_message - begin].decode("utf-8", "replace").partition(":")
+                )
                 formats[topic] = [(kind, int(count or 1)) for kind, count in _FIELD.findall(fields)]
-            byte = after
+            byte = next_message
     if byte != size:
         raise BadData(
             f"{name}: ends within a message, at byte {byte} of {size}, as if it was cut off; copy it again, or, "
@@ -87,8 +89,10 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
 def _field_count(topic: str, formats: dict[str, list[tuple[str, int]]], sizes: dict[str, int]) -> int:
     """Number of fields in a topic, counting each element of an array and of a nested topic."""
     if topic not in sizes:
-        inner = formats.get(topic)
-        sizes[topic] = 1 if inner is None else sum(n * _field_count(kind, formats, sizes) for kind, n in inner)
+        nested_format = formats.get(topic)
+        sizes[topic] = (
+            1 if nested_format is None else sum(n * _field_count(kind, formats, sizes) for kind, n in nested_format)
+        )
     return sizes[topic]
 
 

@@ -32,9 +32,9 @@ def signals_of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     size = path.stat().st_size
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            inner = sum(item.file_size for item in archive.infolist())
-            input_files.check_declared(name, 1, inner, size)
-            input_files.check_memory(name, OBJECTS * inner)
+            unpacked_size = sum(item.file_size for item in archive.infolist())
+            input_files.check_declared(name, 1, unpacked_size, size)
+            input_files.check_memory(name, OBJECTS * unpacked_size)
             if any(item.startswith("xl/worksheets/") and item.endswith(".bin") for item in archive.namelist()):
                 raise BadData(f"{name}: is a binary workbook (.xlsb); save it as .xlsx")
             cells = max(map(_cell_count, map(archive.read, archive.namelist())), default=0)

@@ -62,22 +62,22 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
     input_files.check_memory(name, OBJECTS * len(content))
     if content[7:8] != b"\x01":
         raise BadData(f"{name}: is a WPILOG file with a version other than 1; export it as CSV with DataLogTool")
-    place = HEADER + int.from_bytes(content[8:HEADER], "little")
+    record_start = HEADER + int.from_bytes(content[8:HEADER], "little")
     entries: dict[int, _Entry] = {}
-    while place < len(content):
-        sizes = content[place]
+    while record_start < len(content):
+        sizes = content[record_start]
         lengths = (sizes & 3) + 1, (sizes >> 2 & 3) + 1, (sizes >> 4 & 7) + 1
-        fields, begin = [], place + 1
+        fields, begin = [], record_start + 1
         for length in lengths:
             fields.append(int.from_bytes(content[begin : begin + length], "little"))
             begin += length
         entry, size, stamp = fields
         if begin + size > len(content):
             raise BadData(
-                f"{name}: ends within a record, at byte {place} of {len(content)}, as if it was cut off; copy it "
-                f"again, or keep only the complete records: head -c {place} {name}"
+                f"{name}: ends within a record, at byte {record_start} of {len(content)}, as if it was cut off; copy "
+                f"it again, or keep only the complete records: head -c {record_start} {name}"
             )
-        payload, place = content[begin : begin + size], begin + size
+        payload, record_start = content[begin : begin + size], begin + size
         if entry == 0 and payload[:1] == bytes([START]):
             number, (title, kind) = int.from_bytes(payload[1:5], "little"), _name_and_type(payload[5:])
             entries[number] = _Entry(title, kind)

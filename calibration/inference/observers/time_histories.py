@@ -1141,8 +1141,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
             slow = _may_pass_rest(speeds, SLOW[rig.imposed])
-            before = int(np.ceil(early / _usual_interval(row_steps)))
-            slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
+            early_steps = int(np.ceil(early / _usual_interval(row_steps)))
+            slow = np.convolve(slow, np.ones(early_steps + 1))[early_steps:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
         if elastic > 0:
             longest = np.minimum(longest, ELASTIC / elastic)
@@ -1434,9 +1434,9 @@ def _memory_along_run(
     """
     with_memory = [e for e in effects if e.effect.memory_size is not None]
     counts = np.cumsum([len(e.at) for e in with_memory])
-    nothing = [jnp.zeros(len(e.at)) for e in effects]
+    no_memory = [jnp.zeros(len(e.at)) for e in effects]
     if not with_memory:
-        return lambda t: nothing
+        return lambda t: no_memory
 
     def split(memory: Array) -> list[Array]:
         return jnp.split(memory, counts[:-1])
@@ -1490,7 +1490,7 @@ def _memory_along_run(
         share = jnp.clip(jnp.where(length > 0, (t - clock[k]) / jnp.where(length > 0, length, 1.0), 0.0), 0.0, 1.0)
         parts = iter(split(nodes[k] + share * (nodes[k + 1] - nodes[k])))
         return [
-            zero if e.effect.memory_size is None else next(parts) for e, zero in zip(effects, nothing, strict=True)
+            zero if e.effect.memory_size is None else next(parts) for e, zero in zip(effects, no_memory, strict=True)
         ]
 
     return at_time
