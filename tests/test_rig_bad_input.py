@@ -87,7 +87,7 @@ def test_a_folder_is_no_rigs_file(tmp_path):
 @pytest.mark.parametrize("rows", [("900,-0.6", "1800,-0.7"), ("900,-0.6", "1800,0.7", "-900,-0.6")])
 def test_a_current_against_the_imposed_speed_is_refused_forward_too(tmp_path, rows):
     robot = rig_of(tmp_path, BRAKE)
-    message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; only this drives the motors, so the reading should have its sign"
+    message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; nothing else drives the motors, so the reading should have its sign"
     with pytest.raises(BadData, match=message):
         records.read_runs(table(tmp_path, *rows), robot=robot)
 

@@ -139,8 +139,8 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
 def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:
     value = table[key]
     if not is_number(value) or not math.isfinite(value) or (key in _LEAST and value <= 0):
-        least = "a number above 0" if key in _LEAST else "a number"
-        raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {least} ({LINEAR[key]})")
+        expected = "a number above 0" if key in _LEAST else "a number"
+        raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {expected} ({LINEAR[key]})")
     return float(value)
 
 

@@ -412,8 +412,8 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             row = int(against[0])
             alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
             raise BadData(
-                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at {imposed[row]:g} {unit}; only "
-                "this drives the motors, so the reading should have its sign; use one sign convention in all "
+                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at {imposed[row]:g} {unit}; nothing "
+                "else drives the motors, so the reading should have its sign; use one sign convention in all "
                 f"rows{alike}"
             )
         if wrong.size:

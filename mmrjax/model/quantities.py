@@ -80,7 +80,7 @@ def unit_at_end(text: str, known: Iterable[str]) -> str | None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Quantity:
-    """A number with its unit, its range and the rule for its sign. A row is equal to itself alone.
+    """A number with its unit, its range and the rule for its sign. A row equals only itself.
 
     Attributes:
         name: noun. With the unit, the name of its column.

@@ -269,7 +269,7 @@ def _status(status: str) -> Cell:
 
 def _strongest_trend(found: Comparison) -> str:
     """Channel and condition with the strongest correlation of errors."""
-    best, size = "No error changes with a condition", 0.0
+    best, size = "No error depends on a condition", 0.0
     headings = {column: heading for column, (heading, _) in condition_formats(found.table).items()} | dict(
         found.over or {}
     )
