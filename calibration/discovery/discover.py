@@ -86,7 +86,9 @@ from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import find_residual_clusters
+from calibration.inference.observers.windows import problem_of_windows
 from calibration.inference.simulation_errors import channel_errors
+from calibration.inference.weak_form import fit_weak_form
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -241,6 +243,7 @@ class LoopInput:
     keep: StoreStage = kept.compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
+    equations: CandidateSpace | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -277,7 +280,9 @@ class LoopInput:
         For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
         is appended to `ranked`.
         """
-        space = build_candidate_space(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
+        space = self.equations or build_candidate_space(
+            self.runs, self.robot, noise.sd, self.settings, self.stated, self.library
+        )
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         near = None
         if before is not None:
@@ -474,7 +479,8 @@ def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[
     screened = given.screen(noise, None if known_stages is None else known_stages.screened.base, ranked)
     base, free = screened.base, screened.base.space.free
     residuals = _residual_tests(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
-    factors = {} if screened.cluster is not None else common_factors(residuals)
+    skip = screened.cluster is not None or not base.space.bare.observe.reads
+    factors = {} if skip else common_factors(residuals)
     sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
         given.progress(progress_remark("sds"))
@@ -702,6 +708,26 @@ def choose_effects(
         (fits_of_names[0], diagnosis or diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)),
         searched,
         stood,
+    )
+
+
+def equations_of_log(given: LoopInput) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states."""
+    space = build_candidate_space(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+    fit = fit_weak_form(space.bare, space.library.scored) if space.bare.observe.long else None
+    if fit is None:
+        return None
+
+    def columns(rows: np.ndarray) -> dict[str, np.ndarray]:
+        table = {name: x[rows] for name, x in given.runs.columns.items() if x.dtype.kind == "f"}
+        return {**table, "configuration": np.asarray(space.bare.observe.of_rows.configuration)[rows]}
+
+    settings = given.settings
+    posed, rows = problem_of_windows(space.bare, fit, space.library.scored, columns, settings.width)
+    table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    noise = dataclasses.replace(given.noise, sd=given.noise.sd[rows])
+    return dataclasses.replace(
+        given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table
     )
 
 

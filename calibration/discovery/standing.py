@@ -226,7 +226,8 @@ def _compare_with_single_curve(
         if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
     location = beside.where
-    if equation_of_place(location.place) in {_equation_of_effect(space, e) for e in best.effects}:
+    place = equation_of_place(location.place)
+    if space.bare.observe.reads and place in {_equation_of_effect(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
@@ -391,7 +392,7 @@ def _largest_variation(
     of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _variable_varies(linear, v, space.included)]
     for variable in variables:
-        values = linear.curve_variable(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
+        values = linear.by_row_of_points(linear.curve_variable(bases_room.SHAFTS, variable)[0])
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         projected_residual, scores = _projected_columns(jacobian, residual, changed)

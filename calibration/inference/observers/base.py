@@ -105,6 +105,7 @@ class Observer(eqx.Module):
         library: effects that only such data can reveal, in addition to the library.
         menu: True if the menu of experiments has runs of this kind.
         searches: number of starts of a calibration. None: the default of the fidelity.
+        reads: True if the rows are readings of channels, False if they are errors of equations.
         profiled: False if parameters are never profiled for this kind, whatever the fidelity states.
     """
 
@@ -122,6 +123,7 @@ class Observer(eqx.Module):
     menu: ClassVar[bool] = True
     searches: ClassVar[int | None] = None
     profiled: ClassVar[bool] = True
+    reads: ClassVar[bool] = True
 
     # --- of a table, before anything is simulated
 
