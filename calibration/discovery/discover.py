@@ -71,6 +71,7 @@ from calibration.discovery.score_tests import StrongestStatistics, bootstrap_sta
 from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
+from calibration.discovery.simulation import LogSimulation, simulate_models
 from calibration.discovery.standing import judge_names
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
@@ -115,6 +116,8 @@ WORSE = 1.1
 LIKELY = 4.0
 #: Distance from the prior above which a note reports a base parameter [prior sd].
 FAR = 3.0
+#: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
+LONG = 4000
 #: Callback for progress notes.
 Tell = Callable[[Remark | str], None]
 
@@ -258,6 +261,8 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
+        if (equations := equations_of_log(self, LONG)) is not None:
+            return _confirm_by_simulation(self, equations, equations.trace())
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
@@ -401,6 +406,7 @@ class LoopStages:
     mechanism: Mechanism | None = None
     missed: tuple[MissedChannel, ...] = ()
     unused: Names = ()
+    run: LogSimulation | None = None
 
     @property
     def members(self) -> tuple[Names, ...]:
@@ -711,10 +717,22 @@ def choose_effects(
     )
 
 
-def equations_of_log(given: LoopInput) -> LoopInput | None:
-    """The same input with the windows of a log as its table. None if the log does not show its states."""
-    space = build_candidate_space(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
-    fit = fit_weak_form(space.bare, space.library.scored) if space.bare.observe.long else None
+def _space_of(given: LoopInput) -> CandidateSpace:
+    return build_candidate_space(
+        given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library
+    )
+
+
+def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states.
+
+    Args:
+        fewest: fewest steps of the longest run.
+    """
+    space = None if given.equations is not None else _space_of(given)
+    if space is None or not space.bare.observe.long or space.bare.observe.times.shape[1] < fewest:
+        return None
+    fit = fit_weak_form(space.bare, space.library.scored)
     if fit is None:
         return None
 
@@ -726,9 +744,46 @@ def equations_of_log(given: LoopInput) -> LoopInput | None:
     posed, rows = problem_of_windows(space.bare, fit, space.library.scored, columns, settings.width)
     table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
     noise = dataclasses.replace(given.noise, sd=given.noise.sd[rows])
+    shares = settings_for(type(posed.observe), settings.replicates).shares
     return dataclasses.replace(
-        given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table
-    )
+        given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table, known=None,
+        settings=dataclasses.replace(settings, shares=shares),
+    )  # fmt: skip
+
+
+def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages:
+    """Stages of a log's windows after the simulation of the base model and of the chosen one.
+
+    Nothing is missing if the simulation with the effects gains no more than chance does. If it gains less than half
+    of what the windows promised, the claim falls by one level.
+    """
+    if given.known is not None:  # only the noise differs
+        return traced
+    given.progress(progress_remark("confirm"))
+    screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+    base, best = screened.base.candidate, traced.best
+    ladder = () if searched is None else searched.ladder
+    if best is base and ladder:
+        named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
+        best = min(ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+    run = simulate_models(_space_of(given), base, best, given.settings)
+    traced = dataclasses.replace(traced, run=run)
+    if searched is None or beside is None:
+        return traced
+    confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    if not confirmed.rejected:
+        left = dataclasses.replace(left, test=confirmed)
+        return LoopStages("none", screened, left, traced.sds, unused=unused_inputs(given.runs), run=run)
+    if not run.contradicts or traced.verdict == "place":
+        return traced
+    if traced.verdict == "mechanism":
+        return dataclasses.replace(traced, verdict="place")
+    mechanism = find_mechanism(
+        screened.base.space, windows.runs, base, left, ladder, screened.bases, beside, traced.predicted,
+        windows.settings,
+    )  # fmt: skip
+    level = "place" if mechanism is None or mechanism.fails else "mechanism"
+    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
 
 
 # --- stages without a module of their own ---------------------------------------------------------------
@@ -938,9 +993,14 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         traced.verdict in WITHOUT_NAME,
     )
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
+    decided, shown = (space, best), diagnosis
+    if (run := traced.run) is not None:
+        best = run.base if best is base else run.best
+        space, base, noise, traced = run.space, run.base, given.noise, dataclasses.replace(traced, predicted={})
+        shown, ends = run.diagnosis(base, diagnosis), run.diagnosis(best, ends)
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
-    beside = traced.beside if nameless else None
+    beside = traced.beside if nameless and run is None else None
     if beside is not None:
         progress(progress_remark("shape"))
     before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
@@ -967,7 +1027,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, of_fit = (best, traced.ends) if written else (base, diagnosis)
+        fit, of_fit = (best, traced.ends if run is None else ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
@@ -979,15 +1039,18 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
 
     ladder = () if traced.searched is None else traced.searched.ladder
     ladder = ladder if traced.alike is None else traced.alike.ladder
-    near, too_large = findings.listed_alternatives(space, best, cost, ladder, settings)
+    cost_there = cost if run is None else decided[1].cost
+    near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
-        found = findings.found_effects(space, base, best, traced.alike, diagnosis.test, settings)
-        if not nameless:
+        named = best if run is None else dataclasses.replace(best, cost=decided[1].cost)
+        base_there = screened.base.candidate
+        found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
+        if not nameless and run is None:
             ask = observe.menu and not observe.long
             concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
-    scores = findings.effect_scores(space, diagnosis.scores, settings)
+    scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
     library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
@@ -1002,15 +1065,15 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         runs=runs,
         numbers=numbers,
         included=included,
-        outliers=tuple(int(numbers[k]) for k in screened.outliers),
+        outliers=() if run is not None else tuple(int(numbers[k]) for k in screened.outliers),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
         unnamed=None
         if beside is None or traced.where is None
         else findings.unnamed_discrepancy(beside, traced.where, diagnosis.test.p_value, len(runs)),
         remains=None if nameless or traced.alike is None else traced.where,
-        next_experiment=_next_experiment(space, traced, settings),
-        cannot_see=findings.invisible_effects(space, diagnosis.scores, settings),
+        next_experiment=_next_experiment(decided[0], traced, settings),
+        cannot_see=findings.invisible_effects(decided[0], diagnosis.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
             sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
@@ -1027,8 +1090,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=scores,
-        cosine=signature_cosines(space, diagnosis.scores)[np.ix_(library_places, library_places)],
-        detail=observe.detail(screened.bases, included, diagnosis, ends),
+        cosine=signature_cosines(decided[0], diagnosis.scores)[np.ix_(library_places, library_places)],
+        detail=observe.detail(screened.bases, included, shown, ends),
         readings_of_rows=row_readings,
         errors_as_stated=error(row_readings.as_stated),
         errors=errors_on_common_rows(row_readings.before, row_readings.after, error),
@@ -1044,6 +1107,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     )
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    if run is not None and run.contradicts:
+        of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(
         result, remarks=(*of_noise, *worse_than_stated(row_readings, noise, included), *loop_remarks(result))
     )

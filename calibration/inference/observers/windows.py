@@ -246,6 +246,9 @@ class Windows(SettledRuns):
             coordinates = coordinates.with_effects(jnp.asarray(active))
         return _evaluated(self, coordinates, problem.data, jnp.asarray(z))
 
+    def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> Any:
+        raise NotImplementedError  # that of the log
+
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         linear = self.linear
         ways = {name: np.sign(linear.variable(name)) for name in WAYS}
