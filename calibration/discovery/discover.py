@@ -758,7 +758,9 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     of what the windows promised, the claim falls by one level.
     """
     if given.known is not None:  # only the noise differs
-        return traced
+        run, level = given.known.run, given.known.verdict
+        refuted = run is not None and (level == "none" or run.contradicts)
+        return dataclasses.replace(traced, verdict=level if level == "none" else "place") if refuted else traced
     given.progress(progress_remark("confirm"))
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
     base, best = screened.base.candidate, traced.best

@@ -72,14 +72,21 @@ class LogSimulation:
 def simulate_models(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> LogSimulation:
     """Simulates the base fit and the best fit of a log's windows, each refined by a few steps."""
     space = space.with_room(best.effects)
-    fits = []
-    for c in (base,) if best is base else (base, best):
-        problem, z, active = space.fit_of(c.active, c.z)
-        sets = None if active is None else [active]
-        optima, _ = fit_from_each_start(problem, [z], [space.weight], sets, STEPS)
-        optimum = jax.tree.map(lambda x: x[0], optima)
-        more = len(c.z) - len(optimum.z)
-        optimum = dataclasses.replace(optimum, z=np.pad(optimum.z, (0, more)), sd=np.pad(optimum.sd, (0, more), constant_values=1.0))
-        fits.append(candidate_of_fit(space, c.active, optimum, settings))
-    first, last = fits[0], fits[-1]
+
+    def refined(c: Candidate, starts: list[np.ndarray]) -> Candidate:
+        """The best of the fits from these starts."""
+        problem, _, active = space.fit_of(c.active, c.z)
+        size, fits = len(problem.coordinates), list[Candidate]()
+        for z in starts:
+            sets = None if active is None else [active]
+            optima, _ = fit_from_each_start(problem, [z[:size]], [space.weight], sets, STEPS)
+            optimum = jax.tree.map(lambda x: x[0], optima)
+            more = len(c.z) - size
+            z, sd = np.pad(optimum.z, (0, more)), np.pad(optimum.sd, (0, more), constant_values=1.0)
+            fits.append(candidate_of_fit(space, c.active, dataclasses.replace(optimum, z=z, sd=sd), settings))
+        return min(fits, key=lambda x: x.cost)
+
+    last = refined(best, [best.z])
+    without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
+    first = last if best is base else refined(base, [base.z, without])
     return LogSimulation(space, first, last, 1 - best.cost / base.cost, 1 - last.cost / first.cost)
