@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +50,7 @@ from calibration.discovery.loop_notes import (
     VerdictSummary,
 )
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
-from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
+from calibration.discovery.mechanism import cached_hold_out_score, excess_misfit, find_mechanism
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
@@ -86,8 +87,8 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
 from calibration.inference.weak_form import fit_weak_form
 from mmrjax import effects, fidelities
@@ -118,6 +119,8 @@ LIKELY = 4.0
 FAR = 3.0
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
 LONG = 4000
+#: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
+CHANCE = 3.0
 #: Callback for progress notes.
 Tell = Callable[[Remark | str], None]
 
@@ -261,8 +264,8 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
-        if (equations := equations_of_log(self, LONG)) is not None:
-            return _confirm_by_simulation(self, equations, equations.trace())
+        if (by_windows := self.trace_windows()) is not None:
+            return by_windows
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
@@ -273,6 +276,15 @@ class LoopInput:
                 word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
+
+    def trace_windows(self) -> LoopStages | None:
+        """Stages of the windows of a log with a long run. None without a finding, which a simulation may still
+        make.
+        """
+        if self.equations is not None or (self.known is not None and self.known.run is None):
+            return None
+        equations = equations_of_log(self, LONG)
+        return None if equations is None else _confirm_by_simulation(self, equations, equations.trace())
 
     @functools.cached_property
     def shows_unmodelled_backlash(self) -> bool:
@@ -718,9 +730,7 @@ def choose_effects(
 
 
 def _space_of(given: LoopInput) -> CandidateSpace:
-    return build_candidate_space(
-        given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library
-    )
+    return build_candidate_space(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
 
 
 def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
@@ -729,16 +739,17 @@ def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
     Args:
         fewest: fewest steps of the longest run.
     """
-    space = None if given.equations is not None else _space_of(given)
-    if space is None or not space.bare.observe.long or space.bare.observe.times.shape[1] < fewest:
+    space = _space_of(given)
+    observe: Any = space.bare.observe
+    if not observe.long or observe.times.shape[1] < fewest:
         return None
     fit = fit_weak_form(space.bare, space.library.scored)
-    if fit is None:
+    if fit is None or not fit.plan.mechanical:
         return None
 
     def columns(rows: np.ndarray) -> dict[str, np.ndarray]:
         table = {name: x[rows] for name, x in given.runs.columns.items() if x.dtype.kind == "f"}
-        return {**table, "configuration": np.asarray(space.bare.observe.of_rows.configuration)[rows]}
+        return {**table, "configuration": np.asarray(observe.of_rows.configuration)[rows]}
 
     settings = given.settings
     posed, rows = problem_of_windows(space.bare, fit, space.library.scored, columns, settings.width)
@@ -751,37 +762,36 @@ def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
     )  # fmt: skip
 
 
-def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages:
+def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
     """Stages of a log's windows after the simulation of the base model and of the chosen one.
 
-    Nothing is missing if the simulation with the effects gains no more than chance does. If it gains less than half
-    of what the windows promised, the claim falls by one level.
+    None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
+    gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
+    level.
     """
-    if given.known is not None:  # only the noise differs
-        run, level = given.known.run, given.known.verdict
-        refuted = run is not None and (level == "none" or run.contradicts)
-        return dataclasses.replace(traced, verdict=level if level == "none" else "place") if refuted else traced
-    given.progress(progress_remark("confirm"))
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+    if searched is None or beside is None or given.shows_unmodelled_backlash:
+        return None
+    if given.known is not None:  # only the noise differs
+        refuted = given.known.run is not None and given.known.run.contradicts
+        return dataclasses.replace(traced, verdict="place") if refuted else traced
+    given.progress(progress_remark("confirm"))
     base, best = screened.base.candidate, traced.best
-    ladder = () if searched is None else searched.ladder
-    if best is base and ladder:
+    if best is base:
         named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
-        best = min(ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+        best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
     run = simulate_models(_space_of(given), base, best, given.settings)
-    traced = dataclasses.replace(traced, run=run)
-    if searched is None or beside is None:
-        return traced
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
-    if not confirmed.rejected:
-        left = dataclasses.replace(left, test=confirmed)
-        return LoopStages("none", screened, left, traced.sds, unused=unused_inputs(given.runs), run=run)
+    noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
+    if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
+        return None
+    traced = dataclasses.replace(traced, run=run)
     if not run.contradicts or traced.verdict == "place":
         return traced
     if traced.verdict == "mechanism":
         return dataclasses.replace(traced, verdict="place")
     mechanism = find_mechanism(
-        screened.base.space, windows.runs, base, left, ladder, screened.bases, beside, traced.predicted,
+        screened.base.space, windows.runs, base, left, searched.ladder, screened.bases, beside, traced.predicted,
         windows.settings,
     )  # fmt: skip
     level = "place" if mechanism is None or mechanism.fails else "mechanism"

@@ -76,11 +76,7 @@ def find_mechanism(
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
     # Families that the curve cannot separate from its own may predict better by an effect.
     other_families = [f for f in location_families if f not in alike and explained[alike[0]] == by_curve]
-    by_name = [
-        f
-        for f in (*alike, *other_families)
-        if f in best and (not curved or by_effects[f] >= HALF * most)
-    ]
+    by_name = [f for f in (*alike, *other_families) if f in best and (not curved or by_effects[f] >= HALF * most)]
     blocks = [
         mask
         for blocks_by_name in blocks_room.predictable_blocks(runs, space.bare).values()

@@ -54,19 +54,22 @@ class LogSimulation:
         observe: Any = problem.observe
         residual, jacobian, _ = observe.at(problem, z, active)
         rows, count = problem.data.weight.shape
-        nothing = jnp.zeros((rows * count, 0)), jnp.zeros((0,))
+        no_signals: Any = None
         linear = HistoriesLinearization(
-            jnp.asarray(residual), jnp.asarray(jacobian), *nothing, problem.data.weight / problem.data.sd, None,
-            observe.rows_of, observe.knots, observe.time, jnp.zeros(rows),
-            channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
+            jnp.asarray(residual), jnp.asarray(jacobian), jnp.zeros((rows * count, 0)), jnp.zeros(0),
+            problem.data.weight / problem.data.sd, no_signals, observe.rows_of, observe.knots, observe.time,
+            jnp.zeros(rows), channels=channels.channel_names(problem.channels),
+            magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
         test, count = windows.test, len(windows.test.null.single)
-        chance = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+        chance = jnp.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
         null = dataclasses.replace(test.null, white=chance)
-        strongest = dataclasses.replace(test.found, white=np.asarray(linear.memory()))
+        strongest = dataclasses.replace(test.found, white=linear.memory())
         shares = {**test.settings.shares, "white": min(test.settings.shares.values())}
         settings = dataclasses.replace(test.settings, shares=shares)
-        return Diagnosis(linear, windows.scores, dataclasses.replace(test, found=strongest, null=null, settings=settings))
+        return Diagnosis(
+            linear, windows.scores, dataclasses.replace(test, found=strongest, null=null, settings=settings)
+        )
 
 
 def simulate_models(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> LogSimulation:

@@ -12,12 +12,12 @@ import functools
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-import equinox as eqx
 from calibration.data import Columns, Names
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -28,7 +28,6 @@ from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
 from calibration.inference.problem import Data, Observation, Problem, data_from_readings
 from calibration.inference.shown_states import RunWindows
 from calibration.inference.weak_form import (
-    EquationTerms,
     WeakFormFit,
     covariance_factor,
     derivative_weights,
@@ -46,6 +45,8 @@ from mmrjax.numerics.linear_equations import solve
 TOGETHER = 128
 #: Number of effects that are fitted before the rest counts as a disturbance.
 FITTED = 4
+#: Variables of curves that follow from the states if no channel shows them.
+UNSHOWN = ("speed_motor", "current")
 
 
 class Integrals(eqx.Module):
@@ -187,8 +188,8 @@ class Windows(SettledRuns):
     ) -> WindowsLinearization:
         r, jacobian, _ = _evaluate(self, problem.coordinates, data, z)
         scale = data.weight / data.sd
-        changes = {"signatures": self.linear.signatures * scale.ravel()[:, None], "scale": scale}
-        return dataclasses.replace(self.linear, residual=r, jacobian=jacobian, **changes)
+        signatures = self.linear.signatures * scale.ravel()[:, None]
+        return dataclasses.replace(self.linear, residual=r, jacobian=jacobian, signatures=signatures, scale=scale)
 
     def operating_points(self, robot: Robot) -> None:
         return None
@@ -252,7 +253,8 @@ class Windows(SettledRuns):
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         linear = self.linear
         ways = {name: np.sign(linear.variable(name)) for name in WAYS}
-        table = {name: np.asarray(x) for name, x in self.table.items()}
+        table = {bases_room.VARIABLES[v]: linear.variable(v) for v in UNSHOWN}
+        table |= {name: np.asarray(x) for name, x in self.table.items()}
         arguments = table, linear.at_points(included).astype(float), robot, None, ways
         return (*bases_room.curve_families(*arguments), *bases_room.window_families(*arguments))
 
@@ -303,9 +305,10 @@ def problem_of_windows(
     def linearised(unknown: np.ndarray) -> WindowsLinearization:
         factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
         white = np.stack([np.linalg.inv(x) for x in factors])
-        integrals = Integrals(*map(jnp.asarray, (windows.rows, windows.weight, slope, white)), places, count)
+        arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
+        integrals = Integrals(arrays[0], arrays[1], arrays[2], arrays[3], places, count)
 
-        def whole(f: np.ndarray, y: np.ndarray) -> np.ndarray:
+        def whole(f: Any, y: Any) -> np.ndarray:
             return np.asarray(integrals(jnp.asarray(f), jnp.asarray(y))).reshape(-1, f.shape[-1])
 
         errors = whole(fit.read.f[..., None], fit.read.y[..., None])[:, 0]
@@ -362,8 +365,9 @@ def _unexplained(
     unit = [np.tile(np.sum(w.weight**2 / w.steps, 1)[:, None], len(places)) for w in parts]
     counts = weight[:, places[0]] > 0
     free = counts.sum() / max(counts.sum() - (fit.z.size + FITTED) / len(places), 1.0)
-    defect, noise, unit = (np.concatenate(x)[counts] for x in (plain, noise, unit))
-    return disturbance_intensities(defect * np.sqrt(free), noise, unit)
+    of_windows = (np.concatenate(x)[counts] for x in (plain, noise, unit))
+    defect, variance, per_intensity = of_windows
+    return disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
 
 
 def _stacked(cut: list[RunWindows]) -> tuple[RunWindows, np.ndarray]:
