@@ -40,6 +40,7 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
+from calibration.discovery.log_simulation import LogSimulation, simulate_models
 from calibration.discovery.loop_notes import (
     AlternativeValue,
     Mechanism,
@@ -72,7 +73,6 @@ from calibration.discovery.score_tests import StrongestStatistics, bootstrap_sta
 from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
-from calibration.discovery.simulation import LogSimulation, simulate_models
 from calibration.discovery.standing import judge_names
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room

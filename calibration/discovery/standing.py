@@ -295,6 +295,7 @@ def judge_each_name(
         better: candidates that are the better explanation but not of a plausible size.
     """
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
+    over_time = space.bare.observe.long or not space.bare.observe.reads
     most = searched.diagnosis or after
     lacks = _deficient_equations(space, most, bases)
     fewer = dict(zip(largest.effects, refit_without_each(space, largest, settings, searched.ladder), strict=True))
@@ -316,7 +317,7 @@ def judge_each_name(
                 space, best, effect, _augment_with_curves(space, after.linear, bases, chosen_curves, effect)
             )
             signatures = after.linear.signatures
-        run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
+        run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=over_time)
         full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
@@ -335,7 +336,7 @@ def judge_each_name(
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
-                "run" if space.bare.observe.long else "row",
+                "run" if over_time else "row",
                 *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
                 offset=_relative_zero_error(space, best, effect, settings),
             )
@@ -385,14 +386,14 @@ def _largest_variation(
         share: family-wise error of the critical value.
     """
     most = 0.0, "", math.inf
-    if space.bare.observe.long:
+    if space.bare.observe.long or not space.bare.observe.reads:
         return *most[:2], math.inf, math.inf
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     slot = space.free + best.active.index(effect)
     of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _variable_varies(linear, v, space.included)]
     for variable in variables:
-        values = linear.by_row_of_points(linear.curve_variable(bases_room.SHAFTS, variable)[0])
+        values = linear.curve_variable(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         projected_residual, scores = _projected_columns(jacobian, residual, changed)

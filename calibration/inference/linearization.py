@@ -232,10 +232,6 @@ class Linearization(eqx.Module):
         """Values of rows, repeated for each point of the row, shape (points,)."""
         return rows
 
-    def by_row_of_points(self, x: np.ndarray) -> np.ndarray:
-        """Mean of a quantity over the points of each row."""
-        return x.reshape(-1, self.rows).mean(0)
-
     def of_rows(self, points: np.ndarray) -> np.ndarray:
         """True for rows with at least one point in a mask, shape (rows,)."""
         return points

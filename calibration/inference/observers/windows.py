@@ -133,9 +133,6 @@ class WindowsLinearization(Linearization):
             return bases_room.ORDERS[name][0] * np.asarray(self.angle)
         return np.asarray(self.time if name == "time" else getattr(self.signals, name), float)
 
-    def by_row_of_points(self, x: np.ndarray) -> np.ndarray:
-        return self.integrals.mean(x)
-
     def runs(self) -> list[np.ndarray]:
         run = np.asarray(self.run)
         return [np.flatnonzero(run == k) for k in np.unique(run[run >= 0])]

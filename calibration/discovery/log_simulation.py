@@ -45,12 +45,12 @@ class LogSimulation:
         """True if the simulation gains too little of what the windows promised."""
         return not self.gained >= HALF * self.promised
 
-    def diagnosis(self, of: Candidate, windows: Diagnosis) -> Diagnosis:
+    def diagnosis(self, fit: Candidate, windows: Diagnosis) -> Diagnosis:
         """Diagnosis with the residuals of a simulated fit, and scores of the windows.
 
         The memory of noise is a normal deviate.
         """
-        problem, z, active = self.space.fit_of(of.active, of.z)
+        problem, z, active = self.space.fit_of(fit.active, fit.z)
         observe: Any = problem.observe
         residual, jacobian, _ = observe.at(problem, z, active)
         rows, count = problem.data.weight.shape
