@@ -45,6 +45,11 @@ def sentences(notes: Iterable[object]) -> Names:
     return tuple(map(describe, notes))
 
 
+def as_paragraph(texts: Iterable[str]) -> str:
+    """Texts as sentences of one paragraph. A sentence begins with a capital, a parameter does not."""
+    return " ".join(f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in texts if text)
+
+
 def report_in_words(tell: Callable[[str], None]) -> Callable[[object], None]:
     """Callback for remarks that passes their sentences to `tell`."""
     return lambda note: tell(describe(note))

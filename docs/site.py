@@ -151,7 +151,7 @@ def commands() -> str:
     parts = [
         "# Commands",
         "Each command writes a run folder and prints its path on the last line. `mmrjax COMMAND --help` prints the "
-        "common options. Options marked `*` appear with `--help-all` only, which commands with such options have.",
+        "common options. Options marked `*` appear with `--help-all` only.",
         MADE,
     ]
     for name, command in _commands():

@@ -35,7 +35,7 @@ FOLDER = DOCS / "rigs" / "robotino"
 rig = mm.read_robot(str(FOLDER / "robotino.toml"))
 runs = mm.read_runs(str(FOLDER / "settled.csv"), robot=rig)
 print(f"{len(runs)} runs on {', '.join(np.unique(runs['surface']))}; imposed: {rig.rig.imposed}")
-print(f"channels: {', '.join(rig.rig.channels)}; columns without a role: {', '.join(runs.unknown)}")
+print(f"channels: {', '.join(rig.rig.channels)}; columns not in use: {', '.join(runs.unknown)}")
 
 # %% [markdown]
 # ## The model without effects

@@ -37,16 +37,21 @@ app = typer.Typer(
 
 _NoCache = Annotated[
     bool,
-    typer.Option("--no-cache", help="Do not use the cache of compiled programs."),
+    typer.Option("--no-cache", help="Do not use the cache of compiled programs.", hidden=True),
 ]
 _Config = Annotated[
     Path | None,
     typer.Option(
-        "--config", help="TOML file with the keys of a config.resolved.toml. Options on the command line override it."
+        "--config",
+        hidden=True,
+        help="TOML file with the keys of a config.resolved.toml. Options on the command line override it.",
     ),
 ]
 _Trust = Annotated[
-    bool, typer.Option("--trust", help="Allow the file of --config to name code that runs: effects, or a scheduler.")
+    bool,
+    typer.Option(
+        "--trust", hidden=True, help="Allow the file of --config to name code that runs: effects, or a scheduler."
+    ),
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="Python file with your own effects. May be repeated.")
@@ -62,6 +67,7 @@ def _command(
     beside: type[config.Part],
     *,
     group: str,
+    common: str,
     example: str,
     room: str = "",
     failure: str = "the solver failed at some runs (status failed). Runs that stall or slide give 0",
@@ -75,6 +81,7 @@ def _command(
         kind: the configuration.
         beside: type of the options that change no number. A file may state its `[solver]` only.
         group: heading in `--help`.
+        common: options that `--help` shows, in this order. `--help-all` shows all.
         room: the module, if it has another name.
         failure: meaning of exit code 3.
         resolve: in place of `config.resolve_configuration`.
@@ -104,16 +111,15 @@ def _command(
                 return code
 
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
-        fields = [p for each in (beside, kind) for p in made.option_parameters(each)]
         everything = [
-            *(p for p in fields if p.name not in _LAST),
-            *(p for p in fields if p.name in _LAST),
+            *made.option_parameters((beside, kind), common.split()),
             keyword("config_file", annotation=_Config, default=None),
             keyword("trust", annotation=_Trust, default=False),
             keyword("no_cache", annotation=_NoCache, default=False),
             *made.help_all((kind, beside)),
         ]
-        run.__name__, run.__doc__ = name, described.__doc__
+        lines_joined = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(described) or "")
+        run.__name__, run.__doc__ = name, lines_joined
         run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
         run.__annotations__ = {p.name: p.annotation for p in everything}
         app.command(epilog=f"Example: {example}\n\nExit code 3: {failure}.", rich_help_panel=group)(run)
@@ -124,9 +130,6 @@ def _command(
 #: Headings of commands in `--help`, in their order there.
 MODEL, DATA, DESIGN, ELSEWHERE = "Model", "Data", "Design", "Export and reference"
 _AT_CORNER = "the solver failed at the worst corner"
-#: Options that stand at the end of each command.
-_LAST = ("out", "force")
-
 
 #: What `mmrjax` alone prints.
 FIRST_HOUR = """mmrjax simulates a small robot's drive and compares it with measured data. Begin with:
@@ -163,6 +166,7 @@ def _root(
     config.Simulate,
     config.GivenRuns,
     group=MODEL,
+    common="robot configuration voltage slope payload runs model out",
     example="mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
     "mmrjax simulate --profile patrol --battery --payload 5; mmrjax simulate --left 33 --right 15",
 )
@@ -181,6 +185,7 @@ def simulate() -> None:
     config.Sweep,
     config_campaign.StoreOptions,
     group=MODEL,
+    common="robot set configurations voltages payloads slopes export out",
     resolve=config_campaign.resolve_campaign,
     example="mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
     "--set 6T2A.ground.friction.static=0.6",
@@ -199,6 +204,7 @@ def sweep() -> None:
     config.Compare,
     config.ComparedRuns,
     group=DATA,
+    common="robot against columns model out",
     example="mmrjax compare measured --robot found/robot.toml --against nominal",
 )
 def compare() -> None:
@@ -213,6 +219,7 @@ def compare() -> None:
     config.Reproduce,
     config.FolderPart,
     group=MODEL,
+    common="robot model out",
     example="mmrjax reproduce --robot found/robot.toml --model track",
 )
 def reproduce() -> None:
@@ -227,6 +234,7 @@ def reproduce() -> None:
     config.Render,
     config.Picture,
     group=MODEL,
+    common="robot configuration voltage slope payload begin end slow",
     example="mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
 )
 def render() -> None:
@@ -242,6 +250,7 @@ def render() -> None:
     config.Calibrate,
     config.FittedRuns,
     group=DATA,
+    common="robot columns noise prior free fix verbose out",
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
     failure="the fit, or a fit with a block left out, did not converge, or the solver failed for a row. An "
     "inadequate fit, or a row in which the robot slides, gives 0",
@@ -262,6 +271,7 @@ def calibrate() -> None:
     config.Settle,
     config.SettledLog,
     group=DATA,
+    common="robot columns shortest drift out",
     example="mmrjax settle log.csv --robot rig.toml --out settled, then "
     "mmrjax loop settled/settled.csv --robot rig.toml",
     failure="does not occur, since no equations are solved",
@@ -279,6 +289,7 @@ def settle() -> None:
     config.Loop,
     config.LoopBeside,
     group=DATA,
+    common="robot columns noise prior forbid within verbose out",
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
     failure="the proposed fit did not converge, or --within ran out before a verdict (the same command with more "
     "time continues). Every verdict gives 0",
@@ -296,6 +307,7 @@ def loop() -> None:
     config.Sensitivity,
     config.FolderPart,
     group=DESIGN,
+    common="robot method outputs parameters voltages slopes evaluations out",
     example="mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000",
 )
 def sensitivity() -> None:
@@ -311,6 +323,7 @@ def sensitivity() -> None:
     config.Resonance,
     config.FolderPart,
     group=MODEL,
+    common="robot configuration voltages payloads slope set out",
     example="mmrjax resonance --configuration 6T2A --voltages 10:40:0.5 --payloads 0,4,8 "
     "--set running_gear.guide_recess=1e-4",
 )
@@ -329,6 +342,7 @@ def resonance() -> None:
     config.Climb,
     config.FolderPart,
     group=MODEL,
+    common="robot step stairs gap find levers-front levers-rear out",
     example="mmrjax climb --step 120 --levers-front 45 --levers-rear -8.5 --voltage 6; mmrjax climb --find step",
     failure="the simulation broke down (verdict failed). A robot that does not get over the obstacle gives 0",
 )
@@ -346,6 +360,7 @@ def climb() -> None:
     config.Check,
     config.FolderPart,
     group=DESIGN,
+    common="robot set changes out",
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
     failure=f"{_AT_CORNER}. If only a requirement is missed, the code is 0",
 )
@@ -359,8 +374,9 @@ def check() -> None:
 
 @_command(
     config.Size,
-    config.FolderPart,
+    config.VerbosePart,
     group=DESIGN,
+    common="robot objective pareto motors verbose out",
     example="mmrjax size requirements.toml --pareto mass,energy",
     failure=f"{_AT_CORNER} of the best design. If no design meets all requirements, the code is 0",
 )
@@ -376,6 +392,7 @@ def size() -> None:
     config.Export,
     config.FolderPart,
     group=ELSEWHERE,
+    common="to data configuration joint out",
     example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
     failure="does not occur: runs that do not settle are left out of the comparison",
     room="export_drive",
@@ -472,6 +489,9 @@ def rig_check(
     columns: _Columns = None,
     effects: _Effects = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of text.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print every table and remark instead of about five lines.")
+    ] = False,
     no_cache: _NoCache = False,
 ) -> int:
     """Check a rig's file, and data for it.
@@ -484,7 +504,7 @@ def rig_check(
     _start_jax(no_cache)
     from sweeps.commands import rig_check as room
 
-    return room.check_rig_file(file, data, tuple(effects or ()), json, columns)
+    return room.check_rig_file(file, data, tuple(effects or ()), json, columns, verbose)
 
 
 @app.command(

@@ -57,7 +57,7 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
         default: value if not stated.
         description: meaning without the unit (the name ends with the unit).
         extra: `usual`, the meaning of a default of None, in words. `flag`, its option, if it differs from its name.
-            `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`.
+            `solver`, how its command solves: a key of `[solver]`.
             `verbatim`, a list each of whose texts may have commas. `metavar` of an argument. `format`, such as path.
             `minimum`, where the command asks for more than the field. `executes`, whose value is code that is run,
             or leads to such: a file may state it with `--trust` only. `argument`, if it is no option.
@@ -88,6 +88,12 @@ class FolderPart(Part):
 
     out: Path | None = option_field(None, "The run folder", usual="runs/COMMAND-TIME")
     force: bool = option_field(False, "Replace an existing run folder")
+
+
+class VerbosePart(FolderPart):
+    """Amount of text that a command prints. It changes no number."""
+
+    verbose: bool = option_field(False, "Print every table and remark instead of about five lines")
 
 
 class Measured(FolderPart):
@@ -391,7 +397,7 @@ class MembersPart(Part):
     )
 
 
-class FittedRuns(MembersPart, Measured):
+class FittedRuns(MembersPart, Measured, VerbosePart):
     """Options of `calibrate` that change no number."""
 
 
@@ -401,7 +407,6 @@ class LoopBeside(FittedRuns):
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
         "10min", "Wall-clock limit, such as 90s, 5min or 1h. The best result at that time is reported"
     )
-    verbose: bool = option_field(False, "Print every table and remark of the page instead of five lines")
 
     @property
     def seconds(self) -> float:

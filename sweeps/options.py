@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -99,21 +99,25 @@ def _default_text(name: str, fact: Json) -> str:
     )
 
 
-def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
-    """A function parameter for each field of a command that can be chosen, with default None."""
-    for name, fact in schema_facts(kind).items():
-        if "const" in fact:  # one choice is none
-            continue
+def option_parameters(kinds: Iterable[type[BaseModel]], common: Sequence[str]) -> Iterator[inspect.Parameter]:
+    """A function parameter for each field of a command that can be chosen, with default None.
+
+    The `common` options come first. `--help` hides the others.
+    """
+    facts = {name: fact for kind in kinds for name, fact in schema_facts(kind).items() if "const" not in fact}
+    words = {name: option_of_field(name, fact).removeprefix("--") for name, fact in facts.items()}
+    places = {word: place for place, word in enumerate(common)}
+    for name in sorted(facts, key=lambda name: places.get(words[name], len(places))):
+        fact, word = facts[name], words[name]
         default, annotation = None, _option_type(fact) | None
         if fact.get("argument"):
             declared: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
             if "default" not in fact:
                 default, annotation = inspect.Parameter.empty, _option_type(fact)
         else:
-            word = option_of_field(name, fact)
             pair = fact.get("type") == "boolean" and fact.get("default") is not False
-            names = f"{word}/--no-{word.removeprefix('--')}" if pair else word
-            declared = typer.Option(names, help=option_help(name, fact), hidden=bool(fact.get("solver")))
+            names = f"--{word}/--no-{word}" if pair else f"--{word}"
+            declared = typer.Option(names, help=option_help(name, fact), hidden=word not in places)
         keyword = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, declared])
 
@@ -150,20 +154,14 @@ def _parse_option(name: str, fact: Json, value: Any) -> Any:
 
 
 def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
-    """The option that also shows solver options, for a command that has them."""
-    hidden = [
-        option_of_field(name, fact)
-        for kind in kinds
-        for name, fact in schema_facts(kind).items()
-        if fact.get("solver")
-    ]
-    if hidden:
-        option = typer.Option(
-            "--help-all", is_eager=True, callback=_show_full_help,
-            help=f"Also show {', '.join(hidden)}, which \\[solver] of --config may contain.",
-        )  # fmt: skip
-        kind = inspect.Parameter.KEYWORD_ONLY
-        yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
+    """The option that shows every option of a command."""
+    in_table = [option_of_field(n, f) for kind in kinds for n, f in schema_facts(kind).items() if f.get("solver")]
+    table = f" \\[solver] of --config may contain {', '.join(in_table)}." * bool(in_table)
+    option = typer.Option(
+        "--help-all", is_eager=True, callback=_show_full_help, help=f"Show all options and exit.{table}"
+    )
+    kind = inspect.Parameter.KEYWORD_ONLY
+    yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
 
 
 def _show_full_help(context: typer.Context, wanted: bool) -> None:

@@ -408,7 +408,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path, robot, kind, name):
         parquet.write_table(source, tmp_path / "log.parquet")
         source = tmp_path / "log.parquet"
     columns = {**COLUMNS, "motor_speed_rpm": name} if name == "rpm" else {**COLUMNS, "motor_speed_rpm": None}
-    with pytest.raises(InputError, match=f"{name}: (has the same name as another signal|got a name of 2 signals)"):
+    with pytest.raises(InputError, match=f"{name}: (has the same name as another signal|the name fits 2 signals)"):
         records.read_runs(source, robot, columns={k: v for k, v in columns.items() if v})
 
 

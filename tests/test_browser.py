@@ -49,6 +49,9 @@ PAGES = {
     "found": "climb --find gap --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4",
     "path": "simulate --left 24 --right -12 --slope 10 --heading 30 --model drive --duration 2",
 }
+#: Tables of a phone, but for long ones, that scroll sideways, by name.
+SIDEWAYS = """innerWidth > 600 ? [] : [...document.querySelectorAll(".scroll > table")].filter(
+  t => t.rows.length < 60 && t.scrollWidth > t.parentElement.clientWidth + 1).map(t => t.id)"""
 FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p>
 <p style="color:#bbb">faint</p><p style="font-size:7px">tiny</p>
 <div style="position:relative;height:40px"><span style="position:absolute;top:0">one text</span>
@@ -89,6 +92,8 @@ def wrong(browser, page):
     for width, media, dark in VIEWS:
         browser.open(page, width, media=media, dark=dark)
         kinds = {kind: where for kind, where in browser.value(MEASURE).items() if where}
+        if tables := browser.value(SIDEWAYS):
+            kinds["tables"] = tables
         if said := browser.complaints():
             kinds["complaints"] = said
         if kinds:

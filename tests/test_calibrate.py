@@ -148,6 +148,16 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     assert [" by slope " in line or " by voltage and configuration " in line for line in table] == [True, True]
 
 
+def test_a_terminal_has_few_lines_of_a_calibration(found, capsys):
+    """The answer, the verdict, what moved most, errors of rows left out, and what to check."""
+    print_document(calibration_report.calibration_document(found, "nominal"), brief=True)
+    answer, verdict, moved, *_, check = capsys.readouterr().out.splitlines()
+    farthest = max((p for p in found.parameters.values() if not p.held_by_prior), key=lambda p: abs(p.shift))
+    assert len(_) <= 1 and answer.startswith("The fit is") and verdict == f"{found.adequacy.statement}."
+    assert moved.startswith("These runs determine ") and f"{farthest.value:.3g} ± {farthest.sd:.2g}" in moved[:130]
+    assert f"{len(found.notes)} further remarks" in check
+
+
 def test_errors_and_rows_have_one_spelling_over_all_results():
     errors = ChannelErrors(3, 2.5, 4.0, 1.1, 0.02)
     assert errors["rms_percent"] == errors.rms_percent == 2.5 and errors["rows"] == 3

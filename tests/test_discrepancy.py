@@ -15,7 +15,14 @@ from worlds import settled, tables
 
 from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
-from calibration.discovery.discrepancy import BaseCurve, fit_discrepancy, refine_window, similar_variables
+from calibration.discovery.discrepancy import (
+    BaseCurve,
+    fit_discrepancy,
+    location_columns,
+    refine_window,
+    similar_variables,
+)
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.projection import balance_error_by_row
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import fit_smooth_curve
@@ -251,6 +258,8 @@ def test_a_window_is_refined_to_its_rows():
     assert (found.low, found.high) == (14, 25) and explained > 60
     half, _ = refine_window(linear, "track", "order", np.arange(rows) % 2 == 0)
     assert (half.low, half.high) == (15, 25)
+    columns = location_columns(linear, (), DiscrepancyLocation("track", str(found), (), (), 0.0, 0.0))
+    assert abs(np.corrcoef(columns[:, 0], missing)[0, 1]) == pytest.approx(1.0)
 
 
 def test_a_curve_that_several_ask_for_is_fitted_once(monkeypatch):

@@ -79,6 +79,13 @@ def test_a_design_that_meets_all_that_can_be_met_is_not_red():
     assert set(verdicts) == {("meets the others", "fair"), ("misses", "bad")}
 
 
+def test_a_terminal_has_few_lines_of_a_sizing(capsys):
+    """All tables are on the page."""
+    terminal_renderer.print_document(size(), brief=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "256 searches" in lines[1]
+
+
 def above_the_bench(rise):
     """The bench's rows, and what compares them with a simulation 4 % above them, the first row without one."""
     measured = records.read_runs("measured")
@@ -87,6 +94,19 @@ def above_the_bench(rise):
     simulated |= {c.column: error * measured[c.column] for c in measured.channels}
     simulated["status"] = np.where(np.isnan(error), "slides", "converged")
     return measured, *compare_readings(measured, simulated)
+
+
+def test_a_comparison_draws_the_band_of_stated_sds_and_names_no_other():
+    measured = records.read_runs("measured")
+    sds = {"speed_sd_mm_s": np.full(len(measured), 7.0)}
+    for columns, named in (({}, False), (sds, True)):
+        runs = dataclasses.replace(measured, columns=measured.columns | columns)
+        table, summary = compare_readings(runs, {**runs.columns, "status": np.repeat("converged", len(runs))})
+        found = Comparison(table, summary, runs.channels, "measured", "steady", "nominal (PM)")
+        (figure,) = comparison_report.comparison_document(found).sections[1].blocks
+        assert ("Band: " in figure.caption) == named
+    bands = [axes.patches[0].get_y() for axes in figure.draw().axes]
+    assert min(bands) == bands[-1] == -14.0 and max(bands) == 0.0
 
 
 def comparison(log=False):
@@ -241,5 +261,5 @@ def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
 
 def test_the_page_of_check_shows_its_figure_with_its_finding(tmp_path):
     page = page_renderer.write_report_page(tmp_path, check()).read_text(encoding="utf-8")
-    assert drawn(page) == {"margins", "chart_of_corners"}
+    assert drawn(page) == {"margins", "chart_of_corners", "drive_plane"}
     assert 'aria-label="2 of 3 requirements are missed: ' in page

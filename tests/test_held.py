@@ -158,7 +158,7 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
         BadData, match=r"row 1, load_torque_Nm: got 1 although held is 1; expected 0, .* output_torque"
     ):
         records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
-    with pytest.raises(BadData, match=r"row 16, held: got 0\.5; expected 1 where a clamp holds the output, else 0"):
+    with pytest.raises(BadData, match=r"row 16, held: got 0\.5; expected 1 if a clamp holds the output, otherwise 0"):
         records.read_runs({**table(), "held": np.r_[np.ones(15), 0.5]}, robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
     with pytest.raises(

@@ -44,7 +44,7 @@ def table(tmp_path, text, robot):
 
 DEEP = "a." * 4_999 + "a"
 TOML = {
-    "nested": ("x = " + "[" * 5000 + "]" * 5000, "nested too deep; expected at most 16 levels"),
+    "nested": ("x = " + "[" * 5000 + "]" * 5000, "nested too deeply; expected at most 16 levels"),
     "400 digits": ("[motor]\nresistance = 1" + "0" * 400, "a whole number beyond 64 bits"),
     "5000 digits": ("[motor]\nresistance = 1" + "0" * 5000, "not a readable TOML file"),
     "a long header": (f"[{DEEP}]\nx = 1", "nested too deep"),

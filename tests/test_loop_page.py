@@ -190,7 +190,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
         head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
     )
-    assert "May I use it?" in head and "new law, band of 95 %" in head
+    assert "May I use it for …" in head and "new law, band of 95 %" in head
     with figure_settings():
         (axes,) = loop_figures.draw_effect_laws(
             got.found, loop_report.rows_for_figures(got.found), room.changes_by_effect(got.found)

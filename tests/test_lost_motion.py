@@ -12,6 +12,7 @@ from calibration.discovery import discover
 from calibration.inference.lost_motion import lost_motion_notes
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
+from sweeps.commands import loop as command
 from sweeps.commands.rig_check import check_rig_file
 
 RIG = """base = "none"
@@ -127,18 +128,33 @@ def test_check_of_a_log_reports_lost_motion(tmp_path, capsys):
 def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
     """The search took minutes, and its answer was a driver's characteristic."""
     rejected = SimpleNamespace(test=SimpleNamespace(rejected=True))
-    steps = []
+    steps, base = [], SimpleNamespace(cluster=None, base=SimpleNamespace(space=None))
 
     def keep(name, make):
         steps.append(name)
-        return ("base", rejected) if name == "bootstrap 0" else ("base", rejected, SimpleNamespace(diagnosis=None))
+        return (base, rejected) if name == "bootstrap 0" else (base, rejected, SimpleNamespace(diagnosis=None))
 
     monkeypatch.setattr(discover, "_confirm_gains", lambda *stages: None)
     task = SimpleNamespace(
         settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, shows_unmodelled_backlash=lost
     )
-    searched = discover._search_until_clean(task, SimpleNamespace(cluster=None), None, ["a ranking"])[2]
-    assert (searched is None) == lost and steps == ["bootstrap 0", "search 0"][: 1 if lost else 2]
+    monkeypatch.setattr(discover.findings, "rank_library", lambda *_: None)
+    searched = discover._search_until_clean(task, base, None, [])[2]
+    assert (searched is None) == lost
+    assert steps == (["bootstrap 0"] if lost else ["bootstrap 0", "ranking", "search 0"])
+
+
+def test_a_loop_that_runs_out_of_time_answers_with_the_lost_motion(tmp_path, mmrjax, monkeypatch):
+    read(tmp_path, servo(play=1.0))
+
+    def out_of_time(*_, keep, **__):
+        keep("base", lambda: SimpleNamespace())
+        raise command.OutOfTime
+
+    monkeypatch.setattr(command, "discover", out_of_time)
+    monkeypatch.setattr(command, "_report_stored_stages", lambda *_: None)
+    code, _, err = mmrjax("loop log.csv", "--robot", "rig.toml", "--no-report", "--out", "found", "--within", "20s")
+    assert code == 3 and "reversals about" in " ".join(err.partition("no verdict within 20 s")[2].split())
 
 
 def test_task_of_the_loop_knows_of_lost_motion(tmp_path):

@@ -187,7 +187,7 @@ def test_solvers_of_other_libraries_find_the_truth(bent, name):
     posed, truth = bent[0], jnp.asarray([0.7, 0.4, -0.2, 0.3])
     seen = posed.observation(truth)
     data = dataclasses.replace(posed.data, measured=seen.reading, centre=truth)
-    assert (posed.excess(seen, data) < -1).all()
+    assert (posed.adhesion_excess(seen, data) < -1).all()
     found, start, end = fit.search_with_solver(posed, truth[None] + 0.1, data, solvers.solver_by_name(name))
     assert found.converged[0] and found.steps[0] > 1
     assert_allclose(found.z[0], truth, atol=2e-3)

@@ -20,18 +20,16 @@ KINDS = {
     "calibrate": (config.Calibrate, config.MembersPart),
     "loop": (config.Loop, config.MembersPart),
     "export": (config.Export,),
+    "settle": (config.Settle,),
     "sensitivity": (config.Sensitivity,),
     "resonance": (config.Resonance,),
     "climb": (config.Climb,),
     "check": (config.Check,),
     "size": (config.Size,),
 }
-HIDDEN = {
-    "climb": {"--time-step"},
-    "sweep": {"--shard", "--scheduler"},
-    "calibrate": {"--population", "--solver", "--generations", "--members"},
-    "loop": {"--population", "--generations", "--members", "--replicates"},
-}
+CLI = Path(cli.__file__).read_text(encoding="utf-8")
+#: Most options that `--help` of a command shows, besides `--help` and `--help-all`.
+MOST = 8
 
 
 @pytest.fixture(scope="module")
@@ -88,16 +86,18 @@ def test_units_bounds_choices_and_defaults_are_read_off_the_field():
 
 
 @pytest.mark.parametrize("command", KINDS)
-def test_solver_options_are_hidden_until_all_are_asked_for(command, parameters, said):
-    hidden = {p.opts[0] for p in parameters[command].values() if getattr(p, "hidden", False)}
-    assert hidden == HIDDEN.get(command, set())
-    assert ("help_all" in parameters[command]) == bool(hidden)
-    if hidden:
-        short, whole = said(command, "--help"), said(command, "--help-all")
-        listed = [{line.split()[1] for line in text.splitlines() if "│ --" in line} for text in (short, whole)]
-        assert not listed[0] & hidden and listed[1] == listed[0] | hidden
-        assert f"Example: mmrjax {command}" in whole
-        assert said(command, "--help") == short  # nothing is left of it
+def test_help_shows_few_options_and_help_all_every_one(command, parameters, said):
+    """Those that the command calls common, so that a name that is no option fails."""
+    listed = [p for p in parameters[command].values() if p.opts[0].startswith("--") and p.name != "help_all"]
+    shown = [p.opts[0] for p in listed if not p.hidden]
+    called = re.search(rf'common="([^"]*)"(?:(?!common=).)*?def {command}\(', CLI, re.DOTALL)
+    assert shown == [f"--{word}" for word in called[1].split()] and 0 < len(shown) <= MOST
+    short, whole = said(command, "--help"), said(command, "--help-all")
+    of_help = [{line.split()[1] for line in text.splitlines() if "│ --" in line} for text in (short, whole)]
+    assert of_help[0] == {*shown, "--help-all", "--help"}
+    assert of_help[1] == {*(p.opts[0] for p in listed), "--help-all", "--help"}
+    assert f"Example: mmrjax {command}" in whole
+    assert said(command, "--help") == short  # nothing is left of it
 
 
 def _file(folder, text):

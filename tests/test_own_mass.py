@@ -199,7 +199,7 @@ def test_a_mass_that_varies_is_said_and_its_median_written(robot):
     (said, _) = own_mass.mass_notes(robot, runs)
     assert said == (
         "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. The fit used the mass of each row. "
-        "robot.toml contains the median, 14.35 kg, and does not reproduce the fit in rows of another mass"
+        "robot.toml contains the median, 14.35 kg, and does not reproduce the fit in rows with another mass"
     )
     assert float(own_mass.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
 
@@ -208,7 +208,7 @@ def test_a_total_without_its_payload_is_suspected(robot):
     runs = table()
     runs.columns["total_mass_kg"][:] = 13.1
     said = own_mass.mass_notes(robot, runs)
-    assert len(said) == 2 and all(s.endswith("; does total_mass_kg leave the payload out?") for s in said)
+    assert len(said) == 2 and all(s.endswith("; does total_mass_kg exclude the payload?") for s in said)
 
 
 def test_a_surface_other_than_the_robots_is_said(robot):
@@ -228,7 +228,9 @@ def test_a_mass_that_no_robot_has_is_refused(robot):
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
-    says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column, else remove the prior"
+    says = (
+        r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column, otherwise remove the prior"
+    )
     with pytest.raises(BadConfiguration, match=says):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
     own_mass.check_priors(["4W2T.mass"], robot, unweighed(table()))

@@ -161,12 +161,12 @@ def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
     with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc that calibrate and loop write"):
         room.read_posterior(path)
     path.write_text("nothing of the kind")
-    with pytest.raises(BadData, match="not a posterior that can be read"):
+    with pytest.raises(BadData, match="not a readable posterior"):
         room.read_posterior(path)
     skew = posterior.covariance.copy()
     skew[0, 1] = skew[1, 0] = 5.0  # more than their sds allow
     room.write_posterior(dataclasses.replace(posterior, covariance=skew), path)
-    with pytest.raises(BadData, match="not a valid covariance"):
+    with pytest.raises(BadData, match="the covariance is invalid"):
         room.read_posterior(path)
 
 
@@ -211,7 +211,7 @@ def _written(posterior, folder):
 def test_file_of_another_schema_is_refused(tmp_path):
     xarray = pytest.importorskip("xarray")
     xarray.Dataset({"x": 1.0}).to_netcdf(tmp_path / room.FILE, engine="scipy")
-    with pytest.raises(BadData, match=r"not a posterior that can be read \(ValueError: schema None"):
+    with pytest.raises(BadData, match=r"not a readable posterior \(ValueError: schema None"):
         room.read_posterior(tmp_path / room.FILE)
 
 

@@ -87,8 +87,8 @@ def test_points_that_the_motors_do_not_settle_between_are_a_log(tmp_path):
 def test_rows_that_nothing_was_recorded_in_are_left_out(tmp_path):
     data, file = made("odrive", tmp_path)
     read = runs.read_runs(data, robot_file.read_robot(file))
-    assert any("2 rows without any reading left out" in note for note in read.notes)
-    assert any("5 rows at the end left out, because the clock restarts at 0" in note for note in read.notes)
+    assert any("left out: 2 rows without any reading" in note for note in read.notes)
+    assert any("left out: 5 rows at the end, because the clock restarts at 0" in note for note in read.notes)
     assert (np.diff(read["time_s"]) > 0).all() and read["time_s"][-1] == pytest.approx(399 * 0.00625, rel=0.05)
 
 

@@ -424,7 +424,7 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
 def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
     data = precise_table(tmp_path / "runs.csv")
-    _, told, _ = ends(mmrjax("rig check motor.toml", data), code=0)
+    _, told, _ = ends(mmrjax("rig check motor.toml", data, "--verbose"), code=0)
     assert re.search(r"supply_voltage_V, yours U \[V\] +imposed +18 +-23 +24", told)
     assert re.search(r"motor_current_A, yours Strom \[mA\] +channel motor_current", told)
 

@@ -22,6 +22,7 @@ from mmrjax.model.rig import Instrument
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
+from sweeps.report.terminal_renderer import print_document
 from tests.commands import ends, read_rig
 
 KINDS = tuple(rig_new.KINDS)
@@ -506,7 +507,7 @@ def bench(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_rig_check_says_what_a_file_is(mmrjax, bench):
-    code, out, err = mmrjax("rig check my-rig.toml")
+    code, out, err = mmrjax("rig check my-rig.toml --verbose")
     assert (code, err) == (0, "")
     assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
     assert "10 lines with the template's example number" in out
@@ -533,11 +534,20 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
     assert "are not determined by these runs" in found["statement"]
 
 
-def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
-    _, out, _ = ends(mmrjax("rig check my-rig.toml runs.csv"), "total_current_A, yours total_current_mA", code=0)
+def test_rig_check_of_data_says_the_same_in_words(tmp_path, bench, capsys):
+    check = rig_check.examine_rig_file(tmp_path / "my-rig.toml", str(tmp_path / "runs.csv"))
+    print_document(rig_check.check_document(check), brief=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 5 and lines[0] == f"my-rig.toml: {check.statement()}"
+    assert "12 rows. Columns in use: supply_voltage_V, total_current_mA, motor_speed_rpm" in lines[2]
+    assert "Not in use: output_torque_Nm, room." in lines[2]
+    assert "10 lines with the template's example number" in lines[3] and "further remark" in lines[3]
+    print_document(rig_check.check_document(check))
+    out = capsys.readouterr().out
+    assert "total_current_A, yours total_current_mA" in out
     assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated from the scatter)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
-    assert "room: without a role" in out and "add output_torque to channels" in out
+    assert "room: not used by the model" in out and "add output_torque to channels" in out
 
 
 def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tmp_path):

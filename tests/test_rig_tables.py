@@ -193,7 +193,7 @@ REFUSED = {
     "voltage against speed": (
         lambda: bench(shown=("total_current", "motor_voltage")),
         "motor_speed_rpm,motor_voltage_V,total_current_A\n3000,-17,0.4\n",
-        r"motor_voltage_V: got -17 at an imposed motor_speed_rpm of 3000, of the other sign",
+        r"motor_voltage_V: got -17 at an imposed motor_speed_rpm of 3000, with the wrong sign",
     ),
     "an angle that wraps": (
         lambda: bench("voltage", ("output_angle",)),

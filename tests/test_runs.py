@@ -197,7 +197,7 @@ REFUSED = {
     ),
     "misspelt column": (
         HEADER.replace("slope_deg", "slope_degr") + "\n" + ROW,
-        r"slope_deg is missing; is slope_degr meant",
+        r"slope_deg is missing; did you mean slope_degr",
     ),
     "misspelt optional column": (f"{HEADER},total_current_sd_AA\n{ROW},1", r"did you mean total_current_sd_A"),
     "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg is present 2 times"),
@@ -335,7 +335,7 @@ def test_copies_of_rows_are_said(tmp_path):
     )
     assert (
         plain.notes == ()
-        and "runs.csv: rows 1 and 3 have the same conditions and readings, and so 1 more. " in copied.notes[0]
+        and "runs.csv: rows 1 and 3 have the same conditions and readings, as do 1 more. " in copied.notes[0]
     )
 
 

@@ -189,7 +189,7 @@ REFUSED = {
     "track": (["--model", "track"], 2, r"got --model track"),
     "duration": (["--duration", "5"], 2, r"--duration cannot be combined with --profile"),
     "posterior": (["--posterior", "50"], 2, r"--posterior cannot be combined with --profile"),
-    "slope twice": (["--slope", "0"], 2, r"--slope: got it in addition to mission.csv, which contains slope_deg"),
+    "slope twice": (["--slope", "0"], 2, r"--slope: mission.csv contains slope_deg too"),
     "empty battery": (["--battery", "--discharge", "2300"], 2, r"--discharge: got 2300 mAh; the battery is empty at 2200 mAh"),
     "no such profile": (["--profile", "petrol"], 4, r"petrol: no such file and no packaged profile; .*patrol"),
 }  # fmt: skip
@@ -315,7 +315,7 @@ def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, 
 
 BAD_PLANS = {
     "an output of a run": (PLAN.replace('"energy_Wh"', '"slip"'), r"plan.toml, outputs: got slip;"),
-    "a condition twice": (PLAN + "slope_deg = [0, 5]\n", r"plan.toml, slope_deg: got it in addition to mission.csv, which contains it"),
+    "a condition twice": (PLAN + "slope_deg = [0, 5]\n", r"plan.toml, slope_deg: mission.csv contains it too"),
     "another model": ('model = "steady"\n' + PLAN, r"profile has an effect only with model drive"),
     "a duration": ("duration_s = 3\n" + PLAN, r"duration_s cannot be combined with profile"),
     "no such profile": (PLAN.replace("mission.csv", "none.csv"), r"none.csv: no such file and no packaged profile"),

@@ -213,7 +213,7 @@ def test_a_unit_that_a_source_states_is_not_read_as_another(tmp_path, robot):
 def test_signals_are_named_by_the_end_of_their_path_and_by_their_place(tmp_path, robot):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
     assert find_signal(opened(tmp_path / "log.h5").signals, "volts", "log.h5").path == "/drive/volts"
-    with pytest.raises(BadData, match=r"log.h5, t: got a name of 2 signals, /drive/t, /encoder/t"):
+    with pytest.raises(BadData, match=r"log.h5, t: the name fits 2 signals, /drive/t, /encoder/t"):
         find_signal(opened(tmp_path / "log.h5").signals, "t", "log.h5")
     below = records.read_runs(f"{tmp_path / 'log.h5'}::/drive", robot, columns=COLUMNS)
     assert len(below) == 200 and not below.has("motor_speed_rpm")

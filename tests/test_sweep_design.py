@@ -167,7 +167,7 @@ def test_points_of_a_grid_are_every_combination_the_last_axis_fastest(nominal):
             "motor.resistance": {"start": 0.5, "stop": 2, "number": 3, "scale": "log"},
         },
     )
-    found = plan.design.block(tuple(slice(0, n) for n in plan.design.shape))
+    found = plan.design.values_in_slices(tuple(slice(0, n) for n in plan.design.shape))
     assert_allclose(found, list(itertools.product([0, 1], [0, 10, 20], [0.5, 1, 2])))
     assert np.array_equal(plan.design.at(np.array([17, 4])), found[[17, 4]])
 
@@ -177,7 +177,7 @@ def test_grid_is_crossed_with_every_sample(nominal):
         nominal, axes={"voltage": [15, 24]},
         samples={"design": "random", "number": 5, "over": {"payload": {"distribution": "uniform", "low": 0, "high": 8}}},
     )  # fmt: skip
-    found = plan.design.block((slice(0, 2), slice(0, 5)))
+    found = plan.design.values_in_slices((slice(0, 2), slice(0, 5)))
     assert found[:, 0].tolist() == [15] * 5 + [24] * 5
     assert np.array_equal(found[:5, 1], found[5:, 1]) and len(set(found[:5, 1])) == 5
     assert plan.design.dimensions == ("voltage", "sample")
@@ -202,9 +202,9 @@ def test_blocks_hold_each_point_once_and_no_more_than_stated(shape, most):
 def test_points_of_blocks_are_those_of_the_whole(nominal):
     whole = sampled(nominal, number=97)
     both = Design({"voltage": np.array([15.0, 24.0])}, whole.samples)
-    every = both.block((slice(0, 2), slice(0, 97)))
+    every = both.values_in_slices((slice(0, 2), slice(0, 97)))
     blocks = Blocks.of(both.shape, 30)
-    assert np.array_equal(np.concatenate([both.block(blocks.box(k)) for k in range(len(blocks))]), every)
+    assert np.array_equal(np.concatenate([both.values_in_slices(blocks.box(k)) for k in range(len(blocks))]), every)
 
 
 # --- what is refused ------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
     drawn = DrawnSamples(posterior.names, posterior.draw(DRAWS, 0).T)
     job = run.job_of_run_table(robot, runs, chunked(5), drawn)
     assert job.plan.design.shape == (4, DRAWS) and job.blocks.size == (1, 4)
-    points = job.plan.design.block((slice(1, 3), slice(2, 5)))
+    points = job.plan.design.values_in_slices((slice(1, 3), slice(2, 5)))
     assert_array_equal(points[:, 0], np.repeat([1.0, 2.0], 3))
     assert_array_equal(points[:, 1:], np.tile(posterior.draw(DRAWS, 0)[2:5], (2, 1)))
 

@@ -247,9 +247,7 @@ def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_pat
     robot, each = rig(DRIVEN), [1] * len(of_turns.split(","))
     header = f"supply_voltage_V,slope_deg,{of_turns},{SPEEDS}"
     rows = [(24, slope, *each, 900, 900) for slope in (0, 5, -3)]
-    with pytest.raises(
-        BadData, match=r"row 2, slope_deg: got 5 in a table of settled turns, and so in 2 of 3 .* drive"
-    ):
+    with pytest.raises(BadData, match=r"row 2, slope_deg: got 5 in a table of settled turns, as in 2 of 3 .* drive"):
         table(header, *rows, robot=robot)
     assert len(table(header, rows[0], robot=robot)) == 1
     assert records.read_runs(

@@ -694,18 +694,18 @@ def clustered(levels, **other):
         (
             clustered({"1": -14.42, "2": 3.6}, alike=("direction_deg",)),
             "residuals of speed differ between the levels of wheel (simulated minus measured, by level: 1: -14 mm/s, 2: +3.6 mm/s, p = 2e-07), "
-            "a column without a role (as well by direction_deg). Give each level its own configuration, or find what "
+            "a column that the model does not use (as well by direction_deg). Give each level its own configuration, or find what "
             "differs between them",
         ),
         (
             clustered({"1": -1.0, "2": 1.0}, reversing=True, within="configuration", coarser=(("axle", 0.91),)),
             "residuals of speed differ between the levels of wheel within configuration, with opposite signs in the two directions of travel "
-            "(simulated minus measured, by level: 1: -1 mm/s, 2: +1 mm/s, p = 2e-07), a column without a role (axle alone "
+            "(simulated minus measured, by level: 1: -1 mm/s, 2: +1 mm/s, p = 2e-07), a column that the model does not use (axle alone "
             "91% of it). Give each level its own configuration, or find what differs between them",
         ),
         (
             clustered({}, correlation=-0.456),
-            "residuals of speed are correlated with wheel (rank correlation -0.46, p = 2e-07), a column without a role. Find "
+            "residuals of speed are correlated with wheel (rank correlation -0.46, p = 2e-07), a column that the model does not use. Find "
             "what changes with it",
         ),
     ],

@@ -140,6 +140,20 @@ def test_a_log_is_reproducible_and_its_effect_has_its_strength():
     )
 
 
+def test_an_effect_of_a_servo_is_sized_by_two_simulations(monkeypatch):
+    """A search for the amplitude took a simulation for each of its steps."""
+    monkeypatch.setattr(logs, "ROWS", 60)
+    monkeypatch.setattr(logs, "left_over", lambda rig, shown: 9.0)
+    rig, simulations = logs.rig(np.random.default_rng(7), logs.GOAL, 0.01, coarse=True), []
+    simulated = logs.histories
+    monkeypatch.setattr(logs, "histories", lambda *given: simulations.append(1) or simulated(*given))
+    one = logs.case(rig, "angle_friction", 9.0, 4)
+    assert len(simulations) == 2 and "angle_friction" in one.label["effects"][0]["class_oracle"]
+    _, base, (change,) = logs.slopes(rig, rig.p, (), [one.terms])
+    left = remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))
+    assert np.linalg.norm(left) == pytest.approx(9.0, rel=0.03)
+
+
 def line(kind, seed, verdict="none", classes=(), **more):
     held = {"refit": 1.2, "found": 1.05, "own": 1.3, "own_with_term": 1.0}
     truth = [] if kind == "clean" else [{"name": "churning", "class": "churning", "balance": "track", "sigmas": 9.0}]

@@ -14,21 +14,21 @@ from calibration.data.columns import TIME, Column
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, missing_readings
 from mmrjax.errors import count_noun
 
-#: Numbers of binary digits after which counters wrap; of a 32-bit counter also in seconds, from ms, µs and ns.
+#: Widths of counters that wrap [bit], and their periods. A 32-bit count of ms, µs or ns may be given in seconds.
 DIGITS = (15, 16, 24, 31, 32)
 PERIODS = (*(2.0**n for n in DIGITS), *(2.0**32 * one for one in (1e-3, 1e-6, 1e-9)))
-#: Usual steps that a counter may lack across its wrap.
+#: Largest step across a wrap, in usual steps.
 LACKING = 5.0
-#: Least share of rows that share their stamp with the row before, and largest share of stamps with other numbers of
-#: rows than the usual one or the next: beyond these the rows are no samples of an even clock.
+#: Rows are samples of an even clock if at least the first share repeats the stamp of the row before, and at most the
+#: second share of stamps has an unusual number of rows.
 SHARED, ODD = 0.1, 0.1
 
 
 def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """A counter without its wraps, and its period (0 if it does not wrap).
+    """Counter with its wraps removed, and its period (0 if it does not wrap).
 
-    A counter wraps if it falls from its last numbers to its first ones, within `LACKING` usual steps, and never goes
-    back otherwise.
+    A counter wraps if it falls only from its largest to its smallest numbers, by a step of at most `LACKING` usual
+    steps.
 
     Args:
         count: counter as logged, shape (rows,).
@@ -91,9 +91,9 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     return np.repeat(stamps, rows) + index * np.repeat(apart, rows), float(rows.mean())
 
 
-#: Day of a cell with a time alone, and length of a day [s].
+#: Day assumed for a time without a date, and length of a day [s].
 _SOME_DAY, _DAY = "1970-01-01T", 86400.0
-#: Seconds since 1970 between which a clock may count from there, 1990 and 2100; and seconds of one of other units.
+#: Clocks that read between these seconds since 1970 (1990 and 2100) count from 1970. Second: seconds per count.
 EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: A date as 25.11.2026.
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
@@ -103,7 +103,7 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     """The columns without empty rows, and a note with the number of these rows.
 
     A row is empty if all of its cells are missing, or if it is at the end of a log whose clock has returned to 0.
-    Such a logger writes all of its memory.
+    Such loggers write out their whole memory.
     """
     empty = np.arange(len(arrays))
     for raw in arrays.values:
@@ -113,7 +113,7 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
         is_kept[empty] = False
         arrays = arrays.rows(
             is_kept,
-            f"{count_noun(len(empty), 'row')} without any reading left out. Row numbers count only the others",
+            f"left out: {count_noun(len(empty), 'row')} without any reading. Row numbers count only the others",
         )
     column_names = [None if m is None else m.column for m in meanings]
     clock = next((raw for c, raw in zip(column_names, arrays.values, strict=True) if c in TIME), None)
@@ -124,19 +124,18 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     if not len(filled_rows) or filled_rows[-1] == len(count) - 1 or not np.nanmax(count) > 0:
         return arrays
     is_kept = np.arange(len(count)) <= filled_rows[-1]
-    note = f"{count_noun(int((~is_kept).sum()), 'row')} at the end left out, because the clock restarts at 0 there"
+    note = f"left out: {count_noun(int((~is_kept).sum()), 'row')} at the end, because the clock restarts at 0 there"
     return arrays.rows(is_kept, note)
 
 
 def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:
     """A column of time, converted to the time since the first row of each run, and notes on the changes.
 
-    A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
-    day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time. Such
-    numbers count s, ms, µs or ns since 1970, depending on their size. Times without a date that fall back by more
-    than half a day have passed midnight. A counter that wraps at the end of its digits goes on. Rows that share a
-    time stamp are spread evenly up to the next stamp. A column with a cell that is no time is returned unchanged, and
-    the reader rejects that cell.
+    A run begins at its first row. Its clock may show a time of day or the time since a controller started. Times of
+    day are in ISO 8601, have a date such as 25.11.2026, or are numbers beyond the largest time. Such numbers count s,
+    ms, µs or ns since 1970, depending on their size. Times without a date that fall back by more than half a day have
+    passed midnight. Wraps of a counter are removed. Rows that share a time stamp are spread evenly up to the next
+    stamp. A column with a cell that is no time is returned unchanged, and the reader rejects that cell.
 
     Args:
         name: name of the source.
@@ -191,7 +190,7 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
 
 
 def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
-    """Numbers of a clock without wraps and without shared time stamps, and notes on both."""
+    """Times of a clock with wraps and shared time stamps removed, and notes on both."""
     step = np.diff(count)
     if not len(step) or (step > 0).all() or not np.isfinite(step).all():
         return count, ()
@@ -199,7 +198,7 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
     recording = np.zeros(len(count), int) if run is None else run
     count, period = unwrap_counter(count, recording)
     if period:
-        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}. The time is counted on from there")
+        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}. The wraps are removed")
     count, rows = spread_shared_stamps(count, recording)
     if rows:
         notes.append(

@@ -18,10 +18,9 @@ from mmrjax.model.channels import Channel
 
 #: Ratio to the largest allowed value from which another unit is probable.
 FAR = 2.0
-#: Rounding of a value with few digits, and of one with a factor of few digits, that may carry it beyond a limit, as
-#: shares of the limit.
+#: Tolerance beyond a limit for a rounded value, and for a value with a rounded factor, as shares of the limit.
 ROUNDED, ROUNDED_FACTOR = 1e-6, 5e-4
-#: Entries of people for a missing reading.
+#: Entries that people write for a missing reading.
 NOTHING = ("n.a.", "-", "--", "?", "x", "inf", "-inf")
 _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
@@ -116,7 +115,7 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
 
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """Advice on a unit written next to a number. `mine`: unit of the column. `named`: columns by their units."""
+    """Advice on a unit written next to a number. `mine`: unit of the column. `named`: columns by unit."""
     unit = quantities.unit_in_column(written)
     if unit == mine:
         return f"write {value}, since the unit is in the column's name; "
@@ -172,7 +171,7 @@ def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool
 
 
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
-    """Layout with each channel of `more` for which the file has a column."""
+    """Layout extended by each channel of `more` for which the file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     mapped_columns = {m.column for m in meanings if m is not None}
     with_channels = tuple(
@@ -186,7 +185,7 @@ def check_header(
 ) -> None:
     mapped_columns = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
-    if not layout.complete:  # other channels' columns are not misspelt
+    if not layout.complete:  # names of other channels are not misspellings
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
     _check_names_of_sides(name, strange, mapped_columns, layout)
     required = layout.required(measured=measured, battery=battery)
@@ -198,12 +197,12 @@ def check_header(
         required = tuple(c for c in required if c != SUPPLY)
     if (
         not layout.complete and "surface" in mapped_columns
-    ):  # it gives the configuration too, if all surfaces are of one
+    ):  # it determines the configuration if all surfaces belong to one
         required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *layout.measured_columns) if c not in mapped_columns):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
-            got = f"; is {close[0]} meant?" if close else ""
+            got = f"; did you mean {close[0]}?" if close else ""
             if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
                 got = (
                     "; the columns that drive the two sides can be named in the robot's file under [columns]: "
@@ -255,7 +254,7 @@ def _advice_on_unknown_columns(strange: list[str], column: str) -> str:
 
 
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
-    """Rejects columns that name the side with other words, or at another place in the name."""
+    """Rejects columns that name a side by another word, or in another part of the name."""
 
     def sorted_words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
@@ -282,7 +281,7 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
 
 
 def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
-    """Rejects a column whose name or source states another unit than the one in which it is read."""
+    """Rejects a column whose name or source states a unit other than the one in which it is read."""
     below = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
         if meaning is None or meaning.column in WORDS:

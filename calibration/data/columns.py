@@ -22,29 +22,29 @@ if TYPE_CHECKING:
 SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
 IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
 IMPOSED |= {c.name: (c.column, c.factor) for c in quantities.SET if c.name in GOALS}
-#: Rows of all runs of a log from which on readings of fewer are used (`thinning`).
+#: Number of rows of a log above which a fit uses only some of them (`thinning`).
 ROWS = 4000
 
 
 def _conditions_of_loads(*loads: str) -> dict[str, Condition]:
-    """Conditions of these loads that a table may contain, by column."""
+    """Conditions that a table may contain for these loads, by column."""
     return {c.column: c for c in quantities.SET if c.in_tables and c.acts in loads}
 
 
-#: Conditions that act on a vehicle alone, and on a load on a shaft alone.
+#: Conditions that act only on vehicles, and only on loads on a shaft.
 ON_GROUND, ON_SHAFT = tuple(_conditions_of_loads(GROUND)), tuple(_conditions_of_loads(SHAFT))
-#: Conditions that the packaged robot's tables state, and default values of optional ones.
+#: Conditions in the packaged robot's tables, and default values of optional ones.
 CONDITIONS = {SUPPLY: BY_COLUMN[SUPPLY], **_conditions_of_loads(GROUND)}
 DEFAULTS = {c.column: c.usual for c in CONDITIONS.values() if c.usual is not None}
 TIME = {"time_s": BY_COLUMN["time_s"]}
-#: Statements of a time history about its motors' driver: the share of the supply's voltage that they get, negative
-#: backward; and its mode: that share, or none, with terminals that are shorted or a circuit that is open.
+#: State of the motors' driver in a time history. Duty: share of the supply voltage, negative backward. Mode: driven
+#: at that duty, shorted terminals, or open circuit.
 DUTY = {"duty": BY_COLUMN["duty"]}
 DRIVEN = ("voltage", "brake", "coast")
 #: The motors' circuit in each of these modes, see `Conditions.open`.
 CIRCUITS = dict(zip(DRIVEN, (0.0, -1.0, 1.0), strict=True))
 DRIVING = ("duty", "mode")
-#: Shares of the supply's voltage that the motors of either side get, of a robot whose sides are driven apart.
+#: Duty of each side's motors, for a robot whose sides are driven independently.
 SIDES = {c: BY_COLUMN[c] for c in ("duty_left", "duty_right")}
 #: The same in volts, converted to shares (`sides.duties_from_side_voltages`).
 VOLTS = {c: BY_COLUMN[c] for c in ("voltage_left_V", "voltage_right_V")}
@@ -55,11 +55,11 @@ HEADING = {"heading_deg": BY_COLUMN["heading_deg"]}
 LEVERS = {c: BY_COLUMN[c] for c in ("levers_front_deg", "levers_rear_deg")}
 #: Torque of a brake on the output of each drive, positive against forward rotation.
 LOAD = "load_torque_Nm"
-#: Columns with the time or order of measurement; a table without either was measured in the order of its rows.
+#: Columns with the time or order of measurement. Without either, the rows are in the order of measurement.
 WHEN = ("time_s", "order")
 WORDS = tuple(label.column for label in quantities.LABELS)
 
-#: Least similarity of two names of columns for one to be a misspelling of the other.
+#: Least similarity for one column name to count as a misspelling of another.
 ALIKE = 0.6
 
 
@@ -142,19 +142,19 @@ class Layout:
         return cls(*choices, robot.channels, supply)
 
     @property
-    def table8(self) -> bool:
-        """True if the robot is driven as the paper's robot, so that the conditions of Table 8 apply."""
+    def uses_paper_conditions(self) -> bool:
+        """True if the robot is driven like the paper's robot, so that the conditions of Table 8 apply."""
         return self.inherits and self.has_ground and self.imposed == "voltage"
 
     @property
     def complete(self) -> bool:
         """True if tables must contain every condition. Otherwise a missing condition has its usual value."""
-        return self.table8
+        return self.uses_paper_conditions
 
     @property
     def crosses_zero(self) -> bool:
-        """True if readings may cross zero. Errors are then relative to a channel's size and not to the reading."""
-        return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
+        """True if readings may cross zero. Errors are then relative to the channel's size instead of the reading."""
+        return not self.uses_paper_conditions or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @functools.cached_property
     def idle(self) -> Names:
@@ -188,7 +188,7 @@ class Layout:
         return tuple(c.sd_column for c in self.channels)
 
     def magnitude(self, channel: str) -> bool:
-        """True if the instrument of a channel shows only the magnitude."""
+        """True if a channel's instrument shows only the magnitude."""
         return any(i.channel == channel and i.signed is False for i in self.instruments)
 
     def variance(self, channel: str) -> float:
@@ -204,7 +204,7 @@ class Layout:
         return tuple(dict.fromkeys(c for c in column_names if c not in self.idle))
 
     def required(self, *, measured: bool, battery: bool) -> Names:
-        """Columns that a table must have, in addition to channels."""
+        """Columns that a table must have besides channels."""
         if self.complete:
             further = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
             return tuple(c for c in ("configuration", *CONDITIONS) if c not in further)
@@ -264,7 +264,7 @@ class Layout:
 
     @functools.cached_property
     def _by_name(self) -> Mapping[str, Column]:
-        """Every name of a column, in any unit, with its quantity."""
+        """Every possible column name, in any unit, with its quantity."""
         quantities_by_name = self.quantities().values()
         return {
             name: Column(quantity, name, unit)
@@ -277,9 +277,9 @@ class Layout:
         return (*self._by_name, *(column for _, column, _ in self.mapped))
 
     def nearest(self, name: str, stated: Collection[str]) -> str:
-        """Known column that is most similar to a column without a role, in the unit of `name`.
+        """Known column most similar to the unknown column `name`, in its unit.
 
-        It has a similar name, or it is the only condition in that unit. Empty if there is none.
+        It has a similar name or is the only condition in that unit. Empty if there is none.
 
         Args:
             stated: columns that the table already has, which are left out.
@@ -298,7 +298,7 @@ class Layout:
         return alone[0] if len(alone) == 1 else ""
 
     def expected(self, column: str) -> str:
-        """Name of the column, with the name in the source if the robot file states one."""
+        """Name of the column, and its name in the source if the robot file states one."""
         mapped_column = next(
             (their for mine, their, _ in self.mapped if _standard_name(self._by_name, mine) == column), None
         )

@@ -1,4 +1,4 @@
-"""Torques that were computed from a current instead of measured. They are removed from a table."""
+"""Removal of torque columns that were computed from a current instead of measured."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from calibration.data.instruments import FEWEST, common_step
 from calibration.data.table import Runs
 from mmrjax.model.robot import Robot
 
-#: Fewest rows and distinct readings for a line through all of them to be significant.
+#: Fewest rows and distinct readings for which an exact line through all of them is no coincidence.
 ROWS, LEVELS = 8, 4
-#: Rounding error in a file as a share of a channel's range; fewest steps of a display within the range for a line
-#: through all readings to be more than the display's rounding.
+#: Rounding error in a file as a share of a channel's range. Fewest display steps within the range for an exact line
+#: not to be due to rounding.
 ROUNDED, STEPS = 2e-6, 40.0
-#: Steps of the search for a load, and largest error of its current as a share of the largest reading.
+#: Steps of the search for a load. Largest error of the resulting current as a share of the largest reading.
 SEARCH, ERROR = 8, 1e-3
 #: A torque that a user may name as a reading.
 TORQUE = "output_torque_Nm"
 
 
 def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
-    """The table without a torque column that is an exact multiple of a current in all rows.
+    """Table without torque columns that are exact multiples of a current in all rows.
 
-    Friction of a motor leaves an offset between current and torque, so a measured or set torque is no exact multiple.
+    Motor friction causes an offset between current and torque, so a measured or set torque is no exact multiple.
     If no load torque is set, the load of each row is computed from its current with the balances of the robot. The
     current is then no longer a reading.
 
@@ -50,7 +50,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
         computed += "computed, not measured, and contains no information on torque constant, friction or efficiency"
         if torque == TORQUE:
             columns.pop(torque)
-            notes.append(f"{computed}, so it is left out")
+            notes.append(f"{computed}. It is left out")
         elif runs.sampled or set(shown_columns) <= {current, TORQUE} or current not in shown_columns:
             raise BadData(
                 f"{computed}; remove the column and keep only rows without a load, or give the torque set at the "
@@ -60,7 +60,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             columns[torque] = _load_for_current(runs, robot, shown_columns[current], runs[current])
             columns.pop(current)
             notes.append(
-                f"{computed}, so it is left out. The load of each row follows from {current} and the robot's file, "
+                f"{computed}. It is left out. The load of each row follows from {current} and the robot's file, "
                 "so this current is not a reading either. These rows contribute only voltages and speeds"
             )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
@@ -93,7 +93,7 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
 
 
 def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
-    """Intercept and slope of a line through all points, to within their digits. None if there is no such line."""
+    """Intercept and slope of a line through all points within their rounding. None if there is no such line."""
     is_paired = np.isfinite(x) & np.isfinite(y)
     x, y = x[is_paired], y[is_paired]
     if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:

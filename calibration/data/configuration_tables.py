@@ -21,7 +21,7 @@ from mmrjax.model.track_friction import Track
 
 #: Kinds of movers, and the `on_tracks` of each.
 MOVERS = {"tracks": 1.0, "wheels": 0.0}
-#: Names that a configuration cannot have: the other keys of a robot file.
+#: Names that a configuration cannot have, because robot files use them as keys.
 TAKEN = (
     *(
         "schema",
@@ -48,7 +48,7 @@ class ConfigurationLoads:
 
     Attributes:
         by_name: loads by name, in order.
-        travels: true if the loads travel, as vehicles and linear units do.
+        travels: True if the loads travel, as vehicles and linear units do.
         linear: names of linear units.
         missing: required parameters that the file does not state.
     """
@@ -74,7 +74,7 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
 
     Raises:
         BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name. A table belongs to
-            no configuration. `load`, `like` or `movers` is unknown, contradicts another one, or all are missing. A
+            no configuration. `load`, `like` or `movers` is unknown, contradicts another key, or all are missing. The
             file has both shafts and vehicles. A robot with a base lacks a required parameter.
     """
     load_names = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]

@@ -1,4 +1,4 @@
-"""Description of a data file: its signals with unit, rate, range and gaps, and columns that they may be."""
+"""Description of a data file: its signals with unit, rate, range and gaps, and the columns that they may be."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal, Source, unit_of_clock, values_in_memory
 from mmrjax.model import channels
 
-#: Least gap between samples, in usual steps.
+#: Smallest gap between samples, in usual steps.
 GAP = 5.0
 #: Names of counts of time, and the least share of rows in which such a count rises.
 _COUNT, RISING = re.compile(r"time|tick|stamp"), 0.9
@@ -37,8 +37,8 @@ class SignalFacts:
         rate: sampling rate [Hz], NaN without a clock.
         gaps: number of steps longer than `GAP` usual ones, NaN without a clock.
         least, greatest: smallest and largest number, or NaN.
-        missing: number of samples without a number.
-        words: some of its words, if its samples are words.
+        missing: number of missing readings.
+        words: some of its values, if they are words.
         clock: name of its clock.
     """
 
@@ -63,7 +63,7 @@ class FileContents:
         name, kind: name and kind of the file.
         signals: signals of the file.
         notes: notes on how it was read.
-        preset: name of the packaged preset that matches its columns, empty if none does.
+        preset: name of the packaged preset for its columns, empty if there is none.
         proposed: lines of a proposed table `[columns]`, to be checked by a person.
     """
 
@@ -91,7 +91,7 @@ def inspect_source(source: str | Path | Any) -> FileContents:
     clock_signals = (
         s for s in contents_found.signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None
     )
-    table = None if clocks else next(clock_signals, None)  # the signal of a table that is its time
+    table = None if clocks else next(clock_signals, None)  # the time column of a table
     clock = None if table is None else Clock(table.path, table.load, _unit_of_time(table.name) or "")
     facts = tuple(
         _facts(signal, signal.clock or (None if signal is table else clock), times)
@@ -110,7 +110,7 @@ def inspect_source(source: str | Path | Any) -> FileContents:
         )
     still = {fact.path for fact in facts if fact.least == fact.greatest}
     read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
-    moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first that changes
+    moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first one that changes
     lines = dict(_proposed_columns(moving))
     proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
     return FileContents(
@@ -151,7 +151,7 @@ def _signals_of_text(arrays: NamedArrays) -> Source:
 
 
 def _unit_of_time(name: str) -> str | None:
-    """Unit of a clock according to its name, including names that loggers use. None if it is no clock."""
+    """Unit of a clock according to its name, as loggers spell it. None if the name is not that of a clock."""
     bare = name.casefold().replace("time (", "time_").rstrip(")")
     return "ms" if bare == "ms_today" else unit_of_clock(bare)
 

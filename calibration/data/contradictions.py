@@ -1,4 +1,4 @@
-"""Contradictions within a table of runs, or between table and robot, one sentence for each."""
+"""Checks for contradictions within a table of runs, or between table and robot."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from mmrjax.model import params
 from mmrjax.model.quantities import CURRENT, RPM, VOLTAGE
 from mmrjax.model.robot import Robot, turn_error
 
-#: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
-#: tells [V].
+#: A voltage below this share of the back-EMF cannot turn the motors at an imposed speed [-]. Least back-EMF that is
+#: checked [V].
 TOO_SMALL, LEAST = 0.5, 0.2
-#: Share of the rows that may brake, where no current shows them.
+#: Largest share of rows that may brake, in tables without currents.
 MOST_BRAKING = 0.5
-#: Channel of a column whose instrument may show magnitude alone; of columns of currents, the motors' first.
+#: Channels whose instruments may show only the magnitude, by column. Currents: that of the motors first.
 MAGNITUDES = {"motor_voltage_V": "motor_voltage"}
 CURRENTS = {"motor_current_A": "motor_current", "total_current_A": "total_current"}
-#: Jump of an angle between samples that is a turn lost [deg], and least multiple of the step that is usual.
+#: Jump of an angle that indicates a lost turn [deg], and its least multiple of the usual step.
 TURN, UNUSUAL = 180.0, 4.0
-#: Usual steps of time beyond which samples are missing.
+#: Time step beyond which samples are missing, in usual steps.
 GAP = 5.0
-#: Share of rows before which time goes back, up to which they are no rows in another order.
+#: If time goes back in at most this share of rows, the rows are not just in another order.
 SELDOM = 0.02
-#: Degrees of a radian, and within what share of that an angle that jumps is in the other unit.
+#: Degrees of a radian, and relative tolerance for a jump by this factor.
 RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
@@ -35,9 +35,9 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
     """Rejects a table that contradicts itself or its robot.
 
     Raises:
-        BadData: a vehicle has no mass, a robot turns that cannot turn, or its sides are exchanged. Also if the stated
-            voltage cannot turn the motors at the imposed speed, an angle wraps or changes its unit, or time goes
-            back.
+        BadData: a vehicle has no mass, the table has turns of a robot that cannot turn, or the sides are exchanged.
+            Also if the stated voltage cannot turn the motors at the imposed speed, an angle wraps or changes its
+            unit, or time goes back.
     """
     _check_mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
@@ -136,7 +136,7 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
     wrong = np.flatnonzero(tells & (along < TOO_SMALL * np.abs(back)))
     if wrong.size > (0 if current else MOST_BRAKING * np.sum(tells)):
         row = int(wrong[0])
-        why = "of the other sign" if along[row] < 0 else "too small"
+        why = "with the wrong sign" if along[row] < 0 else "too small"
         raise BadData(
             f"{runs.source} row {row + 1}, {column}: got {voltage[row]:g} at an imposed {SPEED} of "
             f"{runs[SPEED][row]:g}, {why} for the motors' back-EMF of "

@@ -11,7 +11,7 @@ from calibration.data import Names
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.runs import Runs
 
-#: Columns whose values may change from sample to sample of a run. A stated mass may change as the payload does.
+#: Columns whose values may change between the samples of a run. A stated mass may change with the payload.
 CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode", "held")
 
 
@@ -38,7 +38,7 @@ class ConstantInterval:
         return self.end - self.begin
 
     def after(self, time: np.ndarray, share: float) -> np.ndarray:
-        """Rows later than a share of its duration. `time`: of every row of the table [s]."""
+        """Rows after a share of its duration. `time`: time of every row of the table [s]."""
         return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
 
 
@@ -50,7 +50,7 @@ def changing_columns(runs: Runs) -> Names:
 def applied_drive(runs: Runs) -> np.ndarray:
     """Voltage of the motors in every row, or the imposed speed or current, shape (rows,) [V], [rpm] or [A].
 
-    The voltage is 0 if the driver brakes or coasts. In turns it is the larger magnitude of both sides.
+    The voltage is 0 if the driver brakes or coasts. In turns it is that of the side with the larger magnitude.
     """
     if runs.turns:
         return np.abs(runs.of_sides).max(0)
@@ -61,7 +61,7 @@ def applied_drive(runs: Runs) -> np.ndarray:
 
 
 def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray:
-    """True for rows of runs in which one of these columns changes, shape (rows,). By default the columns that may
+    """True for rows of runs in which one of these columns changes, shape (rows,). Default: all columns that may
     change.
     """
     columns = changing_columns(runs) if columns is None else columns
@@ -116,7 +116,7 @@ def intervals_by_run(runs: Runs) -> list[list[ConstantInterval]]:
 def course_of_each_row(runs: Runs) -> np.ndarray:
     """Short name of the sequence of conditions in each row's run, shape (rows,). Empty if no conditions change.
 
-    The name is short because a sequence with thousands of changes, written into each row, took gigabytes.
+    The name is short because the whole sequence, with thousands of changes in each row, would take gigabytes.
     """
     courses, names = np.full(len(runs), "", dtype=object), dict[str, str]()
     if rows_of_varying_runs(runs).any():

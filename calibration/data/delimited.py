@@ -1,4 +1,4 @@
-"""Tables as text: their encoding, their separators, and the decimal mark of their numbers."""
+"""Tables as text: encoding, separators and decimal marks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calibration.data.writing import cell_word
 from mmrjax.errors import count_noun
 from mmrjax.model import channels, quantities
 
-#: Size of a file from which on plain tables are read as arrays at once [bytes].
+#: File size above which plain tables are read as whole arrays [bytes].
 LONG = 2_000_000
 #: Memory of a cell that is read as text [bytes].
 CELL = 80
@@ -29,10 +29,10 @@ SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _SEPARATOR = re.compile(r"[,;\t]")
 #: First characters of lines of comments.
 COMMENTS = ("#", "%")
-#: Bytes that no text has.
+#: Bytes that do not occur in text.
 _CONTROLS = re.compile(rb"[\0-\x08\x0e-\x1f]")
 _COMMA, _POINT = (re.compile(rf"[+-]?\d*{mark}\d+(?:[eE][+-]?\d+)?") for mark in (",", r"\."))
-#: Possible numbers of thousands with a mark between, and numbers below a thousand.
+#: Numbers whose mark may separate thousands, and numbers below a thousand.
 _THOUSANDS, _BELOW = re.compile(r"[+-]?[1-9]\d{0,2}[,.]\d{3}"), re.compile(r"[+-]?[1-9]\d{0,2}")
 
 
@@ -43,8 +43,8 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
         name: name of the file, for messages.
 
     Raises:
-        BadData: for the same reasons as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row of another
-            length than the header.
+        BadData: for the same reasons as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row and the
+            header differ in length.
     """
     content = input_files.csv_bytes(path, name)
     if len(content) >= LONG and (plain := _read_plain_table(name, content)) is not None:
@@ -104,7 +104,7 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
             reader.ParseOptions(quote_char=False),
             kinds,
         )
-    except pa.ArrowInvalid:  # a row of another length, or bytes that are not UTF-8
+    except pa.ArrowInvalid:  # a row of different length, or bytes that are not UTF-8
         return None
     values: list[Raw] = []
     empty = None
@@ -120,7 +120,7 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
             if np.isnan(column_values).any()
             else column_values
         )
-    if empty is None or compute.any(empty).as_py():  # rows of separators alone
+    if empty is None or compute.any(empty).as_py():  # rows with only separators
         return None
     return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
 
@@ -128,7 +128,7 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
 def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
     """Units in the first row below a header. A unit is empty if the row states none for that column.
 
-    () if the row is a data row: one of its cells is a number, or no cell above numbers is a unit.
+    () for a row of data: a cell is a number, or no cell above numbers is a unit.
     """
     if len(first) != len(header) or any(math.isfinite(cell_number(cell)) for cell in first):
         return ()
@@ -162,7 +162,7 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
 
 
 def drop_comments(lines: Sequence[str]) -> list[str]:
-    """Lines of a table from its header on, without the comments above, which begin with # or %.
+    """Lines of a table from its header on, without the comments (# or %) above it.
 
     If numbers follow the comments, the last comment with as many cells is the header. A row of units may follow it.
     """
@@ -234,9 +234,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
                     f"{beside or 'whole numbers below a thousand'}; {expectation}"
                 )
-    return rows, (
-        f"{note}, and numbers have decimal commas, which are read as such" if comma else f"{note}; read so",
-    )
+    return rows, (f"{note}, and numbers have decimal commas" if comma else f"{note}; read so",)
 
 
 def _column(rows: list[list[str]], j: int) -> str:

@@ -66,10 +66,10 @@ def readable_signals(
     return signals_read[0]
 
 
-#: Effects by their name in robot files and on the command line.
+#: Effects by name, as in robot files and on the command line.
 Library = Mapping[str, type[Effect]]
 
-#: First part of the name of a module of the user's own effects; the rest is a hash of its path.
+#: Beginning of the module name of a user's effect file. A hash of its path follows.
 OWN_MODULE = "mmrjax_user_effects_"
 
 #: Kind of every class attribute that an effect states or inherits.

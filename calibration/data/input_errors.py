@@ -67,10 +67,10 @@ def is_number(value: Any) -> bool:
 
 
 def stated_count(value: Any, where: str, low: int, high: int) -> int:
-    """Checks and returns a whole number from TOML or Python.
+    """Returns a whole number from TOML or Python after checking it.
 
     Raises:
-        BadConfiguration: it is something else, or out of bounds.
+        BadConfiguration: it is no whole number, or out of bounds.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not low <= int(value) <= high:
         raise BadConfiguration(f"{where}: got {value!r}; expected a whole number from {low} to {high}")
@@ -78,10 +78,10 @@ def stated_count(value: Any, where: str, low: int, high: int) -> int:
 
 
 def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -> str:
-    """Checks a word of a file or of an argument against the known ones, and returns it.
+    """Returns a word of a file or an argument after checking that it is known.
 
     Args:
-        wrong: beginning of the message about an unknown word. If empty, the message quotes the word.
+        wrong: beginning of the message about an unknown word. Empty: the message quotes the word.
 
     Raises:
         BadConfiguration: an unknown word. The message lists the nearest ones.
@@ -94,7 +94,7 @@ def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -
 def stated_number(
     value: Any, where: str, low: float = -math.inf, high: float = math.inf, unit: str | None = None
 ) -> float:
-    """Checks and returns a number of a TOML file.
+    """Returns a number of a TOML file after checking it.
 
     Args:
         low, high: bounds.

@@ -21,22 +21,22 @@ BINARY = {
     b"PK\x03\x04": "an Excel workbook or a zip file", b"\xd0\xcf\x11\xe0": "an Excel workbook",
     b"\x1f\x8b": "a gzip file", b"SQLite format 3\0": "an SQLite file", b"%PDF": "a PDF",
 }  # fmt: skip
-#: Beginnings of JSON and of web pages.
+#: First characters of JSON and of web pages.
 TEXTS = {
     re.compile(rb"\s*(\{|\[\s*[\[{\"\d-])"): "JSON",
     re.compile(rb"\s*<(!doctype|html|\?xml)", re.I): "a web page or XML",
 }  # fmt: skip
-#: Largest table and largest TOML file [bytes], most keys of a TOML file and most tables within one another.
+#: Largest table and TOML file [bytes]. Most keys and deepest nesting of a TOML file.
 LARGEST, LARGEST_TOML, KEYS, DEEPEST = 2**31, 2**22, 2_000, 16
 #: Most signals of a recording, or columns of a table.
 COLUMNS = 20_000
-#: Bytes of a value, and largest share of the free memory for values; copies and checks use the rest.
+#: Bytes of a value, and largest share of the free memory for values. Copies and checks need the rest.
 VALUE, SHARE = 8, 0.3
-#: Most bytes of values for each byte of a file (deflate reaches 1,032), and bytes that every file may declare.
+#: Largest ratio of declared to stored bytes (deflate reaches 1,032), and size that any file may declare [bytes].
 RATIO, SMALL = 1_100, 2**28
-#: Whole numbers that a TOML file may hold (TOML 1.0: 64 bits).
+#: Range of whole numbers in a TOML file (TOML 1.0: 64 bits).
 WHOLE = 2**63
-#: Names of kinds of files that are not read.
+#: Names of file types that are not read.
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
 
 
@@ -88,19 +88,21 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
 
 
 def check_declared(where: str | Path, columns: int, size: float = 0.0, held: float = math.inf) -> None:
-    """Rejects implausible sizes that a source declares, before its values are read.
+    """Rejects implausible sizes in the header of a source, before its values are read.
 
     Args:
         where: beginning of the error message.
         columns: number of signals or columns.
         size: size of all values [bytes].
-        held: size of the file with these values [bytes].
+        held: size of the file [bytes].
 
     Raises:
         BadData: there are more than `COLUMNS` columns, or more values than a file of this size can hold.
     """
     if columns > COLUMNS:
-        raise BadData(f"{where}: has {columns:,} columns; expected at most {COLUMNS:,}; export those that you need")
+        raise BadData(
+            f"{where}: has {columns:,} columns; expected at most {COLUMNS:,}; export only those that you need"
+        )
     if size > max(RATIO * held, SMALL):
         raise BadData(
             f"{where}: declares {size / 1e9:.3g} GB of values in a file of {held:,.0f} bytes; expected a file that "
@@ -109,14 +111,14 @@ def check_declared(where: str | Path, columns: int, size: float = 0.0, held: flo
 
 
 def check_memory(where: str | Path, size: float) -> None:
-    """Rejects values that need more than `SHARE` of the free memory, before they are read.
+    """Rejects values that would need more than `SHARE` of the free memory, before they are read.
 
     Args:
         where: beginning of the error message.
         size: size of the values [bytes].
 
     Raises:
-        BadData: the values need more memory than that.
+        BadData: they would need more.
     """
     if size > SHARE * (free := available_memory()):
         raise BadData(
@@ -132,7 +134,7 @@ def available_memory() -> float:
     """
     try:
         free = float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-        with contextlib.suppress(OSError, StopIteration):  # with what the system can take back from caches of files
+        with contextlib.suppress(OSError, StopIteration):  # includes file caches, which the system can free
             lines = Path("/proc/meminfo").read_text("ascii").splitlines()
             free = float(next(line for line in lines if line.startswith("MemAvailable")).split()[1]) * 1024
         with contextlib.suppress(ImportError, OSError):
@@ -192,16 +194,16 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
     """
     try:
         content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, ValueError) as error:  # a number of more digits than Python reads
+    except (tomllib.TOMLDecodeError, ValueError) as error:  # more digits than Python converts
         raise kind(f"{where}: not a readable TOML file ({error})") from error
     except RecursionError as error:
-        raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
+        raise kind(f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels") from error
     keys = 0
     pending: list[tuple[Json | list[Any], int]] = [(content, 1)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
-            raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels")
+            raise kind(f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels")
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:

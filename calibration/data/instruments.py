@@ -14,20 +14,21 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot
 
-#: Smallest step, and largest rounding of a printed reading, as shares of the largest difference.
+#: Smallest step, and largest rounding error of a printed reading, as shares of the largest difference.
 SMALLEST, ROUNDING = 1e-5, 1e-7
-#: Fewest different readings that show a step: the common divisor of so many random multiples is the step itself in
-#: 99 % of tables, of four multiples in 83 %.
+#: Fewest different readings that show a step. In 99 % of tables the common divisor of so many random multiples is the
+#: step itself, with four multiples in 83 %.
 FEWEST = 8
-#: Coarsest step of a display, as a share of the largest reading: coarser multiples are levels set by a person.
+#: Coarsest step of a display, as a share of the largest reading. Coarser steps are levels that a person set.
 COARSEST = 0.25
 
 
 def common_step(readings: np.ndarray) -> float:
-    """Largest step of which all differences between readings are multiples (Euclid's algorithm).
+    """Largest common divisor of all differences between readings (Euclid's algorithm).
 
-    0 if that step is not larger than rounding errors, or if there are too few different readings. Readings at even
-    levels, each equally often and at most one left out, were set by a person and show no resolution of a display.
+    0 if that step is not larger than rounding errors, or if there are too few different readings. Evenly spaced
+    readings that occur equally often, with at most one level missing, were set by a person. They do not show the
+    resolution of a display.
     """
     levels, counts = np.unique(readings[np.isfinite(readings)], return_counts=True)
     if levels.size < FEWEST:
@@ -89,7 +90,7 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
-    """Robot with the instruments that its table shows."""
+    """Robot with the instruments inferred from its table."""
     rig_instruments = robot.rig.instruments
     all_instruments = runs.layout.instruments if any(i.free for i in rig_instruments) else rig_instruments
     channel_names = {i.channel for i in all_instruments}

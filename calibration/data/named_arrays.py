@@ -13,7 +13,7 @@ from calibration.data.input_errors import parse_number
 
 #: Raw values of a column: a list of texts as written, or an array of numbers with NaN for a missing reading.
 Raw = list[str] | np.ndarray
-#: Entries of programs for a missing reading.
+#: Entries that programs write for a missing reading.
 MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
 
 
@@ -21,15 +21,15 @@ MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
 class NamedArrays:
     """Named columns of one source. `runs.runs_of_arrays` checks them and converts them to `Runs`.
 
-    Messages count rows from 1. A reader that leaves out rows reports it in `notes`.
+    Messages count rows from 1. A reader that omits rows reports this in `notes`.
 
     Attributes:
         name: name of the source, with which every message begins.
         header: names of the columns, as in the source.
-        values: values of each column, all of one length.
+        values: values of each column, all equally long.
         units: unit of each column, spelled as by `quantities.unit_in_column`, empty if unknown. May be empty
             altogether.
-        units_from: place in which the source states the units, for messages.
+        units_from: where the source states the units, for messages.
         notes: sentences on the reading of the source.
         digest: SHA-256 of the source, empty if it has none.
     """
@@ -56,7 +56,7 @@ class NamedArrays:
         return dataclasses.replace(self, values=values, notes=(*self.notes, f"{self.name}: {note}"))
 
     def with_columns(self, columns: Mapping[str, np.ndarray]) -> NamedArrays:
-        """Copy with columns of numbers in addition to its own, or in place of those with the same name."""
+        """Copy with additional columns of numbers, which replace columns of the same name."""
         columns_left = [k for k, column in enumerate(self.header) if column not in columns]
         return dataclasses.replace(
             self,
@@ -93,7 +93,7 @@ def column_numbers(raw: Raw) -> np.ndarray:
         if "_" not in (joined := "".join(raw)) and joined.isascii():
             return np.array(list(map(float, raw)))
     except ValueError:
-        pass  # some cell states no number
+        pass  # a cell without a number
     return np.array([cell_number(cell) for cell in raw])
 
 

@@ -1,8 +1,8 @@
 """Mass of a robot without payload: from its file, or from a table of runs.
 
-A table that states `total_mass_kg` is simulated with that mass, whatever the robot's own mass. A robot that is fitted
-to the table needs the same mass. Otherwise the fit would identify an effect on the mass relative to the table's mass,
-and write it to a file with another mass.
+A table with `total_mass_kg` is simulated with that mass instead of the robot's own. A robot that is fitted to the
+table needs the same mass: otherwise an effect on the mass would be fitted relative to the table's mass, but written
+to a file with another.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH
 from mmrjax.model.robot import Robot
 
-#: Masses that differ by less are the same: the rounding of a sum [kg].
+#: Masses that differ by less are equal within rounding [kg].
 ROUNDING = 1e-6
 
 
@@ -76,7 +76,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
 
 
 def with_table_mass(robot: Robot, runs: Runs) -> Robot:
-    """Robot whose configurations have the masses of the table, each the median over its rows.
+    """Robot with the masses of the table. For each configuration it is the median over the rows.
 
     Raises:
         BadData: for the same reasons as `stated_masses`.
@@ -96,11 +96,11 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     for name, file_mass in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
         if file_mass.varies:
-            why = "; does total_mass_kg leave the payload out?" if file_mass.unladen else ""
+            why = "; does total_mass_kg exclude the payload?" if file_mass.unladen else ""
             notes.append(
                 f"{name}: total_mass_kg minus payload_kg varies from {file_mass.low:.4g} to {file_mass.high:.4g} kg. "
                 f"The fit used the mass of each row. robot.toml contains the median, {file_mass.median:.4g} kg, and "
-                f"does not reproduce the fit in rows of another mass{why}"
+                f"does not reproduce the fit in rows with another mass{why}"
             )
         elif abs(file_mass.median - mass) > ROUNDING:
             notes.append(
@@ -132,5 +132,5 @@ def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
         if f"{name}.mass" in stated:
             raise BadConfiguration(
                 f"--prior {name}.mass: {runs.source} has a column total_mass_kg, which sets the mass of each run; to "
-                "fit the mass, remove that column, else remove the prior"
+                "fit the mass, remove that column, otherwise remove the prior"
             )

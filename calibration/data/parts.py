@@ -1,7 +1,7 @@
-"""Packaged data sheets for sizing: motors, gearboxes and cells. Each row names the sheet of its values.
+"""Packaged data sheets for sizing: motors, gearboxes and cells. Each row names its data sheet.
 
-The tables are in `parts/*.csv` in the units of the sheets. The reader gives SI. Values missing in a sheet are NaN.
-`docs/reference/parts.md` has the origin of the sheets, and checks of their consistency.
+The tables are in `parts/*.csv` in the units of the sheets. The reader converts to SI. Values that a sheet lacks are
+NaN. `docs/reference/parts.md` has the origin of the sheets, and checks of their consistency.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class MotorSheet:
         temperature_winding_max: largest permissible winding temperature [°C].
         mass: mass [kg].
         price: price of one piece without tax [EUR of 2020].
-        gearboxes: families of packaged gearboxes with which the source combines it.
+        gearboxes: families of packaged gearboxes that its maker combines with it.
         source: data sheet, and where it was read.
         note: further facts.
     """
@@ -216,5 +216,5 @@ def packaged_gearboxes() -> tuple[GearboxSheet, ...]:
 
 @functools.cache
 def packaged_cells() -> tuple[CellSheet, ...]:
-    """Packaged cells. The first is the paper's, whose mass is in no data sheet that was found."""
+    """Packaged cells. The first is the paper's. No data sheet with its mass was found."""
     return tuple(_read_sheets(CellSheet, "cells.csv"))

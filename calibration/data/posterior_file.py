@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "mmrjax.posterior/1"
 FILE = "posterior.nc"
-#: Maps from a coordinate u to a parameter: the identity, the exponential, or an angle within half a turn.
+#: Kinds of parameters: equal to the coordinate u, its exponential, or an angle within half a turn.
 NORMAL, LOG, ANGLE = "normal", "log-normal", "angle"
 #: Largest difference, in posterior sds, between the centre of a posterior and its robot.
 APART = 0.05
@@ -27,9 +27,9 @@ APART = 0.05
 class Posterior:
     """Joint posterior of parameters: a normal distribution of coordinates z, and the parameters as functions of z.
 
-    u = location + spread · z, clipped to the range from low to high. The clip is smooth over `softness` of the
-    spread, as in `calibration.inference.priors.Coordinates`, or sharp for 0. The parameter is θ = u, exp u, or u
-    wrapped to half a turn.
+    u = location + spread · z, clipped to the range from low to high. The clip is smooth over `softness` times the
+    spread, as in `calibration.inference.priors.Coordinates`, or sharp if `softness` is 0. The parameter is θ = u, exp
+    u, or u wrapped to half a turn.
 
     Attributes:
         coordinates: name of the parameter of each coordinate.
@@ -121,11 +121,11 @@ class Posterior:
                     f"{where}: this robot has no {name}, so the posterior belongs to another robot; "
                     f"{allowed_words(name, alike or values)}"
                 )
-        with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
+        with np.errstate(invalid="ignore"):  # NaN from a damaged file is rejected below
             robot_at_mean = self.at(np.asarray(self.mean))
         sd = np.asarray(self.sd)
         for name, value, width in zip(self.names, robot_at_mean, sd, strict=True):
-            if not abs(values[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
+            if not abs(values[name] - value) <= APART * width + 1e-6 * abs(value):  # also if one is NaN
                 raise BadData(
                     f"{where}: {name} is {values[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
                     "posterior: take the robot.toml from the same folder, without changes to fitted parameters"
@@ -161,7 +161,7 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
         file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
 
         def put(name: str, values: Any, kind: str, dimensions: Names, words: str | None) -> None:
-            texts = kind == "S"  # rows of letters
+            texts = kind == "S"  # strings as rows of characters
             values = np.asarray([x.encode() for x in values] if texts else values, kind)
             if texts:
                 dimensions = (*dimensions, f"string{values.itemsize}")
@@ -200,9 +200,9 @@ def read_posterior(path: Path | str) -> Posterior:
         with xr.open_dataset(path, engine="scipy") as data:
             data.load()
         posterior = _posterior_of_dataset(data)
-    except Exception as error:  # whatever a damaged file makes the reader raise
+    except Exception as error:  # a damaged file can make the reader raise anything
         why = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise BadData(f"{path}: not a posterior that can be read ({why})") from error
+        raise BadData(f"{path}: not a readable posterior ({why})") from error
     size = len(posterior)
     sound = (
         posterior.covariance.shape == (size, size)
@@ -216,7 +216,9 @@ def read_posterior(path: Path | str) -> Posterior:
         and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not sound:
-        raise BadData(f"{path}: not a valid covariance, or a number is missing or out of range; write the file again")
+        raise BadData(
+            f"{path}: the covariance is invalid, or a number is missing or out of range; write the file again"
+        )
     return posterior
 
 

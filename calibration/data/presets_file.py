@@ -1,4 +1,4 @@
-"""Presets: TOML files that state what the columns of a logger's files mean, with unit and sign."""
+"""Presets: TOML files with the meaning, unit and sign of the columns in a logger's files."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ PACKAGED = (
     "advantagekit", "bam", "damiao", "dynamixel", "feetech", "lerobot", "moteus", "odrive", "px4", "rcbenchmark",
     "robstride", "ros2", "ros2_amperes", "simplefoc", "sysid", "vesc",
 )  # fmt: skip
-#: Columns of a packaged preset that a source has at least for it to be recognised.
+#: Fewest columns of a packaged preset in a source for the preset to be recognised.
 OF_A_PRESET = 3
 COLUMN_NAME = "the name of a column"
 #: Keys of a preset, and of one of its columns. Texts have a description.
 KEYS, TEXTS = ("columns", "ask", "header"), {"note": "a sentence", "needs": COLUMN_NAME, "across": COLUMN_NAME}
 KEYS_OF_COLUMN = ("column", "factor", "per", "times", "sign_bit", "zero", *TEXTS)
-#: Keys of a number that a preset asks for.
+#: Keys of a number that the user gives for a preset.
 KEYS_OF_NUMBER = ("about", "usual")
-#: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
+#: Separator between the name of a preset and the user's numbers, as in `vesc,pole_pairs=7`.
 SEPARATOR = ","
 
 
@@ -50,8 +50,8 @@ class PresetColumn:
         theirs: possible names in the file, `*` for any text. The first name in the file is used.
         factor: factor from its unit to the unit of `mine`.
         note: its meaning, for a note to the user.
-        needs: column of this program without which it does not describe what drives the motor. Empty: none.
-        across: column of the file with the d-axis current, which is zero without field weakening. Empty: none.
+        needs: another column of this program that is required if this one drives the motor. Empty: none.
+        across: column of the file with the d-axis current, which field weakening makes nonzero. Empty: none.
         sign_bit: sign bit of raw numbers whose other bits are the magnitude. 0: none.
         zero: raw number that means zero.
     """
@@ -98,17 +98,17 @@ class Preset:
                 mapped.append((column.mine, present[0], column.factor))
                 if column.note:
                     notes.append(f"{self.name}: {present[0]}, read as {column.mine}, {column.note}")
-            elif self.name not in PACKAGED:  # a packaged preset has columns of several loggers
+            elif self.name not in PACKAGED:  # packaged presets have columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
 
     def column_of(self, name: str) -> PresetColumn:
-        """Preset column that is read from a source column. An empty one if none is."""
+        """Preset column that is read from a source column, or an empty one."""
         read = (c for c in self.columns if any(_matches_any(pattern, {name}) for pattern in c.theirs))
         return next(read, PresetColumn("", ()))
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
-        """Rejects a source whose imposed column is useless without another column that the source lacks.
+        """Rejects a source that lacks a column without which its imposed column is useless.
 
         Args:
             mapped: columns of the source.
@@ -140,7 +140,7 @@ def preset_of_table(columns: Mapping[str, Any], where: str = "the stated table")
 
 
 def find_preset(stated: str | Path) -> Preset:
-    """Packaged preset with a name, or the preset in a file. Numbers that the preset asks for may follow.
+    """Packaged preset with a name, or the preset in a file. Numbers that the preset needs may follow.
 
     Args:
         stated: text such as `vesc,pole_pairs=7` or `mine.toml`.
@@ -314,14 +314,14 @@ def _list_of_texts(stated: Any, where: str, form: str = "expected a list of name
 def merge_columns(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
-    """Columns of two tables. `first` takes precedence if both have a column, or read the same source column."""
+    """Columns of two tables. `first` takes precedence if both state a column or read the same source column."""
     first = tuple(first)
     used_names = {_name_without_unit(own_column) for own_column, _, _ in first} | {theirs for _, theirs, _ in first}
     return (*first, *(c for c in others if _name_without_unit(c[0]) not in used_names and c[1] not in used_names))
 
 
 def _name_without_unit(mine: str) -> str:
-    """Name of a column without its unit, so that time_ms and time_s are equal."""
+    """Name of a column without its unit: time_ms and time_s become equal."""
     layout = Layout(channels=channels.EVERY)
     quantities = layout.quantities()
     return next((column for column, quantity in quantities.items() if mine in quantity.columns()), mine)

@@ -44,26 +44,26 @@ from mmrjax.model.robot import Robot
 
 #: Profiles that come with the package, in `calibration/data/profiles/`.
 PACKAGED = ("stair", "stop_and_go", "shuttle", "patrol")
-#: Modes in which the driver's controller follows a demand, which is a channel.
+#: Modes in which a controller follows the demand for a channel.
 CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
-#: Most rows in all, cycles included.
+#: Largest number of rows, counting all cycles.
 LONGEST = 1_000_000
-#: Quantities of columns, by field of `mmrjax.missions.profile.Profile`; demands become `demand`.
+#: Quantities of columns, by field of `mmrjax.missions.profile.Profile`. Demands are stored in `demand`.
 QUANTITIES: dict[str, Quantity] = {
     quantity.key: quantity
     for quantity in (quantities.BY_COLUMN["time_s"], *quantities.SET, *channels.EVERY)
     if quantity.in_profiles
 }
-#: Columns of demands, at most one in a row, and the mode of each.
+#: Columns of demands and their modes. A row has at most one demand.
 DEMANDS = {
     **dict.fromkeys(("duty", *PAIRS[0], *PAIRS[1]), MODES[VOLTAGE]),
     **{mode: mode for mode in CONTROLLED},
 }
-#: Columns of a file that no row may leave empty.
+#: Columns that must not be empty in any row.
 HELD = ("voltage", "slope_deg", "payload", "load_torque", "current_other")
 MODE, SURFACE = "mode", "surface"
-#: Initial state of a mission that comment lines may set: field of `Start`, least, greatest, and the SI value of one
+#: Initial values of a mission that comment lines may set: field of `Start`, least, greatest, and SI value of the
 #: unit.
 STARTS = {
     "start_speed_mm_s": ("speed", -50_000.0, 50_000.0, 1e-3),
@@ -87,7 +87,7 @@ class ProfileTable:
         surface: surface of Table 5 in each row, None if the file states none.
         linear, cycles: as in `mmrjax.missions.profile.Profile`.
         digest: SHA-256 of the file.
-        begins: fields of `Start` in the file [SI, °C]: rolling speed, temperatures of winding and housing.
+        begins: fields of `Start` that the file states [SI, °C]: rolling speed, temperatures of winding and housing.
         notes: sentences on how the file was read.
     """
 
@@ -125,7 +125,7 @@ class ProfileTable:
 
     @property
     def stated(self) -> Names:
-        """Columns of conditions that it states, by their names in tables of runs."""
+        """Names that its conditions have in tables of runs."""
         names = {"voltage": SUPPLY, "slope_deg": "slope_deg", "payload": "payload_kg", "load_torque": LOAD}
         return (
             *(column for name, column in names.items() if name in self.values),
@@ -163,7 +163,7 @@ class ProfileTable:
             )
 
     def profile(self, robot: Robot, conditions: Conditions) -> Profile:
-        """Profile in the form that simulations take, for a batch of runs.
+        """Profile in the form that simulations use, for a batch of runs.
 
         Args:
             robot: robot that follows it.
@@ -233,7 +233,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     columns = _profile_columns(name, header)
     if len(body) < 2:
         got = "one row" if body else "a header and no rows"
-        raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
+        raise BadData(f"{name}: got {got}; expected at least two rows, the last of which ends the mission")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
@@ -325,7 +325,7 @@ def _standard_columns() -> list[str]:
 
 
 def _refuse_column(name: str, column: str) -> NoReturn:
-    # The longest name that it begins with: motor_speed before speed.
+    # The longest matching name comes first: motor_speed before speed.
     for quantity in sorted(QUANTITIES.values(), key=lambda q: -len(q.name)):
         if column == quantity.name or column.startswith(f"{quantity.name}_"):
             unit = column[len(quantity.name) + 1 :] or "none"
@@ -353,7 +353,7 @@ class _CellReader:
         return field in self.columns
 
     def called(self, field: str) -> str:
-        """Column of a field, or the first one that it could have."""
+        """Column of a field in the file, or else its usual column."""
         return self.columns[field][0] if self.has(field) else next(iter(QUANTITIES[field].columns()))
 
     def text(self, field: str, row: int) -> str:
@@ -365,7 +365,7 @@ class _CellReader:
         raise BadData(f"{self.source} row {row + 1}, {self.columns[field][0]}: got {got}; expected {allowed}")
 
     def value(self, field: str, row: int) -> float:
-        """Number in a cell, in the unit of `Profile`."""
+        """Number in a cell, in the unit that `Profile` uses."""
         quantity, unit = QUANTITIES[field], self.columns[field][1]
         low, high = quantity.limits(unit)
         allowed = f"{low:g} to {high:g}"
@@ -379,7 +379,7 @@ class _CellReader:
         return value * quantity.factor if isinstance(quantity, Channel) else value
 
     def held(self, field: str) -> np.ndarray:
-        """Numbers of a required column. With held values, the last row may be empty."""
+        """Numbers of a required column. If values are held between rows, the last row may be empty."""
         last = len(self) - 1
         held_values: list[float] = []
         for row in range(len(self)):
@@ -411,8 +411,8 @@ def _time(cells: _CellReader) -> np.ndarray:
 def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
     """Mode of each row, and by field of `Profile` its demand and the stated duties, voltages and yaw rates.
 
-    If values are linear between rows, a demand of another mode ends the ramp that leads to its row. Otherwise it is
-    an error: a second demand.
+    If values are linear between rows, a demand of another mode ends the ramp that leads to its row. Otherwise a
+    second demand is an error.
     """
     modes: list[str] = []
     shares = [field for field in DEMANDS if DEMANDS[field] == MODES[VOLTAGE] and cells.has(field)]
@@ -427,7 +427,7 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
         demands = [field for field in filled if DEMANDS[field] == mode]
         _check_demands(cells, row, before, mode, demands, [f for f in filled if f not in demands and f not in ends])
         modes.append(mode)
-        if row and cells.linear:  # default end of the ramp that leads here
+        if row and cells.linear:  # default end of the ramp to this row
             for name in wholes:
                 shares_found[name][row] = 0.0 if mode in CONTROLLED else shares_found[name][row - 1]
             for name in shares:

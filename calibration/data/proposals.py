@@ -22,11 +22,11 @@ COMMAND = re.compile(r"(?:^|[^a-z])(?:cmd|command|target|set_?point|ref|referenc
 OTHER = re.compile(
     r"status|flag|error|fault|count|index|stamp|air|wind\b|pitot|latit|longit|altit|gps|ambient|_raw|roll|yaw|gyro|accel"
 )
-#: Quantities that a command may state, because they are imposed.
+#: Quantities that a command may contain, because they are imposed.
 IMPOSED = ("supply_voltage", "duty")
-#: Largest number of a signal that is no time stamp and no counter, and of a voltage and a current without a unit.
+#: Larger numbers are time stamps or counters. Largest voltage and current without a unit.
 LARGEST, LARGEST_V, LARGEST_A = 1e6, 1000.0, 500.0
-#: Smallest share of its readings that a current of the supply differs from duty times current of the motor.
+#: Smallest relative difference between a supply current and duty times motor current.
 POWER = 0.25
 
 
@@ -57,22 +57,22 @@ MEANINGS = tuple(Meaning(quantity, re.compile(pattern)) for quantity, pattern in
     ("winding_temperature", r"winding|wicklung|motor[^/]*temp"),
     ("run_id", r"run_?id|episode|trial"),
 ))  # fmt: skip
-#: Numbers that stand for a whole duty in commands without a unit.
+#: Numbers that mean full duty in commands without a unit.
 WHOLE = (127, 128, 255, 256, 400, 511, 512, 1000, 1023, 1024, 2047, 4095, 8191, 32767)
-#: Largest number of a speed without a unit that is read in m/s: without its place, and with it.
+#: Largest speed without a unit that is taken as m/s: if the log has no position, and if it has one.
 SLOW, LARGEST_M_S = 10.0, 30.0
-#: Units of a place, of its rate, and the first in one of the second times a second.
+#: Unit of a position, unit of its rate, and position after one second at a rate of 1.
 RATES = (
     ("m", "m_s", 1.0), ("turns", "turns_s", 1.0), ("deg", "deg_s", 1.0), ("rad", "rad_s", 1.0), ("mm", "mm_s", 1.0),
     ("turns", "rpm", 1 / 60), ("deg", "rpm", 6.0), ("rad", "rpm", math.pi / 30), ("deg", "rad_s", 180 / math.pi),
     ("turns", "rad_s", 0.5 / math.pi), ("rad", "turns_s", 2 * math.pi), ("deg", "turns_s", 360.0),
     ("mm", "m_s", 1e3), ("m", "mm_s", 1e-3),
 )  # fmt: skip
-#: Units that only quantities of places have, and that only their rates have.
+#: Units that only positions have, and that only rates have.
 _PLACES, _SPEEDS = {"m", "turns"}, {"m_s", "turns_s"}
-#: Largest relative difference of a rate from one of these, and of a place from the integral of its rate.
+#: Largest relative error of such a ratio, and of a position that is compared with the integral of its rate.
 SAME_RATE, INTEGRAL = 0.03, 0.05
-#: Quantities of which the only signal in one of their units is taken if its name has no meaning.
+#: Quantities that the only signal in one of their units is taken to be, if its name has no known meaning.
 BY_UNIT = ("supply_voltage", "total_current", "motor_speed", "winding_temperature")
 
 
@@ -102,11 +102,11 @@ class ColumnCandidate:
 def propose_columns(
     signals: Sequence[Signal], spelled: set[str], seconds: Callable[[Signal], np.ndarray | None]
 ) -> Iterator[tuple[str, str]]:
-    """Proposes columns for signals: the path of each signal, with its line of a table `[columns]`.
+    """Proposes columns for signals: the path of each signal, and its line in a table `[columns]`.
 
     Args:
-        signals: signals, those that change first.
-        spelled: names that already are columns.
+        signals: signals, in order of preference.
+        spelled: names that are already columns.
         seconds: function that returns the times of a signal [s].
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
@@ -159,7 +159,7 @@ def _joint_name(signal: Signal, signals: Sequence[Signal]) -> str:
 def _candidate_of_signal(
     signal: Signal, unit: str | None, alone: bool, columns: Mapping[str, Mapping[str, str]]
 ) -> ColumnCandidate | None:
-    """Quantity that a signal may be. None if its unit, behaviour or name excludes all quantities.
+    """Quantity that a signal may show. None if its unit, behaviour or name excludes all quantities.
 
     Args:
         unit: unit of the signal, spelled as in columns. None: it states none.
@@ -192,10 +192,10 @@ def _candidate_of_signal(
         if largest <= 1.0:
             return ColumnCandidate(signal, quantity, "duty")
         full_scale = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
-        if full_scale is None or values.min() > 0.4 * largest:  # the width of a pulse has a large least value
+        if full_scale is None or values.min() > 0.4 * largest:  # pulse widths never become small
             return None
         return ColumnCandidate(
-            signal, quantity, "duty", f"is {full_scale} a whole duty?", float(f"{1 / full_scale:.8g}")
+            signal, quantity, "duty", f"is {full_scale} full duty?", float(f"{1 / full_scale:.8g}")
         )
     if unit is None and quantity == "motor_speed" and largest < SLOW:
         return ColumnCandidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")
@@ -212,7 +212,7 @@ def _candidate_of_signal(
 
 
 def _path_words(path: str) -> str:
-    """Path in lower case, with underscores between words that are separated by capitals."""
+    """Path in lower case. Words that capitals separate get underscores."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", path).casefold()
 
 
@@ -262,7 +262,7 @@ def _candidates_by_rate(
     columns: Mapping[str, Mapping[str, str]],
     seconds: Callable[[Signal], np.ndarray | None],
 ) -> Iterator[ColumnCandidate]:
-    """Candidates for position and speed, with units that agree with each other.
+    """Candidates for position and speed with consistent units.
 
     Args:
         stated: unit of each signal, by its path.
@@ -333,7 +333,9 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
 
 
 def _currents_by_duty(pool: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:
-    """Candidates for two currents next to a duty: the supply current is the motor current times the duty."""
+    """Candidates for two currents that are logged with a duty: the supply current is the motor current times the
+    duty.
+    """
     pool = [*pool]
     duty = next((c for c in pool if c.quantity == "duty"), None)
     currents = [c for c in pool if c.quantity in ("total_current", "motor_current")]

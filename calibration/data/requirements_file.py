@@ -34,11 +34,11 @@ RANGES: dict[str, tuple[float, float, str]] = {
 KEYS = ("configuration", "surface", "battery", *RANGES)
 #: Uses of the battery, for the endurance.
 DUTIES = ("standing", "driving")
-#: Least and greatest that a requirement may state, in the unit of its name.
+#: Smallest and largest limit of a requirement, in the unit of its name.
 STATED = (0.0, 1e6)
-#: Stairs have a rise and a tread, whose least and greatest are stated [mm].
+#: Key for the tread of stairs, and its smallest and largest value [mm].
 STAIRS, TREAD, TREADS = "stairs_rise_mm", "tread_mm", (10.0, 5000.0)
-#: Word that stands for the limit that the part permits, and the quantities for which parts state one.
+#: Word for the rating of the part as limit, and the quantities for which parts have ratings.
 RATED = "rated"
 RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
 
@@ -49,7 +49,8 @@ class Envelope:
 
     Attributes:
         configuration: name of the configuration. Empty: the first one of the robot.
-        surface: surface of Table 5. battery: on the battery, else on the external supply.
+        surface: surface of Table 5.
+        battery: True on the battery, False on the external supply.
         payload_kg, slope_deg, state_of_charge, supply_voltage_V: ranges, units as named.
         ambient_C: ambient temperature [°C]. None: that of the robot.
     """
@@ -70,7 +71,7 @@ class Envelope:
 
     @property
     def charge_end(self) -> float:
-        """State of charge at the end of the battery's use: the lower end of its range. 0 if the range is one
+        """State of charge at the end of the battery's use: the lower end of its range. 0 if its range is a single
         number.
         """
         low, high = self.state_of_charge
@@ -91,9 +92,9 @@ class Requirement:
     Attributes:
         name: name of the quantity, one of `QUANTITIES`.
         limit: limit in the unit of the name. None: the rating of the part.
-        least: true if the quantity must be at least the limit, false if at most.
+        least: True if the quantity must be at least the limit, False if at most.
         envelope: conditions under which it has to be met.
-        share: for endurance, share of the time in which the robot drives. 0: it stands.
+        share: for endurance, share of the time that the robot drives. 0: it stands.
         tread_mm: for the rise of stairs, their tread [mm].
         source: origin of the requirement.
     """
@@ -153,17 +154,17 @@ def load_requirements(path: Path | None) -> Requirements:
 def parse_requirements(text: str, where: str) -> Requirements:
     """Requirements from the text of a file.
 
-    The file states quantities by name. The value of each is a number (the least or the most allowed, by its usual
-    sense), a table, or a list of tables. For some quantities it may be "rated" (the limit that the part permits). A
-    table has `least`, `most`, `source`, and keys of the envelope for this requirement only. A table of the endurance
+    The file states quantities by name. The value of each is a number (the smallest or largest allowed value,
+    depending on the quantity), a table, or a list of tables. For some quantities it may be "rated" (the rating of the
+    part). A table has `least`, `most`, `source`, and keys of the envelope for this requirement only. For endurance it
     also states `duty` (standing, or driving at full voltage for a `share` of the time).
 
     `[envelope]` applies to all requirements: payload_kg, slope_deg, state_of_charge or supply_voltage_V, ambient_C
     (a number or [least, greatest]), surface, configuration, and battery.
 
     Raises:
-        BadConfiguration: not TOML, no requirement. An unknown key, or one without its unit, no finite number, an
-            empty range. Requirements that contradict one another or the envelope.
+        BadConfiguration: the text is not TOML or has no requirement. A key is unknown or lacks its unit. A value is
+            not a finite number, or a range is empty. Requirements contradict one another or the envelope.
     """
     content = toml_content(text, where)
     schema = content.pop("schema", SCHEMA)
@@ -192,7 +193,7 @@ def parse_requirements(text: str, where: str) -> Requirements:
 
 
 def _stem_of_name(name: str) -> str:
-    """Name without its unit."""
+    """Name without unit."""
     units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
     return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
 
@@ -301,7 +302,7 @@ def _parse_limit(value: Any, where: str, quantity: Quantity) -> float | None:
     if value == RATED:
         if quantity.column not in RATINGS:
             raise BadConfiguration(
-                f"{where}: got {RATED!r}; expected a number, only {', '.join(RATINGS)} have a rating"
+                f"{where}: got {RATED!r}; expected a number; only {', '.join(RATINGS)} have a rating"
             )
         return None
     limits = RANGES["slope_deg"][:2] if quantity.unit == "deg" else STATED
@@ -319,7 +320,7 @@ def _parse_share(duty: Any, share: Any, where: str) -> float:
     return share_value
 
 
-#: Quantities that equal another quantity at some point of the envelope.
+#: Quantities that are computed as another quantity, at a certain point of the envelope.
 _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_speed_rpm"}
 
 

@@ -1,4 +1,4 @@
-"""Values that follow from a rig's numbers, and doubts about unusual numbers."""
+"""Values that follow from a rig's numbers, and doubts about implausible numbers."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from mmrjax.model.signals import GRAVITY
 
 BATTERY = "battery"
 OUTPUT_SPEED = channels.find_channel("output_speed").column
-#: Least ratio of a gearbox with three stages or more, and the largest efficiency that makers state for these.
+#: Smallest ratio of gearboxes with three or more stages, and the largest efficiency that makers state for them.
 STAGES, EFFICIENCY = 100.0, 0.85
-#: Least duration of a change of speed, in time constants, that the motors and load do not explain; fewest samples.
+#: Shortest change of speed that the inertia of motors and load does not explain [time constants]. Fewest samples.
 FAR, RISING = 100.0, 3
 
 
@@ -37,7 +37,7 @@ class DerivedFact:
     Attributes:
         what: meaning, in words.
         value: value with its unit, as text.
-        odd: reason to check the numbers, or empty.
+        odd: reason to check the numbers, empty if there is none.
     """
 
     what: str
@@ -54,7 +54,7 @@ def derived_facts(robot: Robot) -> list[DerivedFact]:
 
 
 def _reason_if_outside(value: float, low: float, high: float, why: str) -> str:
-    """`why`, with the usual range, if a value is outside that range. Otherwise empty."""
+    """`why` and the usual range if a value is outside it, otherwise empty."""
     return "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
 
 
@@ -120,7 +120,7 @@ def _current_for_torque(robot: Robot, torque: float) -> float:
 
 
 def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[DerivedFact]:
-    """Current for a torque, compared with the stall current if a voltage limit is known."""
+    """Current for a torque, compared with the stall current if a voltage limit is stated."""
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
@@ -200,7 +200,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
 def doubtful_time(runs: Runs, robot: Robot) -> str:
     """Reason to suspect that the time of a log is in milliseconds, empty without evidence.
 
-    At constant voltage, its speed then changes over far longer than motors with their load take.
+    The speed at constant voltage would then change much more slowly than the inertia allows.
     """
     if not runs.sampled or robot.rig.imposed != "voltage":
         return ""
@@ -227,14 +227,14 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     return ""
 
 
-#: Usual range of a log's largest imposed current, in multiples of the current that turns a load slowly.
+#: Usual range of the largest imposed current of a log, in multiples of the current that turns the load slowly.
 LEAST, MOST = 0.1, 100.0
 
 
 def doubtful_current(runs: Runs, robot: Robot) -> str:
     """Reason to doubt the unit of an imposed current or torque, empty without evidence.
 
-    The current is far from the one that turns the loads of the table slowly.
+    The current is far from the current that turns the loads slowly.
     """
     column, present = runs.layout.imposed_column, set(runs["configuration"])
     loads = [x for name, x in robot.configurations.items() if name in present and isinstance(x, Shaft)]
@@ -254,7 +254,7 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     )
 
 
-#: Multiple of the usual time between rows beyond which rows may be missing.
+#: Time between rows beyond which rows may be missing, in multiples of the usual time.
 LONG = 100.0
 
 
@@ -283,16 +283,16 @@ def gap_sentence(runs: Runs) -> str:
     return told
 
 
-#: Least relative spread of the times between rows, and largest correlation of one with the next, of a clock that
-#: jitters; fewest rows.
+#: A clock jitters if the time between rows has at least this relative spread and at most this correlation with the
+#: next. Fewest rows.
 UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
 
 
 def jitter_sentence(runs: Runs) -> str:
     """Sentence on a clock that jitters although rows are evenly spaced. Otherwise empty.
 
-    If rows are even and clock errors independent, successive time steps correlate by -1/2. If the rows themselves are
-    uneven, time steps are independent.
+    With even rows and independent clock errors, successive time steps have a correlation of -1/2. If the rows
+    themselves are uneven, time steps are independent.
     """
     for name, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
@@ -326,18 +326,18 @@ def constant_conditions_sentence(runs: Runs) -> str:
     )
 
 
-#: Rows up to this share of the largest voltage show resistance and back-EMF; fewest such rows; largest misfit over
-#: their voltage; the least share of a larger voltage that its rows have to show.
+#: Rows up to this share of the largest voltage give resistance and back-EMF. Fewest such rows. Their largest relative
+#: misfit. Smallest share of a larger voltage that its rows must show.
 INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
 
 
 def saturation_sentence(runs: Runs) -> str:
     """Sentence on a command voltage that the driver does not reach, empty without evidence.
 
-    Rows at low voltage give U = R I + k ω by least squares. If the driver limits the voltage, rows at higher commands
-    have currents and speeds that correspond to one constant voltage.
+    Least squares of U = R I + k ω over rows at low voltage give R and k. If the driver limits the voltage, currents
+    and speeds at higher commands correspond to one constant voltage.
     """
-    # With a duty, the supply's current is only a share of the motors' current.
+    # With a duty, the supply current is only a share of the motor current.
     current_columns = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
     current, speed = next((c for c in current_columns if runs.has(c)), CURRENT), SPEED
     if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
@@ -355,7 +355,7 @@ def saturation_sentence(runs: Runs) -> str:
     top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
     limit = float(np.median(np.abs(predicted[top])))
     beyond = read & (np.abs(drive) > limit / REACHES)
-    # If the voltage that they show still rises, the reason is another one.
+    # If the voltage from these rows still rises, the driver does not limit it.
     if beyond.sum() < ROWS_INNER or np.std(np.abs(predicted[beyond])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(beyond)[0])
@@ -367,12 +367,12 @@ def saturation_sentence(runs: Runs) -> str:
     )
 
 
-#: Ratio of speeds to the robot's file beyond which the unit of one of its columns is doubted.
+#: Ratio of the speed to the one that follows from the robot file, beyond which a unit is doubted.
 OTHER_UNIT = 3.0
 
 
 def doubtful_speed(runs: Runs, robot: Robot) -> str:
-    """Reason to doubt the unit of an imposed voltage or of the speed, empty without evidence.
+    """Reason to doubt the unit of the imposed voltage or of the speed, empty without evidence.
 
     The speed is far above the one at which the back-EMF equals the voltage. A load lowers the speed, so a speed that
     is too small shows only in rows without current or brake torque.
@@ -399,20 +399,20 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     )
 
 
-#: Multiple of the torque at stall beyond which a brake's torque is taken to be in another unit.
+#: Brake torque beyond which another unit is suspected, in multiples of the stall torque.
 BEYOND = 3.0
 
 
 def doubtful_torque(runs: Runs, robot: Robot) -> str:
     """Reason to doubt the unit of a brake torque, empty without evidence or if the speed is imposed.
 
-    In most rows the torque is far above the stall torque of the motors.
+    In most rows the torque is far above the motors' stall torque.
     """
     of_current = robot.rig.imposed == "motor_current"
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    torque_at_zero, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
+    torque_at_zero, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
     stall = np.maximum(torque_at_zero + (made - torque_at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
@@ -425,8 +425,9 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     )
 
 
-#: Share of its largest value above which a reading is not one at rest; share of a run, and of the range of what is
-#: imposed, over which a reading that stays the same is held; share of the power of either sign that shows a swap.
+#: Reading above which a signal is not at rest, as a share of its largest value. A reading is held if it stays the
+#: same over these shares of the run and of the imposed range. Share of power of either sign that indicates swapped
+#: signs.
 MOVES, HELD, SWAPPED = 0.05, 0.1, 0.3
 
 
@@ -469,7 +470,7 @@ def swapped_sentence(runs: Runs) -> str:
     """Sentence on a speed whose sign changes within a log although the drive does not, empty for others."""
     imposed = runs.layout.imposed_column
     if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
-        return ""  # what never changes its sign may lack one, which other checks report
+        return ""  # a signal that never changes sign may lack it, which other checks report
     for name in np.unique(runs.run_names):
         rows = runs.in_order(name)
         for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
@@ -487,7 +488,7 @@ def swapped_sentence(runs: Runs) -> str:
 
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
-    """Sentences on doubts about a log: its times, levels and limits, and units that do not fit the robot."""
+    """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
     doubts = (
         gap_sentence(runs),
         jitter_sentence(runs),
@@ -509,7 +510,7 @@ class NumberOrigin:
     """Origin of a parameter value.
 
     Attributes:
-        name: name of the parameter, value [unit].
+        name: name and value of the parameter [unit].
         sd: standard deviation, None if the file states none.
         why: origin, in words.
     """

@@ -18,7 +18,7 @@ from mmrjax.model.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
 
-#: Base of a robot that starts from nothing.
+#: Word for a robot without a base.
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
 KEYS = ("imposed", "channels", "start", "between_rows", "columns", "instruments", "surfaces")
@@ -39,18 +39,18 @@ LINEAR = {
     "inertia": "inertia of parts that turn with the output, without the mass [kg·m^2]",
 }
 _TRAVEL = ("lead_mm", "drum_radius_mm")
-_LEAST = {"mass_kg", *_TRAVEL}  # these must be more than 0
+_LEAST = {"mass_kg", *_TRAVEL}  # must be greater than 0
 
-#: Default values of a robot that starts from nothing, each with its reason. It has no limits and no other losses
+#: Default values of a robot without a base, each with its reason. It has no limits and no other losses
 #: (`robots.blank`).
 DEFAULTS: dict[str, tuple[float, str]] = {
     "motor.inertia": (0.0, "not stated: only the load's inertia counts; time histories from rest need the motor's"),
     "battery.current_other": (0.0, "not stated: no other consumers on the battery"),
 }
-#: Time constant L / R of a winding whose inductance is not stated [s]: of small motors 0.05 to 1 ms.
+#: Time constant L / R assumed if the inductance is not stated [s]. Small motors have 0.05 to 1 ms.
 WINDING = 2e-4
 WINDING_WHY = f"not stated: assumed, {1e3 * WINDING:g} ms of the resistance"
-#: The same of a vehicle, below its configuration.
+#: The same for a vehicle, below its configuration.
 VEHICLE: dict[str, tuple[float, str]] = {
     "track.loss_coulomb": (0.0, "not stated: wheels have no loss except rolling resistance"),
     "track.loss_viscous": (0.0, "not stated: no loss that rises with speed"),
@@ -66,15 +66,15 @@ VEHICLE: dict[str, tuple[float, str]] = {
     "turning.rule": (1.0, "not stated: assumed, friction opposite to the sliding velocity"),
     "turning.inertia": (0.0, "not stated: only a robot that turns needs it"),
 }
-#: Further required parameters of a vehicle that states its width, and so may turn.
+#: Further required parameters of a vehicle that states its width and can therefore turn.
 WIDTH, WHEELBASE = "turning.width", "running_gear.wheelbase"
-#: Parameter whose default value is taken from an example, and the reason.
+#: Parameters whose default value is an example, and the reason.
 CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example value; it shifts load in turns"
-#: Parameters of VEHICLE that tracks have to state.
+#: Parameters of VEHICLE that tracked vehicles must state.
 _OF_TRACKS = ("track.loss_coulomb",)
 DYNAMIC = "ground.friction.dynamic"
-#: Default share of a vehicle's mass that turns with its wheels, as disks. A simulation over time needs an inertia of
-#: the shaft; compared with the mass this one is small.
+#: Default mass of the wheels, as disks, as a share of the vehicle's mass. Simulations over time need an inertia of
+#: the shaft. This one is small compared with the mass.
 WHEELS = 0.05
 #: Reasons for default values of a vehicle that follow from other stated values.
 FOLLOWS = {
@@ -100,8 +100,8 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         sides: number of drives that move it together.
 
     Raises:
-        BadConfiguration: a key is unknown, a value is no number, the mass is missing, there is not exactly one
-            travel, or mass or travel is not positive.
+        BadConfiguration: a key is unknown, a value is no number, the mass is missing, lead and drum are both given or
+            both missing, or one of these is not positive.
     """
     for key in table:
         stated_word(key, LINEAR, f"{where}.{key}", "no such key of a linear unit")
@@ -168,7 +168,7 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
         entry: Any = table
         for key in keys:
             entry = entry.get(key) if isinstance(entry, Mapping) else None
-        return float(entry) if is_number(entry) else 0.0  # a value that is no number is refused later
+        return float(entry) if is_number(entry) else 0.0  # a value that is no number is rejected later
 
     defaults = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
     wheels = 0.5 * WHEELS * stated_value("mass") * stated_value("radius") ** 2 / sides
@@ -239,7 +239,7 @@ def _parse_surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tupl
     return tuple(stated.items())
 
 
-#: Word for a property of an instrument that is found in its table.
+#: Word for an instrument property that is inferred from its table.
 FREE = "free"
 
 
@@ -412,6 +412,6 @@ def value_text(name: str, value: float, rig: Rig) -> str:
 
 
 def is_default_rig(rig: Rig) -> bool:
-    """True if a rig is driven and measured like a robot whose file describes no rig."""
+    """True if a rig is driven and measured like a robot whose file states no rig."""
     usual = Rig()
     return all(getattr(rig, key) == getattr(usual, key) for key in KEYS)

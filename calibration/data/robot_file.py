@@ -30,16 +30,17 @@ from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
 
 SCHEMA = "mmrjax.robot/2"
-#: Whole numbers of a robot, which no fit can free: least, greatest, meaning.
+#: Whole numbers of a robot, which a fit cannot free: smallest, largest, meaning.
 COUNTS = {
     "sides": (1, 12, "(motors with the same command)"),
     "battery.cells": (1, 100, "(cells of the battery in series)"),
 }
 
-#: Key of an effect's table that scales the library's priors and limits to the rig's size.
+#: Key in an effect's table that scales the library's priors and limits to the rig.
 FACTORS = "scaled"
 
-#: Ratings by makers, which no fit can free: least, greatest, unit and meaning. Experiments stay within them.
+#: Makers' ratings, which a fit cannot free: smallest, largest, unit and meaning. Proposed experiments stay within
+#: them.
 RATINGS = {
     "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: the highest in the table"),
     "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
@@ -61,6 +62,13 @@ RATINGS = {
     ),
     "battery.current_limit": (1e-3, 1e4, "A", "largest discharge current of a cell; not stated: no limit"),
     "battery.current_charge": (0.0, 1e4, "A", "largest charging current of a cell; not stated: no limit"),
+    "controller.rate": (
+        0.0,
+        1e5,
+        "Hz",
+        "rate of the controller's samples, the first in a run's first row; 0: continuous",
+    ),
+    "controller.samples_late": (0.0, 1.0, "-", "number of samples, 0 or 1, after which its duty acts"),
     "controller.supply_voltage": (
         0.0,
         1000.0,
@@ -69,14 +77,14 @@ RATINGS = {
     ),
     "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell to which curvature and slope belong"),
 }
-#: The parabola of a cell's no-load voltage; together with a capacity, it applies to a cell of this capacity.
+#: Parabola of a cell's no-load voltage. If a capacity is stated too, it applies to a cell of that capacity.
 CURVE = {"battery.curvature", "battery.slope"}
-#: Switches of a robot, which no fit can free: meaning.
+#: Switches of a robot, which a fit cannot free: meaning.
 SWITCHES = {
     "gearbox.mesh_theory": "efficiency 2 - 1/η (gear mesh theory) when the load drives the motor, else η",
     "driver.returns_current": "supply and driver accept regenerative current (otherwise a diode blocks it)",
 }
-#: Choices by word, which no fit can free: allowed words, meaning.
+#: Choices by word, which a fit cannot free: allowed words, meaning.
 CHOICES = {
     "driver.decay": (
         DECAYS,
@@ -95,7 +103,7 @@ class RobotFile:
         stated: names of the parameters in the file. The keys of a linear unit become parameters of its shaft.
         linear: configurations that the file describes as linear units.
         text: text of the file.
-        remarks: sentences on the robot that readers of its numbers should know.
+        remarks: sentences about the robot for users of its numbers.
     """
 
     robot: Robot
@@ -118,7 +126,7 @@ def load_robot(name_or_path: str, library: Library = effects.BY_NAME, notes: lis
     Args:
         name_or_path: `nominal`, `sm1`, `sm2`, or a TOML file that `calibrate`, `loop` or `rig new` wrote.
         library: effects by name that the file may use.
-        notes: function that receives remarks on the file.
+        notes: callback for remarks on the file.
 
     Raises:
         BadConfiguration: no such name or file, or an invalid value in the file.
@@ -157,7 +165,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
     """Read a robot file. Its effects are looked up in `library` and among the curves.
 
     The file states, all optional:
-        schema: version of this form.
+        schema: version of the file format.
         base: name of the robot that it starts from, `nominal` if left out. `none` starts from nothing.
         imposed, channels, start, columns, instruments: how it is driven and measured, see `rig_file`.
         sides: number of motors. `battery.cells`: cells in series.
@@ -165,9 +173,9 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             A configuration that is not in the base states `like`, the base's configuration that it starts from.
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
-        parameters: parameters in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd
-            of their prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true
-            or false, and CHOICES.
+        parameters: parameters in SI units, in tables by dotted name, e.g. `[motor] resistance = 0.9`, or with the sd
+            of their prior, `"0.9 ± 5 %"`. The sd is wider as long as the number is that of a template. Also RATINGS,
+            SWITCHES (true or false) and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
@@ -176,8 +184,9 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
         notes: as for `find_robot_file`.
 
     Raises:
-        BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not finite, or
-            outside the field's bounds, or what `configured` and `add_effects` raise.
+        BadConfiguration: the text is not TOML. A key is unknown (the message lists the choices). A value is no
+            number, not finite, or outside its field's bounds. Also for the reasons of `loads_from_tables` and
+            `add_effects`.
     """
     text = toml_text(path, path.name)
     content = toml_content(text, path.name)
@@ -217,12 +226,12 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
 def _robot_before_parameters(
     base: Robot | None, content: Json, where: str, examples: Collection[str]
 ) -> tuple[Robot, dict[str, float], frozenset[str]]:
-    """Robot of a file before its parameters are applied, the standard deviations of those, and its linear units.
+    """Robot of a file before its parameters are applied, their standard deviations, and its linear units.
 
     Args:
         base: base robot. None: there is no base.
         content: content of the file. Keys other than parameters are removed from it.
-        examples: names of numbers that are still those of a template.
+        examples: names of numbers that still have the template's value.
     """
     if base is None:
         resolve_likes(content, where)
@@ -293,7 +302,7 @@ def add_effects(
         where: beginning of the error message.
 
     Raises:
-        BadConfiguration: the configurations of an effect are no list of names, or the robot lacks one of them.
+        BadConfiguration: the configurations of an effect are no list of names, or the robot lacks one.
     """
     library_with_built_in = {**effects.BESIDE, **library}
     present = []
@@ -326,7 +335,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     new_values = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
     ratings = {name: _check_setting(where, name, new_values.pop(name)) for name in settings if name in new_values}
-    if CURVE & new_values.keys() and "battery.capacity" in new_values:  # all of one cell, unless stated otherwise
+    if CURVE & new_values.keys() and "battery.capacity" in new_values:  # scaled to one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", new_values["battery.capacity"])
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
@@ -335,7 +344,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
             refused.setdefault(why, []).append(name)
     if refused:
         sentences = [f"{list_some(names, 80)}: {why}" for why, names in refused.items()]
-        if len(sentences) > 1:  # one message has room for all of them without the allowed names
+        if len(sentences) > 1:  # without the allowed names, one message holds all of them
             sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in new_values.items()})
@@ -382,7 +391,18 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
                 f"{name}.inertia must be above 0"
             )
     controller = robot.controller
-    controller = None if controller is None else dataclasses.replace(controller, lags=float(controller.lag) > 0)
+    if controller is not None:
+        controller = dataclasses.replace(controller, lags=float(controller.lag) > 0)
+        if controller.rate and controller.lags:
+            raise BadConfiguration(
+                f"{where}, controller.lag: got {float(controller.lag):g} s with rate = {controller.rate:g}; a held "
+                "duty has no lag: leave one of them out"
+            )
+        if controller.samples_late not in (0, bool(controller.rate)):
+            raise BadConfiguration(
+                f"{where}, controller.samples_late: got {controller.samples_late:g} with rate = "
+                f"{controller.rate:g}; expected 0, or with a rate 1"
+            )
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=controller)
 
 
@@ -450,8 +470,7 @@ def _check_pairs(robot: Robot, where: str) -> None:
 
 
 def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Writes a robot file with everything that the robot states, with unit, meaning and source. `read_robot` restores
-    it.
+    """Writes a robot to a file, with unit, meaning and source of each number. `read_robot` restores it.
 
     For a robot without a base, parameters that it does not state are left out.
     """
@@ -472,7 +491,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
         tables[f"effects.{effect.name}"] = _lines_of_effect(effect)
     for title, line in _lines_of_parameters(robot, nothing):
         tables.setdefault(title, []).append(line)
-    for title, line in _lines_of_ratings(robot, nothing, {name for name, lines in tables.items() if lines}):
+    for title, line in _rating_lines(robot, nothing, {name for name, lines in tables.items() if lines}):
         tables.setdefault(title, []).append(line)
     lines = [f"# {printable(line)}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if inherits else rig_file.NONE}"']
@@ -486,7 +505,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
 
 def _lines_of_effect(effect: Effect) -> list[str]:
-    """Lines of an effect's table except its parameters."""
+    """Lines of an effect's table other than its parameters."""
     configurations = effect.configurations or type(effect)().configurations
     lines = [f"configurations = {toml_value(effect.configurations)}  # in which it acts"] if configurations else []
     if type(effect).plain is not None:
@@ -505,7 +524,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
     for parameter in params.walk_parameters(robot):
         table, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)
-        if table.startswith("rig."):  # where the runs of one table begin is not the robot's
+        if table.startswith("rig."):  # the start of a table's runs is no property of the robot
             continue
         was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
@@ -520,8 +539,8 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         yield table, f"{line}{origin}" if inherits else line
 
 
-def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
-    """Table and line of each rating, switch and choice that differs from the base robot.
+def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
+    """Table and line of each rating, switch and choice that differs from those of the base robot.
 
     Args:
         stated: tables that already have an entry.
@@ -535,7 +554,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
     for name, (_, _, unit, meaning) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = value(robot, name)
-        beside = key == "capacity_curve" and part in stated  # else it would follow from the capacity
+        beside = key == "capacity_curve" and part in stated  # otherwise it would follow from the capacity
         if rating is not None and (inherits or beside or rating != value(nothing, name)):
             stated = stated | {part}
             yield part, f"{key} = {rating!r}  # [{unit}] {meaning if inherits else meaning.partition(';')[0]}"

@@ -28,21 +28,21 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.robot import Load, Robot
 
-#: Least rows between two readings of a slow sensor, and least number of its readings.
+#: Fewest rows between two readings of a slow sensor, and fewest readings.
 APART, FEWEST = 2, 12
-#: Share of changes that may come sooner than a period, and least share that comes after a whole number of periods.
+#: Largest share of changes before a full period, and smallest share after a whole number of periods.
 SOONER, REGULAR = 0.02, 0.8
-#: Least share of rows that repeat the row before, and least ratio of the periods of recordings.
+#: Smallest share of rows that repeat the row before, and smallest ratio of the periods of recordings.
 LEAST, ALIKE = 0.3, 0.8
-#: Least share of changes by one smallest step for which a channel's repeats are attributed to its display.
+#: If at least this share of changes are by one smallest step, repeats are attributed to the display.
 STEPS = 0.5
 
 
 def reading_period(values: np.ndarray) -> float:
-    """Number of rows between two readings of a slow sensor in a log. 0 for a channel that is read in every row.
+    """Number of rows between two readings of a slow sensor in a log. 0 for a channel with a new reading in every row.
 
     A slow sensor changes at even intervals of two rows or more, and rarely sooner. An instrument with coarse
-    resolution repeats numbers too, but it changes by its smallest step, or at irregular intervals.
+    resolution also repeats numbers, but changes by its smallest step or at irregular intervals.
 
     Args:
         values: readings of a channel in one recording, in order of time, NaN if missing.
@@ -68,8 +68,7 @@ def reading_period(values: np.ndarray) -> float:
 def drop_repeated_readings(
     values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
-    """Values of a channel in which each reading of a slow sensor occurs once, and the number of rows between
-    readings.
+    """Values of a channel with each reading of a slow sensor kept only once, and the number of rows between readings.
 
     Rows that repeat a reading are NaN. Without repeated readings, the values are unchanged and the number is 0.
 
@@ -94,7 +93,7 @@ def drop_repeated_readings(
         finite_rows = rows[np.isfinite(values[rows])]
         begins = np.flatnonzero(np.concatenate([[True], np.diff(values[finite_rows]) != 0]))[: len(finite_rows)]
         lengths = np.diff(np.append(begins, len(finite_rows)))
-        times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # a reading may be the same again
+        times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # two readings may be equal
         first = np.repeat(begins, times)
         again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
         nearest = finite_rows[np.minimum(first + np.round(again * rows_apart).astype(int), len(finite_rows) - 1)]
@@ -102,13 +101,13 @@ def drop_repeated_readings(
     return first_readings, rows_apart
 
 
-#: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
+#: Distance by which noise may carry a reading across zero, in stated sds, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
-#: Fewest levels of the drive that show whether readings have signs.
+#: Fewest levels of the drive for deciding if readings have signs.
 LEVELS_OF_SIGN = 3
-#: Least time between settled points [s], and in time constants of the motors with their load.
+#: Shortest time between settled points [s], and in time constants of motors and load.
 SECONDS_APART, CONSTANTS_APART = 0.5, 5.0
-#: Share of the largest reading of a speed below which an undriven motor counts as at rest.
+#: An undriven motor is at rest below this share of the largest speed.
 STILL = 0.02
 
 
@@ -119,7 +118,7 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     held = columns.get("held", np.zeros(1))
     for row in np.flatnonzero((held != 0) & (held != 1))[:1]:
         raise BadData(
-            f"{name} row {row + 1}, held: got {held[row]:g}; expected 1 where a clamp holds the output, else 0"
+            f"{name} row {row + 1}, held: got {held[row]:g}; expected 1 if a clamp holds the output, otherwise 0"
         )
     for row in np.flatnonzero((held == 1) & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
@@ -190,7 +189,7 @@ def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout)
 
 
 def _check_driving(name: str, columns: Columns) -> None:
-    if "mode" in columns and not set(TIME) <= set(columns):  # settled runs are driven
+    if "mode" in columns and not set(TIME) <= set(columns):  # motors of settled runs are driven
         raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" not in columns:
         return
@@ -228,10 +227,10 @@ def too_light_message(where: str, total: float, payload: float) -> str:
 
 
 def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
-    """Columns without the time if each row is a settled run, and a note that says so.
+    """Columns without the time if each row is a settled run, and a note on that.
 
-    Rows are then at least `CONSTANTS_APART` time constants apart: of the windings if a clamp holds the output in
-    every row, otherwise of the motors, and then `_are_separate_settings` must hold.
+    Rows are then at least `CONSTANTS_APART` time constants apart. These are of the windings if a clamp holds the
+    output in every row. Otherwise they are of the motors, and `_are_separate_settings` must be true.
     """
     columns_left, time = dict(columns), columns.get("time_s")
     if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
@@ -261,7 +260,7 @@ def _is_clamped(columns: Columns, layout: Layout) -> bool:
 
 
 def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bool:
-    """True if rows are `SECONDS_APART` or more apart, and half of them are at another setting than the row before.
+    """True if rows are at least `SECONDS_APART` apart, and half of them have another setting than the row before.
 
     Readings must follow the setting of their own row at least as well as that of the row before.
     """
@@ -281,7 +280,7 @@ def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bo
 
 
 def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
-    """Sum of squares of the readings that no linear function of the settings explains."""
+    """Sum of squared residuals of the readings, fitted by a linear function of the settings."""
     a = np.stack([np.ones(len(readings)), *settings], 1)
     sound = np.isfinite(readings)
     if sound.sum() < 3:
@@ -321,9 +320,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
         slope = columns["slope_deg"]
         if slope.any():
             row = int(np.flatnonzero(slope)[0])
-            more = (
-                f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
-            )
+            more = f", as in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
             raise BadData(
                 f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; expected "
                 "0, since on a slope the heading keeps changing and a turn never settles. Remove these rows. To "
@@ -338,12 +335,12 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
     """True for rows of settled runs whose motors are driven, and a sentence on the other rows.
 
     Raises:
-        BadData: no row is driven, or a speed was read in a row where nothing drives the motors.
+        BadData: no row is driven, or a row has a speed although nothing drives its motors.
     """
     sides = [c for c in layout.sides if c in columns]
     column = layout.imposed_column
     size = np.max(np.abs([columns[c] for c in sides]), 0) if sides else np.abs(columns[column])
-    if layout.imposed == "motor_speed" and LOAD in columns:  # a shaft at rest pushes against its load
+    if layout.imposed == "motor_speed" and LOAD in columns:  # a shaft at rest may push against its load
         size = size + np.abs(columns[LOAD])
     if layout.imposed == "voltage":
         size = size * np.abs(columns[SUPPLY] if sides else columns.get("duty", 1.0))
@@ -394,16 +391,16 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
                     "negative reading, since by the robot's file the instrument shows only the magnitude"
                 )
             continue
-        # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
+        # Downhill, gravity may drive a motor. Only uphill or on the flat do current and voltage have the same sign.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
         if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
-            continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
+            continue  # the load may drive a motor; a reversing bridge also reverses the supply current
         doubt = _sign_tolerance(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         if _rises_through_zero(imposed, readings, backward):
             wrong = wrong[:0]
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
-        forward &= channel.name != "motor_voltage"  # it is compared with the back-EMF
+        forward &= channel.name != "motor_voltage"  # compared with the back-EMF instead
         against = np.flatnonzero(forward & (readings < -doubt))
         if against.size:
             row = int(against[0])
@@ -424,10 +421,9 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
 
 
 def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.ndarray) -> bool:
-    """True if readings of backward rows are signed with an offset, because they rise with the imposed value towards
-    zero.
+    """True if readings of backward rows rise with the imposed value towards zero: they have signs and an offset.
 
-    A lost sign would mirror the forward readings, which then fall toward zero.
+    Without signs they would mirror the forward readings and fall towards zero.
     """
     read = backward & np.isfinite(readings)
     if len(np.unique(imposed[read])) < LEVELS_OF_SIGN:
@@ -465,7 +461,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
     for row, cells in enumerate(zip(*told, strict=True), 1):
         alike.setdefault(cells, []).append(row)
     if copied := [rows for rows in alike.values() if len(rows) > 1]:
-        others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
+        others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
             f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}. "
             "They count as repeats. Remove copies: they make results look more certain than they are"
@@ -477,7 +473,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
             run = runs[np.argmax(several)]
             rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
             row_words = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
-            others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
+            others = f", and {several.sum() - 1} more run_ids are repeated" if several.sum() > 1 else ""
             yield (
                 f"{name}: run_id {run} is in rows {row_words}{others}. Without {', '.join(TIME)} every row is a "
                 "separate run"
@@ -485,10 +481,10 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
 
 
 def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
-    """Note on settled rows in which an unsigned load torque drives a shaft that runs backward."""
+    """Note on settled rows in which an unsigned load torque drives a shaft backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
-        more = f", and so in {on.size} rows" if on.size > 1 else ""
+        more = f", as in {on.size} rows" if on.size > 1 else ""
         yield (
             f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
             f"backward{more}: here it drives the shaft. The torque of a brake is negative for backward motion"

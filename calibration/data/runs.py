@@ -1,7 +1,7 @@
 """Runs from files or memory: a table of operating points or samples, from its source to checked columns.
 
-A reader returns the raw columns of its source by name (`NamedArrays`). For every source, `runs_of_arrays` gives each
-column its meaning, checks the values and returns `Runs`.
+A reader returns the raw columns of its source by name (`NamedArrays`). `runs_of_arrays` gives each column its
+meaning, checks the values and returns `Runs`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "read_runs", "runs
 
 #: Tables that come with the package.
 PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_paper.csv"}
-#: Bad cells that a message lists, at most.
+#: Most rejected cells that a message lists.
 LISTED = 8
 
 
@@ -63,18 +63,18 @@ def read_runs(
 
     Args:
         source: `measured`, `simulated_by_paper`, a path, or a table in memory. Files are CSV, Parquet, Feather,
-            Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. A path of signals
-            may follow `::`. A pattern such as `runs/*.csv` reads files that are a run each. Tables in memory are a
-            pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
+            Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. `::` and a path of
+            signals may follow. With a pattern such as `runs/*.csv`, each file is a run. Tables in memory are a pandas
+            or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
         columns: meaning of the source's columns, if their names are not those of this program: a packaged preset
             (`vesc,pole_pairs=7`), a preset file, or a dict such as `{"motor_speed_rpm": "speed"}`. It takes
             precedence over the robot file.
         measured, battery, robot, of_turns: as in `runs_of_arrays`.
 
     Raises:
-        BadData: no such file, a format that is not read, a damaged file, a signal that is missing or of another kind,
-            or as `runs_of_arrays`.
-        BadConfiguration: no such preset, or a preset with a mistake.
+        BadData: the file is missing, damaged or in a format that is not read, a signal is missing or of another kind,
+            or as in `runs_of_arrays`.
+        BadConfiguration: the preset does not exist or has a mistake.
     """
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
     preset = None
@@ -126,9 +126,9 @@ def runs_of_arrays(
         mapped: columns with other names in the source, as in `Layout.mapped`. None: from the robot file.
 
     Raises:
-        BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit. Values that
-            contradict each other or the robot. A value that is no number, not finite or out of range. The sentence
-            has source, row, column, value and the allowed values.
+        BadData: columns, rows or channels are missing. A column is missing, misspelt, repeated, or in a wrong unit.
+            Values contradict each other or the robot. A value is no number, not finite or out of range. The message
+            has source, row, column, value and allowed values.
     """
     inferred = robot is None
     name, layout = arrays.name, Layout.of(robot)
@@ -164,7 +164,7 @@ def runs_of_arrays(
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
-    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+    elif measured and not set(TIME) <= set(columns):  # histories may stop or roll against the motors
         columns, driven, left_out = row_checks.driven_rows(name, columns, layout)
         is_kept[is_kept] = driven
         notes = (*notes, *left_out)
@@ -192,7 +192,7 @@ def runs_of_arrays(
 def _column_values(
     arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
 ) -> tuple[Columns, Names]:
-    """Values of the known columns, and notes on cells that are read as another value."""
+    """Values of the known columns, and notes on changed cells."""
     columns: Columns = {}
     bad: list[tuple[int, int, str]] = []
     notes: list[str] = []
@@ -263,7 +263,7 @@ def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
 def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:
     """Names of configurations with the capitals of the robot file, and notes on changed names."""
     meant = {c.casefold(): c for c in layout.configurations}
-    if len(meant) < len(layout.configurations):  # they differ only in their capitals
+    if len(meant) < len(layout.configurations):  # the names differ only in capitals
         return cells, []
     others = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
     odd = {c: meant[c.casefold()] for c in others if c.casefold() in meant}
@@ -272,7 +272,7 @@ def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tu
 
 
 def _values_without_role(raw: Raw) -> np.ndarray:
-    """Values of a column without a role: numbers if every reading is one, otherwise words."""
+    """Values of a column that the model does not use: numbers if every cell is a number, otherwise words."""
     if isinstance(raw, np.ndarray):
         return raw
     numbers = column_numbers(raw)
@@ -317,7 +317,7 @@ def single_run(cells: Json, layout: Layout | None = None) -> Runs:
         layout: layout of the robot's tables. None: of the packaged robot.
 
     Raises:
-        BadConfiguration: an option is out of range, not finite, or an unknown word.
+        BadConfiguration: an option is out of range or not finite, or is an unknown word.
     """
     layout = Layout() if layout is None else layout
     rows = layout.quantities()

@@ -1,4 +1,4 @@
-"""Settled runs from a log over time: stretches with a constant drive in which every channel has settled."""
+"""Settled runs of a log: stretches of constant drive in which every channel has settled."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 
-#: Share of a signal's largest size below which it counts as zero: the motors are not driven, the output is at rest.
+#: Below this share of its largest value, a signal counts as zero: motors not driven, output at rest.
 STILL = 0.02
-#: Least uncertainty of a signal as a share of its largest size, in addition to the share of its own mean.
+#: Smallest uncertainty of a signal as a share of its largest value, in addition to the share of its mean.
 FINE = 0.005
-#: Default of the largest change of a mean within a stretch, as a share of the mean.
+#: Default of the largest change within a stretch, as a share of the mean.
 DRIFT = 0.02
-#: Default of the shortest stretch [s].
+#: Default length of the shortest stretch [s].
 LEAST = 0.3
-#: Fewest samples of a stretch, and of its parts between which means are compared.
+#: Fewest samples of a stretch, and of the parts whose means are compared.
 FEWEST, PART = 8, 3
-#: Sds within which means of parts agree.
+#: Largest difference between means of parts that agree [sds].
 SDS = 3.0
-#: Sd of the change along a stretch by a straight line, over that of its mean: √12.
+#: Sd of the change along a stretch, by a straight-line fit, divided by the sd of its mean: √12.
 OF_CHANGE = 12**0.5
-#: Beginnings of a stretch that are tried, and share of the largest change from which on a change is slight.
+#: Number of beginnings of a stretch that are tried. A change below this share of the allowed change is slight.
 TRIES, SLIGHT = 20, 0.05
-#: Largest number of different readings, as a share of all, of an instrument with coarse steps.
+#: An instrument has coarse steps if at most this share of its readings are different.
 COARSE = 0.2
-#: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
-#: readings that are equal to the one before are noise's chance.
+#: Number of equal successive readings that noise rules out, if at most this share of all readings repeat the one
+#: before.
 STUCK, CHANCE = 20, 0.2
-#: Robust sds, and steps of the instrument, by which a glitch is off the readings next to it.
+#: Distance of a glitch from neighbouring readings, in robust sds and in steps of the instrument.
 FAR = 6.0
-#: Largest share of glitches in a stretch whose other readings still have a mean; samples around a tested reading.
+#: Largest share of glitches in a usable stretch. Samples around a tested reading.
 MOST_GLITCHES, BESIDE = 0.25, (21, 101)
-#: Channels that a robot that travels straight reads as zero.
+#: Channels that are zero in straight travel.
 OF_YAW = tuple(c.name for c in channels.OF_TURNS if c.directed and c.side is None)
 #: Conditions that end a stretch whenever they change.
 EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
-#: Reasons to leave samples out.
+#: Reasons for omitting samples.
 REASONS = (
     "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "glitches", "unread", "undriven",
 )  # fmt: skip
@@ -69,9 +69,9 @@ class Signal:
         channel: channel of the table of settled runs.
         shown: its readings [unit of the column], NaN if missing or a glitch.
         angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
-        step: step of its instrument [unit], 0 without.
-        largest: size of its readings but for the last two in a hundred.
-        glitches: True for readings far from the readings next to them, see `find_glitches`, shape (rows,).
+        step: step of its instrument [unit], 0 if there is none.
+        largest: 98th percentile of the magnitudes of its readings.
+        glitches: True for readings far from their neighbours, see `find_glitches`, shape (rows,).
     """
 
     channel: Channel
@@ -83,18 +83,18 @@ class Signal:
 
     @functools.cached_property
     def filled(self) -> float:
-        """Share of the log's rows that have a reading. Below 1 where instruments log at different rates."""
+        """Share of the log's rows with a reading. Below 1 if instruments log at different rates."""
         return float(np.isfinite(self.shown).mean())
 
 
 @dataclasses.dataclass(frozen=True)
 class Inertia:
-    """Current that the acceleration of a configuration's motors takes.
+    """Current needed to accelerate the motors of a configuration.
 
     Attributes:
         speed, current: names of channels. `current` is empty if the current is imposed.
-        per_rate: current [A] of one unit of the speed's column a second.
-        least: current below which shares are of this [A].
+        per_rate: current [A] for one unit of the speed column per second.
+        least: smallest current to which shares refer [A].
     """
 
     speed: str
@@ -105,19 +105,19 @@ class Inertia:
 
 @dataclasses.dataclass(frozen=True)
 class Stretch:
-    """Consecutive samples of a log that are judged as one run.
+    """Consecutive samples of a log that are tested as one run.
 
     Attributes:
         run: name of the run.
         rows: indices in the table, in the order of time.
         begin, end: first and last time [s].
         why: empty for a settled run, else one of `REASONS`.
-        channel: the channel to blame, if there is one.
-        size: relative size of its change [-].
+        channel: the channel responsible, if there is one.
+        size: relative change of this channel [-].
         mean, sd: mean and standard deviation of each channel, by name [unit of the column]. Only for a settled run.
         drift: change of each channel over it, by name [unit].
         imposed: mean of the imposed quantity: voltage, speed or current.
-        glitches: readings of each channel that its mean leaves out, by name. Only channels that have some.
+        glitches: number of readings that the mean of each channel omits, by name. Only channels with glitches.
     """
 
     run: str
@@ -135,7 +135,7 @@ class Stretch:
 
     @property
     def lasts(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.end - self.begin
 
 
@@ -144,12 +144,12 @@ class Settled:
     """Settled travel of a log.
 
     Attributes:
-        runs: runs of the log.
+        runs: the log.
         stretches: all of them, in the order of the log.
         signals: signals of its channels.
         shortest, drift: as requested.
         gaps: rows after which samples are missing.
-        scatter: sd of each channel between stretches under the same conditions beyond their own sds, by name [unit].
+        scatter: extra sd of each channel between stretches under the same conditions, by name [unit].
     """
 
     runs: Runs
@@ -166,14 +166,14 @@ class Settled:
         return tuple(s for s in self.stretches if not s.why)
 
     def settled_runs(self) -> Runs:
-        """The settled runs, as a table of runs from a file would be."""
+        """Settled runs, in the form of a table from a file."""
         columns = {**self.runs.columns, **self.table()}
         count = len(self.kept)
         columns = {name: x for name, x in columns.items() if len(x) == count and name not in (*TIME, "mode")}
         return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
 
     def table(self) -> Columns:
-        """The settled runs, a column each as tables of runs have them."""
+        """Settled runs as columns of a table of runs."""
         stretches = self.kept
         columns: Columns = {}
         means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
@@ -212,9 +212,9 @@ def settle_log(
 ) -> Settled:
     """Returns the settled runs of a log.
 
-    The log is divided into levels where the imposed quantity changes. Of each level the end is taken, extended
-    backward while every channel's mean stays the same within its noise. The means over this stretch are the settled
-    run. Means leave out glitches. See `find_glitches`. The sd of a mean has four parts:
+    The log is divided into levels where the imposed quantity changes. The settled run of a level is the mean over its
+    end. This end is extended backward as long as every channel's mean stays the same within noise. Means omit
+    glitches (`find_glitches`). The sd of a mean has four parts:
 
     * noise with its autocorrelation (Geyer's initial positive sequence, 1992),
     * the error from the steps of the instrument (Widrow and Kollár, Quantization noise, 2008, first term for normal
@@ -223,20 +223,20 @@ def settle_log(
     * the scatter of stretches under the same conditions.
 
     Args:
-        shortest: stretch [s]. None: 0.3 s, and at least 20 samples.
-        drift: largest change of a mean within a stretch, as a share of it.
-        inertia: by configuration. A stretch whose acceleration takes more than `drift` of its current is left out.
-        loop: command that fits the log as it is, for messages.
-        rolling: by configuration, readings of channels by name, with motors at 1 rad/s [unit of the column].
+        shortest: shortest stretch [s]. None: 0.3 s, and at least 20 samples.
+        drift: largest change within a stretch, as a share of the mean.
+        inertia: by configuration. Stretches in which acceleration takes more than `drift` of the current are omitted.
+        loop: command that fits unsettled logs, for messages.
+        rolling: by configuration, readings of channels by name while the motors turn at 1 rad/s [unit of the column].
 
     Raises:
-        BadData: time that does not increase. A channel with a single number. No stretch at all. Speeds or currents
-            without a sign. Speeds or rates of angles in other units than their columns state.
+        BadData: time does not increase, a channel has a single value, there is no stretch, speeds or currents have no
+            sign, or speeds or rates of angles are in other units than their columns state.
     """
     result = _divide_log(runs, shortest, drift, inertia)
     if not result.kept:
         raise BadData(_nothing_settled_message(result, loop))
-    _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
+    _check_signs(result)  # from their own sds, because repeats with different signs widen the final ones
     _check_units(result, rolling or {})
     return dataclasses.replace(
         result,
@@ -248,7 +248,7 @@ def settle_log(
 
 
 def doubtful_sign(runs: Runs) -> str:
-    """Reason to doubt the sign of a channel of a log, from its settled stretches, empty without evidence."""
+    """Reason to doubt the sign of a channel, from the settled stretches, empty without evidence."""
     try:
         result = _divide_log(runs, None, DRIFT, None)
     except BadData:  # a log without a stretch
@@ -297,13 +297,13 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
 
 
 def settled_channels(robot: Robot) -> tuple[Channel, ...]:
-    """Channels that the settled runs of a robot's logs can have: its own, and rates of its angles."""
+    """Channels that settled runs of a robot's logs can have: its own channels, and rates of its angles."""
     rates = {rate for angle, rate, _ in RATES if angle in {c.column for c in robot.channels}}
     return tuple(c for c in channels.EVERY if (c in robot.channels and c.settled) or c.name in rates)
 
 
 def _in_order(runs: Runs) -> list[np.ndarray]:
-    """Rows of each run, whose time increases from row to row."""
+    """Rows of each run, checked for increasing time."""
     run, time = runs.run_names, runs["time_s"]
     rows_by_run = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
     for rows in rows_by_run:
@@ -332,7 +332,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
 def _settled_signals_of_log(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
-    """Returns the settled readings of each channel of a log. Of an angle its rate, if no channel reads the rate."""
+    """Returns the readings of each channel of settled runs. If only an angle is measured, its rate."""
     none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
     signals = []
     for c in runs.channels:
@@ -363,21 +363,21 @@ def _settled_signals_of_log(
 def find_glitches(
     shown: np.ndarray, levels: list[np.ndarray], width: int, step: float, drift: float | None
 ) -> np.ndarray:
-    """True for readings that are far from the readings next to them, shape (rows,).
+    """True for readings far from their neighbours, shape (rows,).
 
     A glitch differs from the median of the `width` readings around it by more than `FAR` robust sds, `FAR` steps and
     the allowed drift. The robust sd is 1.4826 times the median difference (Hampel, The influence curve and its role
-    in robust estimation, 1974). Normal noise has 2e-9 of them, so means of clean logs do not change. A level has no
-    glitches if most of its readings are near zero: a current in pulses has its mean in the pulses. An angle that
-    counts on is compared with half of its usual travel over the window instead of the drift. The first `width`
-    readings of a level may be a start, so `PART` in a row are no glitches there.
+    in robust estimation, 1974). In normal noise their share is 2e-9, so means of clean logs do not change. A level
+    has no glitches if most of its readings are near zero, because the mean of a pulsed current depends on the pulses.
+    For an angle, half of its usual travel over the window replaces the drift. The first `width` readings of a level
+    may be a start, so `PART` of them in a row are no glitches.
 
     Args:
-        shown: readings, NaN where missing.
+        shown: readings, NaN if missing.
         levels: rows of each level, in the order of time.
-        width: readings that a median is of.
+        width: number of readings in a median.
         step: step of the instrument [unit of the readings].
-        drift: largest change of a mean within a stretch, as a share of it. None: the readings are an angle.
+        drift: largest change within a stretch, as a share of the mean. None: the readings are an angle.
     """
     from scipy.ndimage import binary_opening, median_filter
 
@@ -388,12 +388,12 @@ def find_glitches(
             continue
         size = min(width, len(rows)) | 1
         x, pad = shown[rows], size // 2
-        # Beyond its ends a level goes on as there: a mirror would make glitches of a start.
+        # A level is padded with its end values: if it were mirrored, a start would appear as a glitch.
         ends = np.full(pad, np.median(x[:PART])), np.full(pad, np.median(x[-PART:]))
         middle = median_filter(np.concatenate([ends[0], x, ends[1]]), size)[pad : pad + len(x)]
         apart = np.abs(x - middle)
         scatter = 1.4826 * median_filter(apart, min(5 * size, len(x)) | 1, mode="reflect")
-        grain = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step  # coarse, whatever is stated
+        grain = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step  # coarse despite the file
         noise = FAR * np.maximum(scatter, grain)
         if drift is None:
             off = apart > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
@@ -405,14 +405,14 @@ def find_glitches(
     return is_glitch
 
 
-#: Columns of angles, the channel of their rate, and its unit's value of one of the angle's a second.
+#: Columns of angles, the channel of their rate, and one unit of the angle per second in the unit of that channel.
 RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1.0))
 
 
 def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
-    """Step of a channel's instrument [unit of the column]: from its readings, else from the file.
+    """Step of a channel's instrument [unit of the column], from its readings or else from the file.
 
-    If neither has one, it is the smallest difference of readings that mostly repeat.
+    If neither gives one and most readings repeat, it is their smallest difference.
     """
     quanta = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
     if step := common_step(shown) or next(quanta, 0.0) / channel.factor:
@@ -443,7 +443,7 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
 
 
 def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
-    """Rows in which a channel repeats one number for longer than its noise allows: saturated, or frozen."""
+    """Rows in which a channel repeats one number for longer than noise allows: saturated or frozen."""
     is_stuck = np.zeros(len(signal.shown), bool)
     if len(signal.angle):
         return is_stuck
@@ -451,7 +451,7 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
         readings = signal.shown[rows]
         same = np.diff(readings) == 0
         if not len(same) or same.mean() > CHANCE:
-            limits = (np.nanmin(readings), np.nanmax(readings))  # an instrument of coarse steps, or one at its limit
+            limits = (np.nanmin(readings), np.nanmax(readings))  # coarse steps, or at its limit
             inside = same & ~np.isin(readings[1:], limits)
             if not len(same) or inside.mean() > CHANCE:
                 continue
@@ -474,7 +474,7 @@ def _change_noise(x: np.ndarray) -> float:
 def _levels_of(
     runs: Runs, drives: np.ndarray, rows: np.ndarray, shortest: float, drift: float, step: float
 ) -> Iterator[np.ndarray]:
-    """Rows of a part without gaps, divided where a condition changes, or `drives` changes by more than its noise.
+    """Rows of a part without gaps, divided wherever a condition changes, or `drives` by more than its noise.
 
     `drives` is the imposed quantity, or the torque of a brake.
     """
@@ -489,12 +489,12 @@ def _levels_of(
     begin, mean, count = 0, float(x[0]), 0
     starts = np.arange(0, len(rows), size)
     sizes = np.diff(starts, append=len(rows))
-    # Lists of numbers, as a log may have a million rows.
+    # Lists are faster here, and a log may have a million rows.
     blocks = ((np.add.reduceat(x, starts) / sizes).tolist(), np.logical_or.reduceat(cuts, starts).tolist())
     for k, more, value, cut in zip(starts.tolist(), sizes.tolist(), *blocks, strict=True):
         tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * sd)
         if count and (abs(value - mean) > tolerance or cut):
-            # the last of averaged samples may be the next level's already
+            # the last averaged samples may belong to the next level
             yield rows[begin : k - size if size > 1 and k - begin > 3 * size else k]
             begin, mean, count = k, value, more
             continue
@@ -505,13 +505,13 @@ def _levels_of(
 
 @dataclasses.dataclass(frozen=True)
 class _End:
-    """The end of a level, before the test that it is settled.
+    """End of a level, before the test whether it is settled.
 
     Attributes:
-        rows: of it.
-        seen: mean, sd and change of each channel over it, by name [unit of the column].
-        left_over: largest significant change of a channel within it, as a share.
-        glitches: readings of each channel that its mean leaves out.
+        rows: its rows.
+        seen: mean, sd and change of each channel, by name [unit of the column].
+        left_over: largest significant change of a channel, as a share.
+        glitches: number of readings that the mean of each channel omits.
     """
 
     rows: np.ndarray
@@ -520,7 +520,7 @@ class _End:
     glitches: dict[str, int]
 
 
-#: Reason why a level has no settled end: one of `REASONS`, the channel to blame, and the size as a share.
+#: Reason why a level has no settled end: one of `REASONS`, the channel responsible, and the size as a share.
 _Why = tuple[str, str, float]
 
 
@@ -575,7 +575,7 @@ def _settled_end(
     ):
         return out(*accelerates)
     values_by_channel = {s.channel.name: finite_means.get(s.channel.name, (math.nan,) * 3) for s in signals}
-    # A change continues after the end, a lag's tail by about as much again, and all channels with it.
+    # The tail of a lag would continue by about as much again after the end, in all channels.
     further = {s.channel.name: left_over * _scale_of(s, values_by_channel[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
         unsettled_stretch,
@@ -589,8 +589,9 @@ def _settled_end(
 
 
 def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
-    """Final part of a level, of the length with the most certain means: a longer part averages out more noise, a
-    shorter one drifts less."""
+    """Final part of a level, with the length that gives the most certain means: longer parts average out more noise,
+    shorter parts drift less.
+    """
     parts = _level_parts(time[rows], shortest)
     first = _first_steady(signals, rows, parts, drift)
     last = max(len(parts) - 3, first)
@@ -613,9 +614,9 @@ def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, s
 
 
 def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: float) -> tuple[_Why | None, float]:
-    """Reason why the end of a level is not settled, None if it is, and the largest change of a channel.
+    """Reason why the end of a level is not settled (None if it is), and the largest change of a channel.
 
-    The change is within the end or after it, as a share.
+    The change is a share, within the end or expected after it.
     """
     left_over = end.left_over
     for signal in signals:
@@ -638,7 +639,7 @@ def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: 
 def _acceleration_reason(
     acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
 ) -> _Why | None:
-    """Reason if acceleration takes too large a share of the current over so many seconds, else None."""
+    """Reason if acceleration takes too large a share of the current, otherwise None. `lasts`: duration [s]."""
     if acting.speed not in seen or (acting.current and acting.current not in seen):
         return None
     a_second = acting.per_rate / lasts
@@ -649,29 +650,29 @@ def _acceleration_reason(
 
 
 def _scale_of(signal: Signal, mean: float) -> float:
-    """Scale of a channel's change [unit]: its mean, at least a tenth of its largest readings."""
+    """Scale of a channel's change [unit]: its mean, but at least a tenth of its largest reading."""
     return max(abs(mean), 0.1 * signal.largest)
 
 
 def _certain_change(signal: Signal, mean: float, sd: float, change: float) -> float:
-    """Part of the change along a stretch that is not noise, as a share of `_scale_of`."""
+    """Change along a stretch beyond noise, as a share of `_scale_of`."""
     if not math.isfinite(mean):
         return 0.0
     return max(abs(change) - OF_CHANGE * sd, 0.0) / _scale_of(signal, mean)
 
 
 def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
-    """Change along a level that is still to come at its end, as a share of `_scale_of`.
+    """Change expected after the end of a level, as a share of `_scale_of`.
 
-    It is the tail of a lag. Changes between quarters of the level show its decay. Where noise hides the last change,
-    it follows from those before.
+    It is the tail of a lag, whose decay follows from the changes between quarters of the level. If noise hides the
+    last change, it is extrapolated from the earlier ones.
     """
     quarters = [signal.shown[q] for q in np.array_split(rows, 4)]
     quarters = [q[np.isfinite(q)] for q in quarters]
     if min(map(len, quarters)) < PART:
         return 0.0
     first, before, last = np.diff([float(np.mean(q)) for q in quarters]).tolist()
-    place = np.arange(len(quarters[3]))  # the last quarter alone: in those before, a lag's decay is no noise
+    place = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
     rest = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
     standard_error = SDS * math.sqrt(2 * _correlation_time(rest) / len(rest)) * float(np.std(rest))
     earlier, later = (before, last) if abs(last) >= standard_error else (first, before)
@@ -689,9 +690,9 @@ def _reading_size(shown: np.ndarray) -> float:
 
 
 def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
-    """A level in parts of a third of the shortest stretch, `PART` samples at least, the last three a stretch."""
+    """Parts of a level: a third of the shortest stretch, at least `PART` samples. The last three form a stretch."""
     size = max(shortest / 3, float(time[-1] - time[0]) / 300)
-    part = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are whole
+    part = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are complete
     edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(time)]
     level_parts: list[tuple[int, int]] = []
     for low, high in reversed(list(pairwise(edges))):
@@ -703,7 +704,7 @@ def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
 
 
 def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
-    """First part after which every channel's mean stays at its final value."""
+    """First part from which on every channel's mean stays at its final value."""
     ends = parts[-3:]
     first = len(parts) - len(ends)
     means = np.array([[_plain(s.shown[rows[low:high]]) for low, high in parts] for s in signals])
@@ -727,7 +728,7 @@ def _plain(x: np.ndarray) -> float:
 
 
 def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]) -> float:
-    """Sd of a reading about the end of a level, times the root of its autocorrelation time."""
+    """Sd of readings at the end of a level, times the root of their autocorrelation time."""
     readings = signal.shown[rows[ends[0][0] :]]
     readings = readings[np.isfinite(readings)]
     return (
@@ -738,7 +739,9 @@ def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]
 
 
 def _correlation_time(x: np.ndarray) -> float:
-    """1 + 2 Σ ρ_k up to where sums of two autocorrelations turn negative (Geyer 1992), at least 1."""
+    """Autocorrelation time 1 + 2 Σ ρ_k, at least 1. The sum ends before the first negative pair of successive terms
+    (Geyer 1992).
+    """
     power = float(np.mean(x**2))
     if len(x) < 4 or power <= 0:
         return 1.0
@@ -755,7 +758,7 @@ def _correlation_time(x: np.ndarray) -> float:
 
 
 def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
-    """Mean of a channel over a stretch, sd of that mean, and its change from end to end by a straight line."""
+    """Mean of a channel over a stretch, the sd of this mean, and the change along a straight-line fit."""
     readings = signal.shown[rows]
     finite = np.isfinite(readings)
     if finite.sum() < max(FEWEST, 0.5 * signal.filled * len(rows)):
@@ -773,8 +776,8 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
     rest = x - mean - slope * t
     spread = float(np.std(rest))
     sd = spread * math.sqrt(_correlation_time(rest) / len(x))
-    if signal.step > 0:  # without noise readings round alike; with it their mean is off by less
-        # Two readings alone do not show how often noise carries one to the other.
+    if signal.step > 0:  # without noise all readings round the same way; noise makes the error of their mean smaller
+        # Two readings do not show how often noise moves one to the other.
         within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
         rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
@@ -782,8 +785,7 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
 
 
 def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
-    """Scatter of stretches under the same conditions beyond their own sds, for each channel [unit], 0 with too few
-    repeats."""
+    """Extra sd of each channel between stretches under the same conditions [unit], 0 with too few repeats."""
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
     previous_key: tuple[object, ...] = ()
@@ -811,17 +813,18 @@ def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], l
 
 
 def _brake_levels(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
-    """Levels of the brake's torque in a stretch, and in a turn of the drive of each side, in steps of `DRIFT` of the
-    largest."""
+    """Levels of the brake torque in a stretch, and of each side's drive in a turn, in steps of `DRIFT` of the
+    largest.
+    """
     signals = (*(runs.of_sides if runs.turns else ()), *([runs[LOAD]] if runs.has(LOAD) else []))
     return tuple(
         round(float(np.mean(x[stretch.rows])) / (DRIFT * float(np.max(np.abs(x))))) if x.any() else 0 for x in signals
     )
 
 
-#: Sds beyond zero from which on a mean has a sign.
+#: A mean has a sign if it is at least this far from zero [sds].
 SIGNED = 5.0
-#: Factors of a speed in a wrong unit, and the relative tolerance of a match.
+#: Factors between units of speed, and relative tolerance for a match.
 UNITS = {
     "degrees for radians": 180 / math.pi, "radians for degrees": math.pi / 180, "deg/s for rpm": 6.0,
     "rpm for deg/s": 1 / 6, "rad/s for rpm": math.pi / 30, "rpm for rad/s": 30 / math.pi,
@@ -832,7 +835,7 @@ NEAR = 0.03
 
 
 def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
-    """Place of a stretch, with a channel's reading there and the imposed value, for a message."""
+    """Place of a stretch, a channel's reading there, and the imposed value, for a message."""
     reading, unit = _digits(s.mean[channel.name], 4), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
         f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {reading:g} "
@@ -841,7 +844,7 @@ def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
 
 
 def _check_signs(found: Settled) -> None:
-    """Reject speeds and currents of stretches both ways that have one sign."""
+    """Rejects speeds and currents that have the same sign in both directions of travel."""
     layout, runs = found.runs.layout, found.runs
     for signal in (s for s in found.signals if runs.turns_round(s.channel)):
         channel = signal.channel
@@ -868,10 +871,10 @@ def _check_signs(found: Settled) -> None:
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
-    """Reject speeds, and rates of angles, that differ from another channel's by the factor between two units."""
+    """Rejects speeds and rates of angles that differ from another channel by the ratio of two units."""
     runs = found.runs
     angles = {rate: angle for angle, rate, _ in RATES}
-    # The angle is doubted first, as its rate is not read directly.
+    # The angle is suspected first, since its rate is not read directly.
     order = sorted(found.signals, key=lambda s: not len(s.angle))
     for s in found.kept:
         units = rolling.get(str(runs["configuration"][s.rows[0]]), {})
@@ -900,12 +903,12 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
 
 
 def _direct(runs: Runs, channel: str) -> bool:
-    """True if a channel is read directly, and is not the rate of an angle."""
+    """True if a channel is read directly instead of from the rate of an angle."""
     return runs.has(channels.find_channel(channel).column)
 
 
 def _nothing_settled_message(found: Settled, loop: str) -> str:
-    """Message on a log without settled stretch: main reason and advice. `loop` is the command that takes it."""
+    """Message on a log without settled stretches: main reason and advice. `loop`: command that fits it."""
     direct = "" if found.runs.turns else f"use the log itself ({loop}), or "
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
@@ -952,13 +955,13 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
     return f"{source} {rows}, no settled segment: {others[why]}"
 
 
-# --- numbers of the robot that settling needs ---
+# --- properties of the robot that settling needs ---
 
 
 def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
-    """Readings of speeds in each configuration at 1 rad/s of the motors, the load rolling [unit of the column].
+    """Speed readings of each configuration while the motors turn at 1 rad/s without slip [unit of the column].
 
-    By channel. Only speeds of shafts for a vehicle, which slips.
+    By channel. For vehicles, only speeds of shafts, because the ground speed depends on slip.
     """
     readings = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
@@ -970,7 +973,7 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
 
 
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
-    """Current that acceleration takes in each configuration, where it is known."""
+    """Current that acceleration takes in each configuration, if known."""
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
     found = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
@@ -992,7 +995,7 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
 
 
 def _reading(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """Reading of a channel that follows from a state alone [unit of its column], 0 for others."""
+    """Reading of a channel that depends only on the state [unit of its column], 0 for others."""
     signals = balances.begin_signals(robot, Conditions(configuration), state)
     try:
         return float(channel.read(robot, signals)) / channel.factor

@@ -1,4 +1,4 @@
-"""Checks of tables of turns: exchanged sides, a yaw rate of the other sign, currents without signs."""
+"""Checks of tables of turns: exchanged sides, a yaw rate with the wrong sign, currents without signs."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from mmrjax.model import channels
 from mmrjax.model.quantities import TURN
 from mmrjax.model.rig import Instrument
 
-#: Least difference of the sides' drives, or backward drive of a side, of rows that count: as a share of the largest
-#: [-].
+#: A row counts if the drives of its sides differ by at least this share of the largest drive, or a side is driven
+#: backward by as much [-].
 CLEAR = 0.25
-#: Fewest rows that count, and the least share of them that has to contradict the drive [-].
+#: Fewest rows that count, and the share of them that must contradict the drive [-].
 FEWEST, MOSTLY = 3, 0.75
-#: Largest relative excess of a side's voltage over the supply's, as both are written with few digits [-].
+#: Largest relative excess of a side's voltage over the supply voltage, because both are rounded [-].
 ROUNDED = 0.01
 
 
 def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the supply's voltage [V], by default the larger of both sides', and the share of each side.
+    """Supply voltage [V], by default the larger of the sides' voltages, and the duty of each side.
 
     Args:
         volts: voltages of left and right side [V], shape (2, rows).
@@ -33,7 +33,7 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tu
 
 
 def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Names:
-    """Replaces the sides' voltages of a table by their shares of the supply's voltage.
+    """Replaces the sides' voltages in a table by duties, their shares of the supply voltage.
 
     Returns:
         A note on the replacement. None if the table has no such column.
@@ -77,10 +77,10 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
 
 
 def check_turns(runs: Runs) -> None:
-    """Rejects a table of turns with exchanged sides or a yaw rate of the other sign.
+    """Rejects a table of turns with exchanged sides or a yaw rate with the wrong sign.
 
     Raises:
-        BadData: readings of a side that follow the drive of the other side, or a yaw rate that contradicts both.
+        BadData: readings of a side follow the drive of the other side, or the yaw rate contradicts both.
     """
     left, right = runs.of_sides
     for quantity in ("motor_speed", "motor_current"):
@@ -108,7 +108,7 @@ def check_turns(runs: Runs) -> None:
 def _refuse_against(
     runs: Runs, column: str, shown: tuple[np.ndarray, ...], readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
-    """Rejects readings that mostly have the other sign than their drive. The message names the clearest row.
+    """Rejects readings whose sign is mostly opposite to that of their drive. The message names the clearest row.
 
     Args:
         shown: values of the columns in every row.
@@ -127,8 +127,8 @@ def _refuse_against(
 
 
 def unsigned_current_channels(columns: Columns, layout: Layout) -> tuple[Instrument, ...]:
-    """Instruments of the sides' currents that show no sign: their readings are positive in every row that drives
-    their side backward.
+    """Instruments of the sides' currents that show no sign: their readings are positive whenever their side is driven
+    backward.
 
     Args:
         columns: columns of the table.

@@ -1,4 +1,6 @@
-"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`. `12 ± 0` is exact. A template's are examples."""
+"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`, or `12 ± 0` if exact. Numbers of templates are
+examples.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,12 @@ from calibration.data.input_errors import BadConfiguration, parse_number
 
 FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
 _SIGNS = r"(?:±|\+/-|\+-)"
-#: Comment of a line whose number is an example's.
+#: Comment on a line with an example number.
 EXAMPLE = "example: yours"
-#: Least sd of an example's number that nobody replaced: share of the number. It is some other robot's, and robots
-#: differ by factors, so what a template states of its own robot is no knowledge of this one.
+#: Smallest sd of an example number that was not replaced, as a share of the number. It belongs to another robot, and
+#: robots differ by factors.
 EXAMPLE_SHARE = 3.0
-#: The same for an example of 0: times its sd.
+#: The same for an example number of 0: multiple of its sd.
 EXAMPLE_ZERO = 10.0
 HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
 
@@ -26,10 +28,10 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     """Value and standard deviation of `value ± sd` or `value ± x %`, in the value's unit.
 
     Args:
-        where: opens the message of an error.
+        where: beginning of the error message.
 
     Raises:
-        BadConfiguration: another form, no number, or an sd below 0.
+        BadConfiguration: the form is different, there is no number, or the sd is negative.
     """
     parts = re.split(_SIGNS, text)
     try:
@@ -47,7 +49,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
                 f"{where}: got {text!r}; a percentage of 0 is 0, so give the standard deviation itself; {FORM}"
             )
         size *= abs(mean) / 100
-    return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
+    return mean, float(f"{size:.12g}")  # without rounding errors of the percentage
 
 
 def split_values_and_sds(table: Json, where: str, prefix: str = "") -> dict[str, float]:
@@ -67,18 +69,18 @@ def split_values_and_sds(table: Json, where: str, prefix: str = "") -> dict[str,
 
 
 def is_example(line: str) -> bool:
-    """True if a line of a rig's file is marked as an example and has a template's number."""
+    """True if a line of a rig file is marked as an example and still has a template's number."""
     return EXAMPLE in line and _number_of_line(line) in _template_numbers()
 
 
 def has_template_number(line: str) -> bool:
-    """True if a line has the name and number of a template's example, marked or not. 0 and 1 may be anyone's."""
+    """True if a line has the name and number of a template's example, marked or not. 0 and 1 do not count."""
     number = _number_of_line(line)
     return number is not None and number[1] not in (0.0, 1.0) and number in _template_numbers()
 
 
 def example_numbers(text: str) -> dict[str, str]:
-    """Returns names and units of the numbers that are still those of an example, as `motor.resistance`: `[ohm]`."""
+    """Names and units of the numbers that are still those of an example, such as `motor.resistance`: `[ohm]`."""
     examples, table = {}, ""
     for line in text.splitlines():
         if not line.startswith("#") and (header := HEADER.match(line)):
@@ -89,7 +91,7 @@ def example_numbers(text: str) -> dict[str, str]:
 
 
 def example_sd(value: float, sd: float) -> float:
-    """Sd of an example's number that nobody replaced. An exact one stays exact."""
+    """Sd of an example number that was not replaced. Exact numbers stay exact."""
     least = EXAMPLE_SHARE * abs(value) or EXAMPLE_ZERO * sd
     return max(sd, float(f"{least:.12g}")) if sd else 0.0
 
@@ -103,6 +105,6 @@ def _template_numbers() -> frozenset[tuple[str, float] | None]:
 
 
 def _number_of_line(line: str) -> tuple[str, float] | None:
-    """Name and number of a line. None for other lines, also for comments."""
+    """Name and number in a line. None for other lines and comments."""
     match = re.match(r'(\w+) = "?([-+.\deE]+)', line)
     return None if match is None else (match[1], float(match[2]))

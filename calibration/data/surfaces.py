@@ -1,7 +1,8 @@
-"""Surfaces of runs: labels of Table 5 scale the paper's robots' adhesion, any other surface has its own friction.
+"""Surfaces of runs: labels of Table 5 scale the adhesion of the paper's robots. Any other surface has its own
+friction.
 
-A surface without stated friction becomes a separate configuration, named after configuration and label: its
-`ground.*` is free, and all its other parameters follow the first configuration (`rig.surfaces`).
+A surface without stated friction becomes a separate configuration, named after configuration and label. Its
+`ground.*` parameters are free, and all others follow the first configuration (`rig.surfaces`).
 """
 
 from __future__ import annotations
@@ -18,16 +19,16 @@ from mmrjax.errors import allowed_words
 from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.robot import Configurations, Robot
 
-#: Beginning of the names of a configuration's parameters that belong to its surface.
+#: First part of the names of parameters that belong to a surface.
 GROUND = "ground."
-#: Likeness of a label to one of Table 5 from which it is taken for misspelt [-].
+#: Similarity to a label of Table 5 above which a label counts as misspelt [-].
 MISSPELT = 0.75
 
 V = TypeVar("V")
 
 
 def common_configuration(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
-    """Returns the only configuration, or the configuration with all of these surfaces, otherwise None."""
+    """The only configuration, or the one with all of these surfaces, otherwise None."""
     if len(configurations) == 1:
         return configurations[0]
     stems = [
@@ -39,7 +40,7 @@ def common_configuration(configurations: Sequence[str], labels: Iterable[str]) -
 
 
 def allowed_labels(label: str, layout: Layout) -> str:
-    """Allowed labels for the message about a label, empty if the label is allowed itself."""
+    """Allowed labels, for the message about a wrong label. Empty if the label is allowed."""
     if not layout.inherits:
         return "" if label else "the name of a surface"
     if label in SURFACES:
@@ -51,10 +52,10 @@ def allowed_labels(label: str, layout: Layout) -> str:
 
 
 def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
-    """`robot` with a configuration for each surface of the table that does not scale its adhesion.
+    """`robot` with a configuration for each surface of the table without a label of Table 5.
 
-    If all surfaces of a configuration's rows have such configurations, these replace it, unless there is only one
-    surface. Priors that the robot's file states apply to the new configurations.
+    If all surfaces of a configuration have such configurations, these replace it, unless there is only one surface.
+    Priors that the robot's file states apply to the new configurations.
     """
     if not runs.has("surface") or not robot.has_ground:
         return robot
@@ -75,7 +76,7 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
         stays = configuration in members and len(own_names) < len(labels)
         pattern = members[configuration] if configuration in members else members[present[0]]
         names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own_names))
-        if configuration in members and not stays:  # in its place
+        if configuration in members and not stays:  # replaces the configuration
             members = {
                 n: m for key, value in members.items()
                 for n, m in (
@@ -99,7 +100,7 @@ def values_of_surface_configurations(stated: Mapping[str, V], robot: Robot, runs
     """Values stated by parameter, with replaced configurations renamed to the configurations of their surfaces.
 
     Args:
-        robot: as from `with_surface_configurations`.
+        robot: as returned by `with_surface_configurations`.
     """
     by_name: dict[str, V] = {}
     for name, value in stated.items():
@@ -111,7 +112,7 @@ def values_of_surface_configurations(stated: Mapping[str, V], robot: Robot, runs
 def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[str]:
     """Names of parameters, with replaced configurations renamed to the configurations of their surfaces.
 
-    A parameter of the ground becomes one for each surface. Any other becomes the first surface's.
+    A parameter of the ground becomes one parameter for each surface. Any other becomes that of the first surface.
     """
     names_found: list[str] = []
     for name in names:

@@ -1,4 +1,4 @@
-"""A table of runs, as read: columns by name, readings in SI, and the conditions of its rows."""
+"""Table of runs: columns by name, readings in SI, and the conditions of its rows."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def driven_on(columns: Columns, layout: Layout) -> np.ndarray:
 
 
 def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
-    """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows),
-    negative in reverse.
+    """Voltage of left and right side [V] (on a battery, duty), or their speed [rpm], shape (2, rows). Negative in
+    reverse.
 
     Args:
         columns: columns of a table that turns.
@@ -51,20 +51,20 @@ def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """A table of runs, one row each (or one row a sample, with `time_s` among the columns).
+    """Table of runs with one row for each run, or for each sample if it has `time_s`.
 
     Attributes:
         source: where it came from, for messages.
-        columns: name → array of shape (rows,). Numbers in the unit of the name, words as str, NaN for a reading
-            that is missing.
+        columns: name → array of shape (rows,). Numbers in the unit of the name, words as str, NaN for missing
+            readings.
         unknown: columns of the file that this program does not know.
-        digest: SHA-256 of the file, empty for a table that came from none.
-        extras: cells of `unknown` columns, shape (rows,): numbers, NaN if empty, or words. They are not in `columns`,
-            as they have no role. Only the search for correlations with residuals reads them.
+        digest: SHA-256 of the file, empty for a table in memory.
+        extras: cells of `unknown` columns, shape (rows,): numbers, NaN if empty, or words. They have no role and are
+            not in `columns`. Only the search for correlations with residuals uses them.
         layout: meaning of its columns for its robot, and its channels.
         notes: sentences on the reading of the file, and on missing data.
         headings: names of the columns in the file, by their names in this program.
-        log: the whole log, if these rows are a selection of it (see `thinning`). None: all rows are here.
+        log: the whole log, if these rows are a selection of it (see `thinning`). None: the rows are complete.
     """
 
     source: str
@@ -89,12 +89,12 @@ class Runs:
 
     @property
     def turns(self) -> bool:
-        """True if its robot is free to turn: its sides are driven apart, or it does not head uphill."""
+        """True if its robot is free to turn: its sides are driven independently, or it does not head uphill."""
         return any(self.has(name) for name in (*self.layout.sides, *HEADING))
 
     @property
     def of_sides(self) -> np.ndarray:
-        """See `drive_of_sides`. Of a table with `turns`."""
+        """See `drive_of_sides`. For a table with `turns`."""
         return drive_of_sides(self.columns, self.layout)
 
     @property
@@ -103,10 +103,10 @@ class Runs:
         return self.layout.channels
 
     def of(self, robot: Robot) -> Runs:
-        """The table with the channels of a robot. Columns of other channels become unknown columns without a role.
+        """Table with the channels of a robot. Columns of other channels are not used by the model.
 
         Raises:
-            BadData: the table was read for a robot without a channel of this one, so its column was left out.
+            BadData: the table was read for another robot, which lacks a channel of this one.
         """
         if self.channels == robot.channels:
             return self
@@ -138,16 +138,16 @@ class Runs:
 
     @property
     def pulled(self) -> bool:
-        """True if gravity, a constant torque or a motor as the load may drive the motors."""
+        """True if gravity, a constant torque or a load motor may drive the motors."""
         sloped = self.has("slope_deg") and bool(self["slope_deg"].any())
         return self.layout.weight or sloped or bool(driven_on(self.columns, self.layout).any())
 
     def turns_round(self, channel: Channel) -> bool:
         """True if a channel's readings have the sign of what drives the motors.
 
-        A speed has it, and so has a current if nothing else drives the motors. A bridge that reverses the voltage
-        reverses the supply's current. In a turn each side has its own sign, and the yaw rate has the sign of their
-        difference (`sides.check_turns`).
+        This is true for speeds, and for currents if nothing else drives the motors. A bridge that reverses the
+        voltage also reverses the supply current. In a turn each side has its own sign, and the yaw rate has the sign
+        of their difference (`sides.check_turns`).
         """
         if (
             self.turns
@@ -161,39 +161,39 @@ class Runs:
 
     @property
     def sampled(self) -> bool:
-        """True if a row is a sample of a run."""
+        """True if the rows are samples of runs."""
         return all(self.has(column) for column in TIME)
 
     @property
     def whole(self) -> Runs:
-        """The log that its rows were chosen from, or itself."""
+        """The log from which its rows were selected, or the table itself."""
         return self if self.log is None else self.log
 
     @property
     def run_names(self) -> np.ndarray:
-        """Name of the run that each row is of, shape (rows,). Of a table without `run_id` all are of one, ""."""
+        """Run name of each row, shape (rows,). "" in a table without `run_id`."""
         return self["run_id"] if self.has("run_id") else np.zeros(len(self), str)
 
     def in_order(self, name: str) -> np.ndarray:
-        """Rows of a run, by its name, in the order of time."""
+        """Rows of the run with a name, in order of time."""
         rows = np.flatnonzero(self.run_names == name)
         return rows[np.argsort(self["time_s"][rows], kind="stable")]
 
     def rows_by_run(self) -> dict[str, np.ndarray]:
-        """Rows of each run in the order of time, by its name, runs in the order of the file."""
+        """Rows of each run, by name, in order of time. Runs are in the order of the file."""
         return {name: self.in_order(name) for name in dict.fromkeys(self.run_names.tolist())}
 
     def where(self, rows: np.ndarray) -> Runs:
-        """The rows that a mask or an index selects."""
+        """Table with the rows that a mask or an index selects."""
         columns, extras = ({k: v[rows] for k, v in cells.items()} for cells in (self.columns, self.extras))
         return dataclasses.replace(self, columns=columns, extras=extras)
 
     def measured(self) -> np.ndarray:
-        """Measured readings [SI], NaN where one is missing, shape (rows, channels)."""
+        """Measured readings [SI], NaN if missing, shape (rows, channels)."""
         return self._stacked(tuple(c.column for c in self.channels))
 
     def deviations(self) -> np.ndarray:
-        """Stated sds of the readings [SI], NaN for others, shape (rows, channels)."""
+        """Stated sds of the readings [SI], NaN if not stated, shape (rows, channels)."""
         return self._stacked(tuple(c.sd_column for c in self.channels))
 
     def _stacked(self, columns: Names) -> np.ndarray:
@@ -202,7 +202,7 @@ class Runs:
         return np.stack(stacked, 1) * np.asarray([c.factor for c in self.channels])
 
     def missing(self) -> list[str]:
-        """Returns a note on each channel with missing readings."""
+        """A note on each channel with missing readings."""
         notes = []
         for k, channel in enumerate(self.channels):
             missing_rows = np.flatnonzero(np.isnan(self.measured()[:, k]))
@@ -218,11 +218,11 @@ class Runs:
     def configurations(self, robot: Robot) -> np.ndarray:
         """Index of each row's configuration in `robot`, shape (rows,).
 
-        It is the configuration on the row's surface (`surface_labels.configuration_on_surface`) if the robot has it,
-        else the row's configuration.
+        It is the configuration for the row's surface (`surface_labels.configuration_on_surface`) if the robot has
+        one, otherwise the stated configuration.
 
         Raises:
-            InputError: a configuration that the robot does not have. The message lists its configurations.
+            InputError: the robot lacks a configuration. The message lists those that it has.
         """
         configuration_index = np.empty(len(self), int)
         names = self.configurations_named(robot)
@@ -238,7 +238,7 @@ class Runs:
         return configuration_index
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
-        """Names of `configurations`. A configuration that the robot does not have keeps the table's name."""
+        """Names of `configurations`. Configurations that the robot lacks keep the table's name."""
         configurations = self["configuration"]
         if not self.has("surface"):
             return configurations
@@ -247,10 +247,9 @@ class Runs:
         return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
-        """The conditions as one batch of shape (rows,).
+        """Conditions as one batch of shape (rows,).
 
-        The mass is the stated `total_mass_kg` where the table has that column, else the robot's own mass
-        and the payload.
+        The mass is `total_mass_kg` if the table has that column, otherwise the robot's own mass plus the payload.
 
         Args:
             robot: has the configurations of the table.

@@ -17,12 +17,12 @@ from mmrjax.climbing.climb_simulation import ON_GROUND, LeverSequence, roller_cl
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model.robot import Robot
 
-#: A polyline longer or higher than the first, smaller than the second, or with a wall higher than the third is taken
-#: for one in other units [m].
+#: Another unit is suspected if a polyline is larger than the first, smaller than the second, or has a wall higher
+#: than the third [m].
 LARGEST, SMALLEST, WALL = 50.0, 1e-3, 5.0
-#: Voltage beyond which a motor's voltage is refused [V].
+#: Largest accepted motor voltage [V].
 HIGHEST = 1000.0
-#: Metres of one.
+#: Metres per unit.
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 
 
@@ -30,7 +30,7 @@ def parse_stairs(text: str) -> tuple[float, float, int]:
     """Rise and tread [m] and count of «170x290x3» in mm.
 
     Raises:
-        BadConfiguration: something else, or a stair without rise or tread.
+        BadConfiguration: the text has another form, or rise or tread is missing.
     """
     cells = text.lower().replace("×", "x").split("x")
     numbers = [named_arrays.cell_number(c) for c in cells]
@@ -45,7 +45,7 @@ def parse_stairs(text: str) -> tuple[float, float, int]:
 
 
 def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Columns, Rows[str]]:
-    """Columns of the first of some headers that a file has."""
+    """Columns of a file, which must have one of several headers."""
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")
     table = reading.read_whole_table(path)
@@ -80,12 +80,12 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
 
 
 def read_terrain(path: Path) -> Terrain:
-    """A polyline from a file: level ground up to its first point and from its last one on.
+    """Polyline from a file. Ground is level before its first and after its last point.
 
     Raises:
         BadConfiguration: no such file.
-        BadData: columns without units, cells without numbers, ground that folds back, or metres mistaken for
-            millimetres or the reverse.
+        BadData: columns lack units, cells lack numbers, the ground folds back, or metres and millimetres were
+            confused.
     """
     columns, names = _read_columns(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
     unit = names[0].rpartition("_")[2]
@@ -103,21 +103,21 @@ def read_terrain(path: Path) -> Terrain:
         wrong, other, word = f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm", "m", "metres"
     elif largest <= LARGEST:
         wrong = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
-    # too small in the smaller unit, or too large in the larger one
+    # too small in mm, or too large in m
     hint = "" if other == unit else f"; is the file in {word}? Then name its columns x_{other} and z_{other}"
     raise BadData(f"{path.name}: {wrong}{hint}")
 
 
 def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> LeverSequence:
-    """Lever angles over distance or time from a file, or voltages of their motors.
+    """Lever angles over distance or time from a file, or voltages of the lever motors.
 
     Args:
         begins: initial angles of front and rear levers [rad], used if the file states voltages.
 
     Raises:
         BadConfiguration: no such file.
-        BadData: other columns, cells without numbers, knots that do not rise, an angle beyond the robot's range, a
-            voltage beyond `HIGHEST`.
+        BadData: columns are wrong, cells lack numbers, knots do not increase, an angle is beyond the robot's range,
+            or a voltage is beyond `HIGHEST`.
     """
     angles, volts = ("front_deg", "rear_deg"), ("front_V", "rear_V")
     column_sets = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]

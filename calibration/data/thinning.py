@@ -13,17 +13,17 @@ from calibration.data.table import Runs
 from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 
-#: Rows at the start of a run whose readings are always used: they show its initial state.
+#: Number of rows at the start of a run that are always used, because they show its initial state.
 FIRST = 5
-#: Memory that a loop takes for each settled row [bytes]: the base fit took 61 kB at 50 000 rows of a bench.
+#: Memory of a loop for each settled row [bytes]. The base fit took 61 kB with 50 000 rows of a bench.
 ROW = 100_000
 
 
 def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
-    """Returns the rows of a robot's runs that a fit uses, with the robot's channels.
+    """Rows of the runs that a fit uses, with the robot's channels.
 
     Raises:
-        BadConfiguration: other objects than `Runs` and a `Robot`, or as `thin_rows`.
+        BadConfiguration: the arguments are no `Runs` and `Robot`, or as in `thin_rows`.
         BadData: for the same reasons as `Runs.of` and `thin_rows`.
     """
     for name, value, kind in (("runs", runs, Runs), ("robot", robot, Robot)):
@@ -34,16 +34,16 @@ def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
 
 
 def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
-    """Returns runs with about `most` of their rows, if they have more. `Runs.log` keeps all rows.
+    """Runs with about `most` of their rows, if they have more. `Runs.log` keeps all rows.
 
-    Of a log, each run keeps its first rows, its last row, and one row of every few in between. A table without
-    `time_s` is sorted by its conditions, the imposed quantity first, and treated as one run, so that the rows kept
-    are spread evenly over the conditions. Of neighbouring rows, the one with readings of the channels with the fewest
-    readings so far is kept, else the first.
+    In a log, each run keeps its first rows, its last row, and every n-th row in between. A table without `time_s` is
+    sorted by its conditions, the imposed quantity first, and treated as one run. The kept rows are therefore spread
+    evenly over the conditions. Among n neighbouring rows, the one with readings of the channels with the fewest kept
+    readings is preferred.
 
     Raises:
         BadConfiguration: `most` is less than 1.
-        BadData: settled rows that need more memory than is free.
+        BadData: the settled rows need more memory than is free.
     """
     if most < 1:
         raise BadConfiguration(f"rows: got {most}; expected 1 or more")
@@ -67,10 +67,10 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
 
 
 def _evenly_spaced_rows(read: np.ndarray, apart: int) -> np.ndarray:
-    """First rows, last row, and one of every `apart`.
+    """First rows, last row, and one of every `apart` rows.
 
     Args:
-        read: true if a row has a reading, shape (rows, channels).
+        read: True if a row has a reading, shape (rows, channels).
     """
     kept_rows = list(range(min(FIRST, len(read))))
     count = read[kept_rows].sum(0)

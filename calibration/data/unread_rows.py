@@ -1,4 +1,4 @@
-"""Settled rows without sound readings: speeds that were not read, and rows beyond a limit of supply or driver."""
+"""Settled rows with invalid readings: speeds that were not read, and rows beyond a limit of supply or driver."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from calibration.data.input_errors import rows_text
 from calibration.data.table import Runs
 from mmrjax.model.robot import Robot
 
-#: Share of the current at standstill below which a motor turns, if it drives more than its friction by this factor.
+#: A motor turns if its current is below this share of the stall current, and above the friction current by this
+#: factor.
 TURNS, DRIVES = 0.3, 2.0
-#: Readings that no longer change: by this share at most, while the command rises by such a factor.
+#: Readings no longer change if they vary by at most this share while the command rises by such a factor.
 ALIKE, RISE = 0.02, 1.05
-#: Fall of the supply's voltage over such rows, beyond which two of them are enough; else three.
+#: Two such rows suffice if the supply voltage falls by at least this share, otherwise three.
 FALLS = 0.05
-#: Rows that a note lists, and its words for more of them.
+#: Most rows that a note lists, and its words for the rest.
 SHOWN = 12, " and {} more"
 
 
 def without_unread(runs: Runs, robot: Robot) -> Runs:
-    """The table of settled runs with unsound readings marked as missing, and a note on each kind."""
+    """Table of settled runs with invalid readings marked as missing, and a note on each kind."""
     if runs.sampled or runs.turns or runs.layout.imposed_column != SUPPLY or runs.has("held"):
         return runs
     columns, notes = dict(runs.columns), list(runs.notes)
@@ -48,7 +49,7 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
 
 
 def _turning_mask(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
-    """True for rows whose motor current is far from that at standstill and more than friction takes."""
+    """True for rows whose motor current is far below the stall current and above that of friction."""
     motor = robot.motor
     resistance, constant = float(motor.resistance), float(motor.torque_constant)
     share = np.abs(runs["duty"]) if runs.has("duty") else np.ones(len(runs))
@@ -64,10 +65,10 @@ def _turning_mask(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
 
 
 def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
-    """True for rows of the largest commands with the readings, or the supply's current, of the largest.
+    """True for rows whose readings, or whose supply current, equal those at the largest command.
 
-    If the supply's voltage falls over them, the supply is at its limit in all of them. Else the least command may
-    just reach the limit.
+    If the supply voltage falls over them, the supply is at its limit in all of them. Otherwise the smallest of these
+    commands may just reach the limit.
     """
     beyond = np.zeros(len(runs), bool)
     command, supply = (np.abs(runs["duty"]), np.abs(runs[SUPPLY])) if runs.has("duty") else (drive, drive)

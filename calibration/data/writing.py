@@ -1,4 +1,4 @@
-"""Tables and documents as files: numbers that are not finite are empty cells in CSV and null in JSON."""
+"""Writing of tables and documents: numbers that are not finite become empty cells in CSV and null in JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from calibration.data import Columns, Json
 from mmrjax.errors import printable
 from mmrjax.model.quantities import TABLE, unit_at_end, unit_in_column
 
-#: Types of libraries that are imported where they are needed.
+#: Types of libraries that are imported only when needed.
 PandasFrame: TypeAlias = Any
 PolarsFrame: TypeAlias = Any
 ArrowTable: TypeAlias = Any
@@ -118,7 +118,9 @@ def to_xarray(result: Any) -> XarrayDataset:
 
 @contextlib.contextmanager
 def naming_file(path: Path | str) -> Iterator[None]:
-    """Adds the file's name to an error of the system while the file is written, as a full disk does not name it."""
+    """Adds the file's name to a system error while the file is written, because errors such as a full disk do not
+    name it.
+    """
     try:
         yield
     except OSError as error:
@@ -129,11 +131,11 @@ def naming_file(path: Path | str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Path next to a file, which replaces the file when the block ends.
+    """Context manager: temporary path that replaces a file when the block ends.
 
-    After an error the file is as it was. A full disk is an example: writing into the file would have emptied it.
+    After an error, such as a full disk, the file is unchanged.
     """
-    path = path.resolve()  # the file that a link names
+    path = path.resolve()  # target of a link
     if path.exists() and not path.is_file():  # a device or a pipe
         with naming_file(path):
             yield path
@@ -154,18 +156,18 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file."""
+    """Writes a text file."""
     with replacing(path) as aside:
         aside.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file, `json_text`."""
+    """Writes `json_text` to a file."""
     write_text(path, json_text(content) + "\n")
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Data as JSON: numbers that are not finite become null, characters that are not `printable` their escapes."""
+    """Data as JSON. Numbers that are not finite become null, and characters that are not `printable` are escaped."""
     text = json.dumps(json_value(content), indent=2, ensure_ascii=False)
     printed = printable(text)
     pairs = zip(text, printed, strict=True)
@@ -173,7 +175,7 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML, a text with escapes for characters that are not `printable`."""
+    """A value as TOML. Characters that are not `printable` are escaped."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -187,10 +189,10 @@ def toml_value(value: Any) -> str:
 
 
 def write_table(path: Path, columns: Columns, tables: str = "csv") -> None:
-    """Write a table as CSV. Numbers that are not finite become empty cells.
+    """Writes a table as CSV. Numbers that are not finite become empty cells.
 
     Args:
-        tables: `parquet` to write the same columns into a file of that format too, with all their digits.
+        tables: `parquet` to also write the columns in that format, with all digits.
     """
     if tables == "parquet":
         from pyarrow import parquet
@@ -202,7 +204,7 @@ def write_table(path: Path, columns: Columns, tables: str = "csv") -> None:
 
 
 def table_text(columns: Columns) -> str:
-    """A table as the text of a CSV file, as `write_table` writes it."""
+    """Text of the CSV file that `write_table` writes."""
     stream = io.StringIO()
     _write_rows(stream, columns)
     return stream.getvalue()
@@ -214,7 +216,7 @@ def _write_rows(stream: TextIO, columns: Columns) -> None:
     writer.writerows(zip(*(map(cell_text, column) for column in columns.values()), strict=True))
 
 
-#: Words that a spreadsheet would run as formulas, and those that already have our mark.
+#: Words that a spreadsheet would run as formulas, and words that already have our mark.
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
@@ -239,7 +241,7 @@ def _is_number(text: str) -> bool:
 
 
 def entries_of(value: Any, *listed: str) -> Json:
-    """Entries of an object, listed as `key` or `key=attribute.of.attribute`. Methods are called."""
+    """Entries of an object for a list of `key` or `key=attribute.of.attribute`. Methods are called."""
     pairs = (entry.partition("=") for entry in listed)
     entries = {key: operator.attrgetter(attribute or key)(value) for key, _, attribute in pairs}
     return {key: x() if inspect.ismethod(x) else x for key, x in entries.items()}
@@ -248,8 +250,8 @@ def entries_of(value: Any, *listed: str) -> Json:
 def json_value(value: Any) -> Any:
     """Data for JSON, with null in place of numbers that are not finite.
 
-    An object becomes the entries that its class lists in `JSON`, see `entries_of`. Without such a list it becomes its
-    `to_json()`, or the fields of its dataclass.
+    An object becomes the entries that its class lists in `JSON` (`entries_of`), otherwise its `to_json()` or the
+    fields of its dataclass.
     """
     json_fields = getattr(value, "JSON", None)
     if json_fields is None and hasattr(value, "to_json"):

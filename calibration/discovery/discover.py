@@ -35,7 +35,7 @@ from calibration.discovery.classes import (
     signature_cosines,
 )
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
-from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
@@ -69,7 +69,7 @@ from calibration.discovery.result import (
     NoiseVerdict,
     ReadingsOfRows,
 )
-from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics, family_columns
+from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
 from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
@@ -295,7 +295,7 @@ class LoopInput:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
         For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
-        is appended to `ranked`.
+        is appended to `ranked`, unless effects would only stand in for a backlash.
         """
         space = self.equations or build_candidate_space(
             self.runs, self.robot, noise.sd, self.settings, self.stated, self.library
@@ -307,7 +307,8 @@ class LoopInput:
         else:
             if (ranking := screen_by_weak_form(space, self.settings)) is not None:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
-                ranked.append(self.keep("ranking", make))
+                if not self.shows_unmodelled_backlash:
+                    ranked.append(self.keep("ranking", make))
                 begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
                 space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
             if self.others is not None:
@@ -546,7 +547,7 @@ def _search_until_clean(
     for k in range(SCREENINGS):
         progress(progress_remark("bootstrap", settings.replicates))
         screened, diagnosis = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
-        if k == 0 and not ranked:
+        if k == 0 and not ranked and not given.shows_unmodelled_backlash:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis, settings))
         if given.shows_unmodelled_backlash or (not diagnosis.test.rejected and screened.cluster is None):
             return screened, diagnosis, None  # effects of the library would only stand in for a backlash
@@ -652,8 +653,7 @@ def _with_ammeter_alternatives(
         where: location of its discrepancy. It defines the curve of a mechanism without effects.
     """
     columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
-    if not found.effects:
-        columns = family_columns(linear, bases, bases_room.family_names(bases).index((where.place, where.variable)))
+    columns = columns if found.effects else location_columns(linear, bases, where)
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
     also = ammeter_families(space, *fit, columns, found.families[0], settings)
     families = tuple(dict.fromkeys((*found.families, *also)))

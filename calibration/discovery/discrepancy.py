@@ -24,7 +24,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.projection import BalanceError, Projection, balance_error_by_row
-from calibration.discovery.score_tests import diagnose_fit
+from calibration.discovery.score_tests import diagnose_fit, family_columns
 from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -164,6 +164,19 @@ def refine_window(
     k = int(np.argmax(gain))
     inside = included & (index >= first[k]) & (index < last[k])
     return bases_room.Window(axis, float(x[inside].min()), float(x[inside].max())), float(gain[k])
+
+
+def location_columns(linear: Linearization, bases: Bases, where: DiscrepancyLocation) -> np.ndarray:
+    """Sensitivity of the readings to a discrepancy in a location, shape (readings, terms).
+
+    The terms are those of the location's family of curves. A temporary change is constant in its window, whose ends
+    are refined, so no family has them.
+    """
+    window = bases_room.window_from_name(where.variable)
+    if window is None:
+        return family_columns(linear, bases, bases_room.family_names(bases).index((where.place, where.variable)))
+    x, factor = linear.curve_variable(where.place, window.axis)
+    return bases_room.place_signature(linear, where.place, (factor * window.holds(x))[:, None])
 
 
 # --- the curve ------------------------------------------------------------------------------------------

@@ -137,8 +137,8 @@ class Proposal:
     Attributes:
         expression: text such as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
         mark: label of the formula.
-        terms: monomials of the formula. coefficients, sds: coefficients and standard deviations of each [unit of
-        the balance].
+        terms: monomials of the formula.
+        coefficients, sds: their coefficients and standard deviations [unit of the balance].
         variables: signals of the terms, without repeats.
         explained: decrease of χ² at the base fit.
         gain: BIC of the smooth curve minus BIC of the formula. A positive value favours the formula.

@@ -27,7 +27,7 @@ class UsedConditions:
     Attributes:
         configuration: name of the configuration.
         index: index of the configuration in the robot.
-        voltages [V], slopes [deg], payloads [kg].
+        voltages, slopes, payloads: values [V], [deg], [kg].
         mass: largest total mass [kg].
     """
 

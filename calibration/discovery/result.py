@@ -131,9 +131,10 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         p_value: family-wise p-value.
         score: decrease of χ² by the curve [σ²].
         score_free_in_each_run: score of a wave with its own phase in each run. None for other curves.
-        at: values of the variable [SI]. value, sd: value and standard deviation of the curve there [unit]. over,
-        defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]. It is the curve
-        there plus the row's residual, along the travel, None if single rows do not show it.
+        at: values of the variable [SI].
+        value, sd: value and standard deviation of the curve there [unit].
+        over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
+            plus the row's residual, along the travel. None if single rows do not show it.
         proposal: proposed formula.
     """
 
@@ -285,8 +286,8 @@ class ReadingsOfRows:
 
     Attributes:
         measured, sd: measured readings and their standard deviations.
-        as_stated: simulated by the robot before any fit, at its prior means. before, after: simulated by the base
-        and by the proposed robot, fitted to all rows.
+        as_stated: simulated by the robot before any fit, at its prior means.
+        before, after: simulated by the base and by the proposed robot, fitted to all rows.
         held_out: kind of block → readings (before, after), where each row is predicted by fits without its block.
         blocks: kind of block → label of each row's block.
     """
@@ -440,12 +441,12 @@ class DiscoveryResult:
         next_experiment: most informative experiment. None if there are no alternatives to separate.
         cannot_see: effects that the data cannot reveal.
         needs_histories: effects that only time histories can reveal.
-        needs_reverse: effects that only runs in both directions can show. alternatives, implausible: candidates
-        nearly as good. Those of implausible size or sign.
+        needs_reverse: effects that only runs in both directions can show.
+        alternatives, implausible: candidates that are nearly as good, and those of implausible size or sign.
         hidden: effects that the effects found would hide, the largest first.
         support: tests of the effects' names. None if no name was tested.
         cluster: property that the outliers share. They were then not excluded. None if there is none.
-        residual_clusters: groups of rows with similar residuals, by columns without a role.
+        residual_clusters: groups of rows with similar residuals, by columns that the model does not use.
         before, after: evidence for a missing effect in the residuals without and with the proposal.
         chi2: twice the objective without and with the proposal [σ²].
         readings: number of included readings.

@@ -75,7 +75,7 @@ def search_effects(
         base: fit without effects.
         left: diagnosis of that fit.
     """
-    names = _rank_by_score(space, left.scores)
+    names = _names_by_score(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch_size(space)]
     at, rankings = _fit_to_rank_at(space, base, left, bases, settings)
@@ -162,10 +162,10 @@ def refit_without_each(
     return [simulated[w] for w in fewer]
 
 
-def _rank_by_score(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Names of effects by their best |score|, strongest first. Effects in `without` are last."""
+def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[str] = ()) -> list[str]:
+    """Names of effects by their best |score|, strongest first. Effects in `last` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
-    strength[list(space.library.indices(without))] = 0.0
+    strength[list(space.library.indices(last))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
@@ -195,7 +195,7 @@ def _extend_set(
     settings: Settings,
 ) -> ScreenedSets:
     """Fits the best set with one more effect and, if the best is the base, also pairs of effects."""
-    names = _rank_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
+    names = _names_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1 and not at.effects:
         for pair in _best_pairs(space, left.scores):

@@ -54,9 +54,10 @@ class Settings:
         outlier_error: family-wise error of an exclusion.
         gross: a row this far beyond the median row's distance cannot have been measured as stated [σ].
         cauchy: scale of the Cauchy weights [σ].
-        reweightings: number of reweighting iterations. worth, apart: least separation of an experiment to be
-        worthwhile, and to separate two alternatives [σ]. enough, gain: probability above which a better separation
-        is no gain. Least addition of a second experiment to the expected number of separated pairs.
+        reweightings: number of reweighting iterations.
+        worth, apart: least separation of an experiment to be worthwhile, and to separate two alternatives [σ].
+        enough, gain: probability above which a better separation is no gain, and least increase of the expected
+            number of separated pairs by a second experiment.
         refuted: rise of χ² that refutes an alternative [σ²].
         prefer: criterion for the leading effect, one of `PREFERENCES`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that must not be proposed.

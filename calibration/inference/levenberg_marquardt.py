@@ -131,8 +131,8 @@ class SolverLinearisation(optx.FunctionInfo):
         return self.residual[self.one_sided] > 0
 
     @property
-    def counting_residuals(self) -> Float[Array, " residuals"]:
-        """Residuals, with zeros for one-sided ones that do not count."""
+    def active_residuals(self) -> Float[Array, " residuals"]:
+        """Residuals, with zeros for inactive one-sided ones."""
         return self.residual.at[self.one_sided].set(jnp.where(self.positive, self.residual[self.one_sided], 0.0))
 
     def as_min(self) -> Float[Array, ""]:
@@ -300,7 +300,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
 
     def _is_small(self, y: Z, moved: Z, found: SolverLinearisation, before: SolverLinearisation) -> Array:
         """True if a step changed neither y nor any residual that counts by more than the tolerances."""
-        changed = found.counting_residuals - before.counting_residuals
+        changed = found.active_residuals - before.active_residuals
         return (self.norm(moved / (self.atol + self.rtol * jnp.abs(y))) < 1) & (
             self.norm(changed / (self.atol + self.rtol * jnp.abs(found.residual))) < 1
         )

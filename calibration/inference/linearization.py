@@ -178,12 +178,11 @@ class Linearization(eqx.Module):
     Attributes:
         residual: whitened residuals, shape (residuals,): readings (row by row), adhesion (one per row), priors.
         jacobian: derivatives of the residuals with respect to the free coordinates, shape (residuals,
-        coordinates).
+            coordinates).
         signatures: derivatives with respect to each instance's amplitude in prior sds, shape (readings,
-        instances).
+            instances).
         defects: derivatives with respect to an error of each balance in `probed` [unit of the balance]. Further axes
             depend on the observer.
-        on the observer.
         scale: change of a whitened reading per unit of the reading [1/SI], 0 if excluded, shape (rows, channels).
         signals: signals of each row at the fit.
         channels: names of the readings' channels, in order.

@@ -100,14 +100,14 @@ class Optimum(eqx.Module):
     steps: Int[Array, ""]
 
 
-def penalty_slice(data: Data) -> slice:
+def adhesion_penalty_slice(data: Data) -> slice:
     """Slice of the adhesion penalties among the residuals: one for each row, between readings and priors."""
     return slice(data.measured.size, data.measured.size + data.measured.shape[0])
 
 
 def informative_residuals(data: Data) -> np.ndarray:
     """Indices of the residuals of readings and priors, without the adhesion penalties."""
-    penalties = penalty_slice(data)
+    penalties = adhesion_penalty_slice(data)
     return np.r_[: penalties.start, penalties.stop : penalties.stop + data.centre.size]
 
 
@@ -139,7 +139,7 @@ def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
 
 def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver for fits to such data. `long`: True for rollouts."""
-    penalties, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
+    penalties, tolerance = adhesion_penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(
         tolerance, tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
     )
@@ -150,7 +150,7 @@ def _optimum_at(
 ) -> Optimum:
     """Optimum record of a point. `slope` is the Jacobian that predicts its decrement, None for `jacobian`."""
     slope = jacobian if slope is None else slope
-    held_rows = penalty_slice(data)
+    held_rows = adhesion_penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
@@ -199,7 +199,7 @@ def _solver_step(solver: OneSidedLevenbergMarquardt, function: Function, at: Pro
 
 def _begin_search(problem: Problem, start: Z, data: Data) -> Progress:
     """State of a problem's search before its first evaluation."""
-    size = penalty_slice(data).stop + start.shape[0]
+    size = adhesion_penalty_slice(data).stop + start.shape[0]
     codes = jnp.zeros(data.measured.shape[0], int)
     return _initial_progress(
         _least_squares_solver(data, problem.observe.long),
@@ -363,7 +363,8 @@ def with_solved_rows(problem: Problem, z: Z) -> Problem:
         return problem
     active = getattr(problem.coordinates, "active", None)
     many = [
-        None if x is None else np.repeat(np.asarray(x)[None], problem.observe.places(problem), 0) for x in (z, active)
+        None if x is None else np.repeat(np.asarray(x)[None], problem.observe.searches_per_core(problem), 0)
+        for x in (z, active)
     ]
     return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _solve_rows(problem, *many)))
 
@@ -372,9 +373,9 @@ def solve_rows_at(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray
     """Solutions of the rows at several z (first axis), by the program of the searches. For a problem without
     slots.
     """
-    places = problem.observe.places(problem)
-    filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
-    parts = [jax.device_get(_solve_rows(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]
+    count = problem.observe.searches_per_core(problem)
+    filled = np.resize(zs, (-(-len(zs) // count) * count, zs.shape[1]))
+    parts = [jax.device_get(_solve_rows(problem, part, None)) for part in filled.reshape(-1, count, zs.shape[1])]
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(zs)], *parts)
 
 
@@ -495,7 +496,7 @@ def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Ar
         one_member[3],
         None if active is None else np.asarray(active)[None],
     )
-    _, final_states = _search_with_states(problem, members, 1, problem.observe.places(problem))
+    _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
     return state.found.residual, state.found.jacobian, state.aux
 
@@ -505,7 +506,7 @@ def clip_penalties(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]
 
     A reading with a non-finite derivative counts as not computed.
     """
-    return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), penalty_slice(data))
+    return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), adhesion_penalty_slice(data))
 
 
 _clip_penalties = compiled(clip_penalties, options=SELDOM)
@@ -558,7 +559,7 @@ def search_rollout(
         The optimum, and the observations at the start and at the end.
     """
     pin, solver = no_pin(start.shape[0]), _least_squares_solver(data, long=True)
-    size = penalty_slice(data).stop + start.shape[0]
+    size = adhesion_penalty_slice(data).stop + start.shape[0]
     progress, first, last = _initial_progress(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
@@ -702,7 +703,7 @@ def search_starts(
     problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
     first_results, final_results = (
-        search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100)
+        search_refilling(problem, members, steps, problem.observe.searches_per_core(problem)) for steps in (1, 100)
     )
     return final_results[0], first_results[1].status, final_results[1].status
 

@@ -116,11 +116,11 @@ class Problem(eqx.Module):
         """Whitened residuals of an observation: readings, then adhesion penalties. Shape (rows (channels + 1),)."""
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
-        return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
+        return jnp.concatenate([error.ravel(), jax.nn.relu(self.adhesion_excess(seen, data))])
 
     def signed(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
         """Residuals as in `whitened`, but the adhesion penalty is negative for rows within their margin."""
-        return jnp.concatenate([self.whitened(seen, data)[: data.measured.size], self.excess(seen, data)])
+        return jnp.concatenate([self.whitened(seen, data)[: data.measured.size], self.adhesion_excess(seen, data)])
 
     def linearised(
         self, robot: Callable[[Array], Robot], x: Float[Array, " x"], data: Data
@@ -157,10 +157,10 @@ class Problem(eqx.Module):
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
-    def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
+    def adhesion_excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
         """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
-        adhesion_excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
-        return jnp.where(jnp.isfinite(adhesion_excess), adhesion_excess, 0.0)
+        excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        return jnp.where(jnp.isfinite(excess), excess, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:
         """Robot at coordinates z."""

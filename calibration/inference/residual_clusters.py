@@ -1,4 +1,4 @@
-"""Test of whether the residuals of a fit differ between levels of a column without a role.
+"""Test of whether the residuals of a fit differ between levels of a column that the model does not use.
 
 A column that the model does not read may still explain which rows differ: which wheel idles, who measured, which
 battery was in. For each channel a variance ratio (Seber and Lee, Linear Regression Analysis (2003), 4.3) compares the
@@ -67,7 +67,7 @@ class LevelMean:
 
 @dataclasses.dataclass(frozen=True)
 class ResidualCluster:
-    """Residuals of a channel that depend on a column without a role.
+    """Residuals of a channel that depend on a column that the model does not use.
 
     Attributes:
         column: name of the column.
@@ -113,7 +113,7 @@ class ResidualCluster:
 
 
 def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
-    """Columns without a role that affect the residuals of a fit, the most significant first.
+    """Columns that the model does not use that affect the residuals of a fit, the most significant first.
 
     Args:
         fit: residuals of the fit. For histories, the mean of each run is tested.

@@ -267,7 +267,7 @@ class CalibrationResult:
         searched: population of the search by generations before them, None without one.
         chi_square: χ² of the finite readings.
         adequacy: tests of whether the residuals are consistent with noise.
-        residual_clusters: columns without a role that the residuals depend on.
+        residual_clusters: columns that the model does not use that the residuals depend on.
         identifiability: linear analysis at the optimum.
         posterior: posterior of the free parameters.
         remarks: remarks to read before the result is used.

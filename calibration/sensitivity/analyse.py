@@ -1,4 +1,4 @@
-"""A complete sensitivity study: the important inputs at each operating point, and the most informative next runs."""
+"""Sensitivity study: important inputs at each operating point, and the most informative next runs."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax import derived, fidelities
 from mmrjax.model.quantities import Quantity
 
-#: Default number of model evaluations: of solves, and with a run over time among the outputs.
+#: Default number of model evaluations: without and with outputs of a run over time.
 EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
-#: Least number of evaluations.
+#: Smallest number of evaluations.
 LEAST = 1_000
 
 
 def analyse_sensitivity(
     study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: CandidateRuns | None = None
 ) -> SensitivityResult:
-    """Result of a complete sensitivity study.
+    """Runs a sensitivity study and returns its result.
 
     Args:
         method: one of `METHODS`.
@@ -117,7 +117,7 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
     with np.errstate(divide="ignore", invalid="ignore"):
         elasticity = slopes * median / value[:, None]
     elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)
-    # A condition's score is uniform in 0..1, of variance 1/12.
+    # A condition's score is uniform in 0..1, with variance 1/12.
     weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
     along = correlated_directions(study.inputs)
     squared_changes = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight

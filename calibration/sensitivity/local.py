@@ -13,7 +13,7 @@ from calibration.inference.identifiability import Z95
 from calibration.sensitivity.study import Study, source_words
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
 
-#: Number of random robots, and of points, at which derivatives are computed before an input is called inert.
+#: Numbers of random robots and points at which an input must have zero derivatives to count as inert.
 LOOKS, PLACES = 4, 12
 
 
@@ -36,8 +36,7 @@ class LocalDerivatives:
 
 
 def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
-    """Directions in the space of scores: in each, one input moves by one sd and the others follow by their
-    correlation.
+    """Directions in score space. Along each, one input moves by one sd and the others follow by their correlation.
 
     Each row has length 1. A condition moves along its own score.
     """
@@ -97,7 +96,7 @@ def inert_inputs(study: Study, found: LocalDerivatives, seed: int) -> np.ndarray
     unit = np.concatenate([qmc.Sobol(len(study.inputs), scramble=True, rng=rng).random(1) for rng in streams])
     scores = study.inputs.scores(unit)
     moving = np.zeros(len(study.inputs), bool)
-    for g in found.derivative.values():  # not by scores, because those of a posterior mix its parameters
+    for g in found.derivative.values():  # not scores, which mix the parameters of a posterior
         moving |= (np.nan_to_num(g) != 0).any(0)
     if moving.all():
         return ~moving

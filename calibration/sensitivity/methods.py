@@ -1,4 +1,4 @@
-"""Methods of sensitivity analysis over all operating points. Each returns a part of every output's result."""
+"""Methods of sensitivity analysis over all operating points. Each returns part of the result of every output."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from calibration.sensitivity import morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate
 from calibration.sensitivity.study import Study
 
-#: Largest share of base points without a value for a point to be studied.
+#: Largest share of base points without a value at an operating point that is studied.
 MOST_LOST = 0.5
 
 
@@ -30,7 +30,7 @@ class PartialResult:
 
 
 def _sampled_scores(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Scores of all inputs, at points of the unit cube of some inputs. The others are at their medians."""
+    """Scores of all inputs, for points in the unit cube of some inputs. The other inputs are at their medians."""
     unit_scores = np.full((len(unit), len(study.inputs)), 0.5)
     unit_scores[:, which] = unit
     return study.inputs.scores(unit_scores)

@@ -24,8 +24,8 @@ from mmrjax.model.quantities import Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES, is_done
 
-#: Points in one call for few and for many points: solves, runs over time, and the derivatives of both. All calls have
-#: one of these shapes, so that all studies of the same inputs and outputs share compiled programs.
+#: Points per call, for few and for many points: solves, runs over time, and the derivatives of both. With only these
+#: shapes, studies of the same inputs and outputs share compiled programs.
 CHUNKS = {"solves": (512, 32_768), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
 #: Default outputs, in addition to every channel.
 DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
@@ -49,7 +49,7 @@ class ModelOutputs:
 
 
 def count_statuses(codes: np.ndarray) -> dict[str, int]:
-    """Number of points with each status, without zeros."""
+    """Number of points with each status that occurs."""
     counts = np.bincount(codes, minlength=len(STATUSES))
     return {STATUSES[k]: int(n) for k, n in enumerate(counts) if n}
 
@@ -71,7 +71,7 @@ def default_outputs(robot: Robot, turns: bool) -> Names:
         )
     if not robot.has_ground:
         beside = ("power_supply",)
-    elif robot.rig.imposed == "motor_speed":  # it stalls on no slope
+    elif robot.rig.imposed == "motor_speed":  # no slope stalls it
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")
     outputs = known_outputs(robot)
     return tuple(n for n in (*channels.channel_names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
@@ -85,7 +85,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
 
     Raises:
         BadConfiguration: a name is unknown (the message lists the choices). Also if an output needs a ground or
-            stance that the robot lacks, a turn while it travels straight, or straight travel while it turns.
+            stance that the robot lacks, or a turn in straight travel, or straight travel in a turn.
     """
     outputs, outputs_chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)
@@ -124,7 +124,7 @@ class Model:
     Attributes:
         robot: robot with the other parameters.
         columns: names of the parameters and conditions that vary.
-        fidelity, options: fidelity and its options, for outputs that are not derived.
+        fidelity, options: fidelity of outputs that are not derived, and its options.
         outputs: outputs to compute.
     """
 
@@ -204,7 +204,7 @@ class Model:
         point.
         """
         points, values = len(values), np.asarray(values)
-        alike = conditions.shape == ()  # the program broadcasts them
+        alike = conditions.shape == ()  # broadcast by the program
         spread = conditions if alike else jax.tree.map(np.asarray, conditions)
         parts = []
         for first in range(0, points, size):
@@ -264,9 +264,7 @@ def _derivatives(
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
-    """Jacobian of all points. One tangent for each column suffices, because outputs of a point depend on its own row
-    only.
-    """
+    """Jacobian of all points. One tangent per column suffices, since outputs of a point depend only on its row."""
 
     def numbers(values: Array) -> tuple[dict[str, Array], Array]:
         made = _outputs(variation, source, options, names, values, conditions)

@@ -1,8 +1,8 @@
 """Screening by elementary effects: changes of an output when single inputs change (Morris 1991).
 
 μ* is the mean magnitude of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22
-(2007)). σ is the variation of the change between places, by nonlinearity or interactions. Trajectories and measures
-are SALib's.
+(2007)). σ is the standard deviation of the change between places, due to nonlinearity or interactions. Trajectories
+and measures are computed by SALib.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ElementaryEffects:
         size: μ*, mean magnitude of the effects, with its interval.
         spread: σ, standard deviation of the effects.
         trajectories: number of included trajectories.
-        lost: number of trajectories that were left out because the model has no value at a point.
+        lost: number of omitted trajectories, at a point of which the model has no value.
     """
 
     mean: np.ndarray
@@ -41,7 +41,7 @@ def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
     """Trajectories in the unit cube, shape (trajectories · (inputs + 1), inputs)."""
     from SALib.sample import morris as sampling
 
-    # The sampler draws from NumPy's global generator, whatever its seed argument; its state is restored.
+    # The sampler uses NumPy's global generator despite its seed argument, so the state is restored.
     state = np.random.get_state()  # noqa: NPY002
     try:
         return sampling.sample(_problem(inputs), trajectories, num_levels=LEVELS, seed=seed)

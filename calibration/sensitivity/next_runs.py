@@ -1,4 +1,4 @@
-"""Choice of the runs from a list that are most informative about the inputs of a study."""
+"""Choice of the runs in a list that are most informative about the inputs of a study."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
             missing readings.
         sd: standard deviation of the readings, shape (runs, channels).
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # a share of a reading of zero is no information
+    with np.errstate(divide="ignore", invalid="ignore"):  # a relative sd of a zero reading is no information
         whitened = jacobian / sd[..., None]
     whitened = np.where(np.isfinite(whitened), whitened, 0.0)
     return np.einsum("rci,rcj->rij", whitened, whitened)
@@ -67,7 +67,7 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
                 run_indices = [*others, best]
                 improved = True
     ordered: list[int] = []
-    for _ in range(count):  # of the set, the most informative first
+    for _ in range(count):  # chosen runs, the most informative first
         unordered = [k for k in run_indices if k not in ordered]
         ordered.append(max(unordered, key=lambda k: _log_determinant(information, [*ordered, k])))
     values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
@@ -103,7 +103,7 @@ class CandidateRuns:
     Attributes:
         points, conditions: operating points and conditions of the runs.
         source: origin of the list.
-        noise: index of a channel → (number, True for a share of the reading), see `calibration.inference.noise`.
+        noise: index of a channel → (number, True if relative to the reading), see `calibration.inference.noise`.
         words: the same noise as text.
         sd: standard deviations stated by the candidates [SI], NaN if not stated, shape (candidates, channels).
         count: number to propose.
@@ -126,7 +126,7 @@ class CandidateRuns:
 
 
 def choose_next_runs(study: Study, found: LocalDerivatives, candidates: CandidateRuns) -> NextRuns | None:
-    """Candidates that together are most informative about the parameters, if every channel is read.
+    """Candidates that together are most informative about the parameters, if every channel is measured.
 
     Args:
         found: results at the operating points of the study.
@@ -143,7 +143,7 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
         return None
     rows = np.tile(study.inputs.centre, (len(points), 1))
     values = np.array(study.values_at(rows))
-    # A condition that a candidate states is set, whatever its range in the study; others stay in the middle of their
+    # A condition that a candidate states replaces its range in the study. The others are in the middle of their
     # range.
     first = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):

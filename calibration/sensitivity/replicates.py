@@ -1,9 +1,9 @@
 """Estimates from independent replicates of a randomised design, with valid intervals.
 
-Every index here is a ratio of means: of a numerator over a variance. A bootstrap over the points of a scrambled Sobol
-sequence would treat them as independent, but they are correlated by construction. Whole replicates with
-scramblings of their own are independent (Owen, Monte Carlo variance of scrambled net quadrature, SIAM J. Numer.
-Anal. 34 (1997)). So their spread is that of the estimate, and Student's t for their number gives the interval.
+Every index is a ratio of means: a numerator over a variance. A bootstrap over the points of a scrambled Sobol
+sequence would treat them as independent, but they are correlated by construction. Whole replicates with different
+scramblings are independent (Owen, Monte Carlo variance of scrambled net quadrature, SIAM J. Numer. Anal. 34 (1997)).
+The spread between replicates is therefore that of the estimate, and Student's t gives the interval.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEs
     """Ratio of the means of two quantities over replicates, with its interval.
 
     Its variance is that of the linearised ratio, e = (numerator - ratio · denominator) / mean denominator (Cochran,
-    Sampling Techniques (1977), eq. 6.9). The bias of a ratio decreases with the number of all points, not of a
-    replicate's points.
+    Sampling Techniques (1977), eq. 6.9). The bias of the ratio decreases with the total number of points, not with
+    the number in a replicate.
 
     Args:
         numerator: shape (replicates, ...).

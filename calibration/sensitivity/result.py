@@ -1,4 +1,4 @@
-"""Result of a sensitivity study, by name. JSON, tables, terminal output and reports are made from it."""
+"""Result of a sensitivity study, from which JSON, tables, terminal output and reports are made."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mmrjax.model.quantities import Quantity
 SCHEMA = "mmrjax.sensitivity/1"
 #: Methods.
 METHODS = ("local", "sobol", "morris")
-#: Share of an output's variance below which an input is negligible, for all outputs and points [-].
+#: An input is negligible if its share of the variance is smaller for all outputs and points [-].
 NEGLIGIBLE = 0.01
 
 
@@ -59,21 +59,21 @@ class OperatingPoints:
         )
 
     def at(self, rows: np.ndarray) -> OperatingPoints:
-        """Some of the points, selected by a mask or an index."""
+        """Points selected by a mask or an index."""
         speed = None if self.motor_speed is None else self.motor_speed[rows]
         voltage, payload, slope = (x[rows] for x in (self.voltage, self.payload, self.slope_deg))
         return OperatingPoints(self.configuration[rows], voltage, payload, slope, speed, self.has_ground)
 
     @property
     def imposed(self) -> tuple[str, np.ndarray, str]:
-        """Imposed quantity of the motors: name, values, unit."""
+        """Quantity imposed on the motors: name, values, unit."""
         if self.motor_speed is None:
             return "voltage", self.voltage, "V"
         return "motor speed", self.motor_speed, "rpm"
 
     @property
     def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
-        """Conditions of the ground: column, values and unit of each. Empty without a ground."""
+        """Ground conditions: column, values and unit of each. Empty without a ground."""
         quantities = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
         return quantities if self.has_ground else ()
 
@@ -170,7 +170,7 @@ class Interaction:
     Attributes:
         second: second-order index.
         interval: 95 % interval of the index.
-        sure: True if the index is above zero even with an interval that allows for all tested pairs.
+        sure: True if the index is above zero even with an interval for all tested pairs at once.
     """
 
     JSON = ("pair", "second", "second_interval=interval", "sure")
@@ -218,7 +218,7 @@ class SensitivityResult:
         points: operating points.
         outputs: results by output name.
         statuses: source → status → number of points, at the medians.
-        sampled: the same for the sample.
+        sampled: source → status → number of points, in the sample.
         next_runs: most informative next runs. None if no candidate converges.
         evaluations: number of model evaluations.
         seconds: duration of the evaluations [s], including compilation.
@@ -384,7 +384,7 @@ def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
     part = np.flatnonzero(np.nan_to_num(study.overall["total"].value) >= NEGLIGIBLE / 10)
     pairs = [(int(i), int(j)) for n, i in enumerate(part) for j in part[n + 1 :]]
     wider = 1.0
-    if pairs:  # so that in 95 of 100 studies no pair is called sure by chance (Bonferroni)
+    if pairs:  # in 95 of 100 studies no pair is sure by chance (Bonferroni)
         single_quantile, all_ = (stats.t.ppf(1 - (1 - LEVEL) / 2 / n, REPLICATES - 1) for n in (1, len(pairs)))
         wider = float(all_ / single_quantile)
     pairs_found = []

@@ -1,12 +1,12 @@
 """Variance-based (Sobol) indices of independent inputs: first, total and second order (Sobol' 1993, Homma and
 Saltelli 1996).
 
-S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that is removed if x_i is known. T_i = E[Var(y | all
-but x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions. S_ij is the
-joint effect of x_i and x_j in addition to their single effects. Designs are SALib's (Saltelli's scheme on a scrambled
-Sobol sequence), and so are the estimators: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first order and,
-after Jansen (1999), for the total. Saltelli, ibid. 145 (2002) for second order, the mean of both orders. Intervals
-are from whole replicates.
+S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that vanishes if x_i is known. T_i = E[Var(y | all but
+x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions. S_ij is the joint
+effect of x_i and x_j in addition to their single effects. Designs (Saltelli's scheme on a scrambled Sobol sequence)
+and estimators are those of SALib: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first order and, after Jansen
+(1999), for the total, and Saltelli, ibid. 145 (2002) for second order, as the mean of both orders. Intervals are from
+whole replicates.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate, rat
 
 #: Fewest points of a replicate.
 FEWEST = 4
-#: Numbers of replicates at which convergence is shown.
+#: Numbers of replicates for which convergence is shown.
 STAGES = (4, 8, 16, REPLICATES)
 
 
@@ -53,7 +53,7 @@ class SobolDesign:
 
 
 def base_point_count(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
-    """Number of base points of a replicate that gives at least this many evaluations: the next power of 2."""
+    """Number of base points of a replicate for at least this many evaluations: a power of 2."""
     blocks = (2 * inputs if second else inputs) + 2
     return 2 ** max(math.ceil(math.log2(max(evaluations / (replicates * blocks), FEWEST))), 0)
 
@@ -79,7 +79,7 @@ def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replica
 
 @dataclasses.dataclass(frozen=True)
 class VarianceTerms:
-    """Parts of the variance of an output, for each replicate [unit² of the output]. Their ratios are the indices.
+    """Parts of an output's variance in each replicate [unit² of the output]. Their ratios are the indices.
 
     Attributes:
         variance: total variance, shape (replicates,).
@@ -87,7 +87,7 @@ class VarianceTerms:
         second: part of each pair including its single effects, shape (replicates, inputs, inputs). None if not
             computed.
         rows: number of included base points.
-        lost: number of base points that were left out because the model has no value.
+        lost: number of base points omitted because the model has no value.
     """
 
     variance: np.ndarray
@@ -110,7 +110,7 @@ class VarianceTerms:
         )
 
     def widened(self, places: Sequence[int], inputs: int) -> VarianceTerms:
-        """Terms for more inputs: these at `places`, the others without influence."""
+        """Terms for more inputs: these terms at `places`, the others without influence."""
 
         first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
         first[:, places], total[:, places] = self.first, self.total
@@ -125,9 +125,9 @@ class VarianceTerms:
 def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None:
     """Parts of the variance of an output.
 
-    A base point is omitted if the output is not finite in one of its blocks. If that depends on a single input (such
-    as too small an adhesion), the indices are exactly those of that input truncated there. Otherwise they are
-    approximate.
+    A base point is omitted if the output is not finite in one of its blocks. If this depends on a single input (such
+    as too small an adhesion), the indices are exact for the distribution of that input truncated there. Otherwise
+    they are approximate.
 
     Args:
         values: values of the output at the points of the design.
@@ -146,7 +146,7 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
     centre = (a + b)[finite].mean() / 2
     values_by_block = np.where(finite[..., None], values_by_block - centre, 0.0)
     a, b, ab = values_by_block[..., 0], values_by_block[..., -1], values_by_block[..., 1 : d + 1]
-    # A replicate with more rows has a larger weight: sums over the mean number of rows, not means of each.
+    # A replicate with more rows has a larger weight: sums are divided by the mean number of rows.
     weight = 1.0 / count.mean()
     second = None
     if design.second:

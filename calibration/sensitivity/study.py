@@ -77,14 +77,13 @@ class Study:
         return self.inputs.acting(str(self.points.configuration[k]), self.robot.configurations.names)
 
     def values_at(self, scores: np.ndarray) -> np.ndarray:
-        """Columns of the model for scores of all inputs."""
+        """Values of the model's columns for scores of all inputs."""
         return np.asarray(self.inputs.values(scores))
 
     def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, Columns]]:
-        """Yields the outputs at each point for the same values of the model's columns. Evaluations are counted and
-        timed.
+        """Yields the outputs at each point for the same sampled inputs. Evaluations are counted and timed.
 
-        A source is not computed again if conditions differ only in ones that it ignores.
+        A source is not computed again if only conditions that it ignores differ.
         """
         sampled: dict[tuple[str, tuple[float, ...]], ModelOutputs] = {}
         for k in points:

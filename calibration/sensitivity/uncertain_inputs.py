@@ -24,10 +24,10 @@ from mmrjax.errors import UsageError
 from mmrjax.fidelities.variation import CONDITIONS, Axis, Variation
 from mmrjax.model.robot import Robot
 
-#: Least distance from an end of the unit interval for a normal score: 6 sds.
+#: Smallest distance from the ends of the unit interval, which limits normal scores to 6 sds.
 EDGE = 1e-9
 
-#: Distribution of no parameter.
+#: Distribution without parameters.
 NOTHING = Posterior(
     coordinates=(), units=(), mean=np.zeros(0), covariance=np.zeros((0, 0)), location=np.zeros(0), spread=np.zeros(0),
     low=np.zeros(0), high=np.zeros(0), softness=np.zeros(0), kinds=(),
@@ -63,7 +63,7 @@ class UncertainInputs:
 
     @property
     def columns(self) -> Names:
-        """Columns of a point's values: inputs, and parameters tied to them."""
+        """Columns of a point: inputs, and parameters tied to them."""
         return (*self.parameters.names, *self.conditions)
 
     @cached_property
@@ -112,12 +112,12 @@ class UncertainInputs:
         return np.concatenate([np.arange(p), np.arange(p + tied, p + tied + len(self.conditions))])
 
     def acting(self, configuration: str, others: Sequence[str]) -> np.ndarray:
-        """Indices of the inputs that do not belong to another configuration."""
+        """Indices of the inputs that act in a configuration."""
         foreign = tuple(f"{name}." for name in others if name != configuration)
         return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
 
 
-#: Parameters that belong to a rig only if its file states a prior for them.
+#: Parameters that are inputs of a rig only if its file states a prior for them.
 _OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_", "motor.temperature_ambient")
 
 
@@ -135,7 +135,7 @@ def default_input_names(
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     by_name = priors.parameters_by_name(robot)
     left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
-    if not robot.rig.inherits:  # parameters of another robot are not its own
+    if not robot.rig.inherits:  # parameters of another robot do not count
         prior_names = {name for name, _, _ in robot.rig.priors}
         left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in prior_names} | {
             *robot.rig.unknown

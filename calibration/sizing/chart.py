@@ -1,4 +1,4 @@
-"""Chart of where a robot can be used: the nearest limit and its margin, over payload and slope."""
+"""Chart of a robot's use: the nearest limit and its margin, over payload and slope."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIMITS = (
     "cell cut-off",
     "speed",
 )
-#: Number of points along payload and slope, and the chart's extent over the envelope's.
+#: Number of points along payload and slope, and ratio of the chart's extent to that of the envelope.
 POINTS, BEYOND = 33, 1.6
 
 

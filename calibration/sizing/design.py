@@ -1,4 +1,4 @@
-"""A design as numbers, the robot that it describes, and its margins to requirements and to ratings of parts."""
+"""A design as numbers, its robot, and its margins to requirements and ratings of parts."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from mmrjax.model.signals import CONVERGED
 #: Continuous numbers of a design, for which the search uses logarithms: total ratio, rolling radius [m], cells in
 #: parallel.
 CONTINUOUS = ("ratio", "radius", "parallel")
-#: Quantities that can be minimised: name, unit and words.
+#: Quantities that can be minimised: name, unit and description.
 OBJECTIVES = {
     "mass": ("kg", "mass without payload"),
     "energy": ("Wh/m", "energy per metre"),
     "cost": ("EUR", "price of motors and gearboxes"),
 }
-#: Requirements on lasting travel: at their points the ratings of the parts apply.
+#: Requirements on continuous travel, at whose points the ratings of the parts apply.
 LASTING = tuple(q.column for q in QUANTITIES.values() if q.group in ("travel", "payload"))
-#: Ratings of parts: name and words.
+#: Ratings of parts: name and description.
 RATED = {
     "winding": "winding", "motor_speed": "motor speed", "gearbox_speed": "gearbox input speed",
     "gearbox_torque": "gearbox torque", "cell_current": "cell current",
@@ -52,7 +52,7 @@ class Design(eqx.Module):
 
     Attributes:
         continuous: logarithms of `CONTINUOUS`.
-        drive, cell: numbers of the chosen drive and cell, by name, as in `PartOptions`.
+        drive, cell: values of the chosen drive and cell, by name, as in `PartOptions`.
         cells: number of cells in series.
     """
 
@@ -66,7 +66,7 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
     """Robot of a design, derived from an initial robot, and the ratings of its parts. Can be traced by JAX.
 
     The masses of motors, gearboxes and cells replace those of the initial robot. The voltage of a cell depends on the
-    used share of its capacity as in the initial robot. Cells in parallel share the resistance.
+    used share of its capacity as in the initial robot. Parallel cells divide its resistance by their number.
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
@@ -101,7 +101,7 @@ class SizingDemand:
 
 
 class SizingTask(eqx.Module):
-    """Requirements as points and demands. Each point needs one solution of the balances for each design.
+    """Requirements as points and demands. For each design, the balances are solved once per point.
 
     Attributes:
         robot: initial robot, with one cell (see `sheet`).
@@ -187,7 +187,7 @@ def _envelope_corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[t
     if r.name == "payload_kg":
         return [(dataclasses.replace(p, payload=jnp.asarray(float(r.limit or 0.0))),) for p in corners]
     if r.name == "endurance_min":
-        # The nodes of the integral and the end of the charge.
+        # Nodes of the integral, and end of the charge.
         nodes = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
         charges = [*(high + (r.envelope.charge_end - high) * nodes), r.envelope.charge_end]
         return [tuple(dataclasses.replace(p, charge=jnp.asarray(float(c))) for c in charges) for p in corners]
@@ -247,9 +247,9 @@ def _demand_margin(
         return jnp.min(jnp.stack([travels, above, hot, torque]))
     if r.name == "endurance_min":
         return _endurance_margin(r, robot, ratings, states)
-    if r.limit is None:  # the rating of the parts, a demand on every design
+    if r.limit is None:  # ratings of the parts, required of every design
         return jnp.minimum(travels, above)
-    if r.name not in states:  # a quantity that is not of straight travel
+    if r.name not in states:  # not a quantity of straight travel
         found_here = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
         counts = jnp.where(found_here.outcome == CONVERGED, 1.0, -1.0)
         value, travels = found_here.value / r.quantity.factor, jnp.min(counts)

@@ -1,4 +1,4 @@
-"""Search for a design: parts are enumerated, continuous numbers are found by gradients from many starts in one
+"""Search for a design: parts are enumerated, and continuous numbers are found by gradients from many starts in a
 batch.
 """
 
@@ -38,21 +38,21 @@ from mmrjax.model.robot import Robot
 #: Ranges of cells in series, cells in parallel, and the radius as a multiple of the robot's (on tracks the height of
 #: 100 mm of Section 2.2 allows 1.3).
 CELLS, PARALLEL, RADIUS = (3, 14), (1.0, 12.0), (0.6, 1.3)
-#: Random designs of each enumerated choice, from which the starts are taken; least number of starts for each motor;
-#: largest number for one choice.
+#: Random designs for each choice of parts, from which the starts are taken. Fewest starts per motor, and most starts
+#: per choice.
 TRIES, OF_MOTOR, OF_CHOICE = 6, 6, 3
 #: Rows of one call of `_evaluate_designs`.
 ROWS = 8192
-#: Steps of each start; steps between updates of the multipliers; first and last step length in the logarithms.
+#: Steps of each search. Steps between updates of the multipliers. First and last step length in the logarithms.
 STEPS, EVERY, RATE = 120, 12, (0.06, 0.003)
-#: Weight of a violated margin: initial, factor of each update, largest.
+#: Weight of a violated margin: initial value, factor per update, largest value.
 WEIGHT, GROWTH, HEAVIEST = 5.0, 1.7, 500.0
-#: Number of designs that are then refined, points along each of their axes, rounds, and shrinkage of the box.
+#: Number of refined designs, points along each axis, rounds, and shrinkage of the box per round.
 REFINED, ALONG, ROUNDS, SHRINK = 24, 7, 7, 0.45
-#: Number of choices for which all ratios of the sheets are tried with whole cells, most cells in parallel, and number
-#: of designs that are kept.
+#: Number of choices whose data-sheet ratios are all tried with whole cells, most parallel cells, and number of
+#: designs that are kept.
 WHOLE, MOST_WHOLE, KEPT_WHOLE = 600, 8, 192
-#: Largest margin of an active limit.
+#: A limit is active up to this margin.
 BINDS = 0.01
 
 
@@ -245,7 +245,7 @@ def evaluate_designs(
         f, g = jax.device_get(_evaluate_designs(problem, choice.designs(rows[some], x[some])))
         parts.append((f[: len(rows) - first], g[: len(rows) - first]))
     f, g = (np.concatenate(p) for p in zip(*parts, strict=True))
-    f = np.where(f > 0, f, np.inf)  # no motion, or no price: worse than any
+    f = np.where(f > 0, f, np.inf)  # worse than any other: no motion, or no price
     return f, np.where(np.isfinite(g), g, -5.0)
 
 
@@ -289,9 +289,10 @@ def size_robot(
     tell(progress_remark("whole"))
     real = search.buildable_designs(drawn, free, weights)
     tell(progress_remark("refined", REFINED))
-    # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
+    # The best of these are refined with free ratio and fractions of a cell, because no search may have started from
+    # their parts.
     top = np.argsort(search.cost(real))[:REFINED]
-    free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
+    free = free + search.refined(real.rows[top], real.x[top], search.first_objective_weights(len(top)), np.ones(3))
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
     def found(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
@@ -301,7 +302,7 @@ def size_robot(
     everything, by_motor = free + real, dict[str, SizedDesign]()
     for k in np.argsort(search.cost(everything)):
         name = part_options.drives[choice.drive[everything.rows[k]]].motor.name
-        if name not in by_motor:  # building a robot takes time, and there are a thousand designs
+        if name not in by_motor:  # building robots for all thousand designs takes time
             by_motor[name] = found(everything, int(k))
     good = [k for k in range(len(real.rows)) if np.all(real.g[k][is_feasible] >= 0)]
     different: dict[tuple[int, int], int] = {}
@@ -342,7 +343,7 @@ class _EvaluatedDesigns:
 def _random_designs(
     problem: SizingTask, choice: ChoiceSpace, costed: bool, rng: np.random.Generator
 ) -> _EvaluatedDesigns:
-    """Random designs for every choice of parts. They show which limits can be met, and serve as starts.
+    """Random designs for every choice of parts. They show which limits can be met, and some become starts.
 
     Args:
         costed: True to include only drives with a known price.
@@ -375,7 +376,7 @@ class _DesignSearch:
         """Designs with their objectives and margins."""
         return _EvaluatedDesigns(rows, x, *evaluate_designs(self.problem, self.choice, rows, x))
 
-    def first(self, count: int) -> np.ndarray:
+    def first_objective_weights(self, count: int) -> np.ndarray:
         """Weights of only the first objective, shape (count, objectives)."""
         return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
 
@@ -392,7 +393,7 @@ class _DesignSearch:
 
     def cost(self, designs: _EvaluatedDesigns) -> np.ndarray:
         """Cost by the first objective, shape (designs,)."""
-        return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
+        return _cost(designs.f, designs.g, self.kept, self.first_objective_weights(len(designs.rows)))
 
     def misses(self, drawn: _EvaluatedDesigns) -> np.ndarray:
         """Total violation of the limits that can be met, shape (designs,)."""
@@ -442,7 +443,7 @@ class _DesignSearch:
 
 
 def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
-    """Best designs to start from: some for each motor, then the best of all, with few from one choice."""
+    """Designs to start from: the best for each motor, then the best of all, but few for each choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
     start_indices: list[int] = []
@@ -462,7 +463,7 @@ def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, cou
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Cost of designs: logarithm of the objective. With a violated margin it exceeds that of any feasible design."""
+    """Cost of designs: logarithm of the objective. Designs with a violated margin cost more than any feasible one."""
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
     short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)

@@ -26,9 +26,9 @@ from mmrjax.model.robot import Robot
 
 #: The paper's parts among the sheets.
 MOTOR, GEARBOX, CELL = "RE 30 24 V", "GP 32 C 23:1", "XP2200SL"
-#: Ratio of the belt stage between gearbox and driving wheel, which is kept (docs/explanation/paper-notes.md).
+#: Ratio of the belt stage between gearbox and driving wheel, which is not changed (docs/explanation/paper-notes.md).
 BELT_STAGE = 25 / 12
-#: A current above any limit [A].
+#: Current above any limit [A].
 FREE = 1e9
 
 
@@ -50,12 +50,12 @@ class DriveOption(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name for the user."""
+        """Displayed name."""
         return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
 
 
 def drive_options(names: Names = ()) -> tuple[DriveOption, ...]:
-    """All motors (or those named) with all sizes of gearbox with which their source combines them."""
+    """All motors (or those named) with all gearbox sizes that their maker combines with them."""
     options = []
     for motor in packaged_motors():
         if names and motor.name not in names:
@@ -76,7 +76,7 @@ _LIPO = "lithium-polymer"
 
 @dataclasses.dataclass(frozen=True)
 class PartOptions:
-    """Numbers of drives and cells, one row for each, by name.
+    """Numbers of drives and cells by name, one row for each.
 
     Attributes:
         drives, cells: data sheets.

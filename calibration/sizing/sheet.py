@@ -1,4 +1,4 @@
-"""Check of requirements: each at the worst corner of its envelope, with its margin and changes that would meet it."""
+"""Check of requirements: the margin of each at the worst corner of its envelope, and changes that would meet it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from mmrjax.model.quantities import AMBIENT, AXES, CHARGE, MM, PAYLOAD, SLOPE
 from mmrjax.model.robot import Robot, turn_error
 from mmrjax.model.signals import CONVERGED, STATUSES
 
-#: Number of values along each axis of an envelope: its ends, and between them if an output may have an extremum.
+#: Number of values along each axis of an envelope: its ends, and more if an output may have an extremum between them.
 VALUES = {PAYLOAD: 3, SLOPE: 5, CHARGE: 5, AMBIENT: 2}
-#: Parameters that a designer can change; those of a configuration without its name. `battery.cells` is an integer.
+#: Parameters that a designer can change, without the name of their configuration. `battery.cells` is an integer.
 CELLS = "battery.cells"
 CHANGEABLE = (
     "gearbox.ratio", "gearbox.efficiency_load", "motor.resistance", "motor.torque_constant",
@@ -39,7 +39,7 @@ OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_
 OF_LEVERS = ("running_gear.lever_length", "running_gear.levers.roller")
 #: Range of a change, in addition to the field's bounds: least and greatest multiple of the present value.
 REACH = (0.1, 10.0)
-#: Values of a parameter in one call, values along a ladder, and digits of a stated change.
+#: Values of a parameter per call, values in the coarse search, and digits of a reported change.
 ROWS, LADDER, DIGITS = 32, 24, 4
 
 
@@ -328,11 +328,12 @@ def _present_values(held: _QuantityOfRobot) -> np.ndarray:
 def _check_requirement(held: _QuantityOfRobot) -> RequirementOutcome:
     r = held.requirement
     value, outcome, margin = (x[0] for x in held.over(_present_values(held)[None]))
-    # A point without a value is worse than any; the largest of those with the same outcome is at its worst corner.
+    # A point without a value is worse than any other. Among points with the same outcome, the largest is the worst
+    # corner.
     k = int(np.argmin(margin))
     status = STATUSES[outcome[k]]
     counts = np.isfinite(margin[k])
-    if not counts and status == STATUSES[CONVERGED]:  # a value beyond all bounds: a temperature that never settles
+    if not counts and status == STATUSES[CONVERGED]:  # beyond all bounds: a temperature that never settles
         status = "unbounded"
     return RequirementOutcome(
         r,
@@ -378,7 +379,7 @@ def _add_changes(
     for other, before in zip(every, now, strict=True):
         if other is held or not before.met:
             continue
-        # Another configuration has other names; names in common are changed.
+        # Other configurations have other names. Common names are changed.
         present = np.tile(_present_values(other), (len(rows), 1))
         for k, name in enumerate(held.names):
             if name in other.names:
@@ -430,7 +431,7 @@ def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[P
         low, high = max(bounds[0], REACH[0] * now[k]), min(bounds[1], REACH[1] * now[k])
         uphill = slopes[k] if np.isfinite(slopes[k]) else 0.0
         if outcome.margin is not None and uphill == 0:
-            continue  # the quantity does not depend on it
+            continue  # no influence
         # Without a value the derivative is not informative, so both directions are tried.
         ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
         options = [v for end in ends if (v := _nearest_value(held, name, now[k], end)) is not None]
@@ -442,8 +443,8 @@ def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[P
 
 
 def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
-    """Value of a parameter, nearest to `begin` and in the direction of `end`, that meets the requirement. None if
-    there is none.
+    """Parameter value nearest to `begin`, in the direction of `end`, that meets the requirement. None if there is
+    none.
     """
     if begin == end:
         return None
@@ -470,7 +471,7 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
         inside = np.flatnonzero(meets(finer))
         k = int(inside[0]) if inside.size else len(finer) - 1
         a, b = (a if k == 0 else finer[k - 1]), finer[k]
-    # Rounded to few digits, away from `begin`; each rounding is tested.
+    # Rounded to few digits, away from `begin`. Each rounded value is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
         rounded = _round_outward(b, digits, up=end > begin)
         if min(begin, end) <= rounded <= max(begin, end) and meets(np.array([rounded]))[0]:
@@ -484,6 +485,6 @@ def _round_outward(value: float, digits: int, up: bool) -> float:
 
 
 def count_outcomes(outcomes: Sequence[RequirementOutcome]) -> Mapping[str, int]:
-    """Number of requirements that are met, and that are missed."""
+    """Numbers of met and missed requirements."""
     met = sum(o.met for o in outcomes)
     return {"met": met, "missed": len(outcomes) - met}

@@ -274,9 +274,11 @@ SAID: dict[str, str | Callable[..., str]] = {
     "nothing_possible": "Every experiment that the loop can propose is forbidden or not possible on this bench",
     "no_menu": "The loop can propose experiments for straight travel only, not for {word}",
     "nothing_tells": lambda names, sigma: (
-        f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} σ"
+        f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} σ. "
+        "Repeat the runs to average out the noise, or measure one of these parts on its own"
     ),
-    "too_weak": "A series of runs over {variable} would show the missing term with only {sigma:.1f} σ",
+    "too_weak": "A series of runs over {variable} would show the missing term with only {sigma:.1f} σ. "
+    "Repeat the runs to average out the noise",
     "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
         f"{instruction_for_further_runs(SimpleNamespace(**series))}. Read every channel. The series shows how the "

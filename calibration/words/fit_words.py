@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data import Names
+from calibration.described import as_paragraph, sentences
 from calibration.inference import blocks, fit_notes
 from calibration.inference.identifiability import HELD
 from calibration.inference.simulation_errors import root_mean_square
@@ -243,17 +244,42 @@ def calibration_answer(found: CalibrationResult) -> str:
     return f"{_VERDICTS[found.adequacy.adequate]}. The rms error before → after on {row_words}: {errors}."
 
 
+#: Fitted parameters that a terminal shows, and remarks that it shows in full.
+FEW, TO_CHECK = 4, ("unsettled", "far_from_prior", "after_steps", "shifted", "freed_delay", "residual_cluster")
+
+
+def brief_calibration(found: CalibrationResult) -> Names:
+    """Lines printed below the answer: adequacy, determined parameters, hold-out errors, and what to check."""
+    determined = {name: p for name, p in found.parameters.items() if not p.held_by_prior}
+    first = sorted(determined.items(), key=lambda item: -abs(item[1].shift))[:FEW]
+    fitted = [f"{name} {p.value:.3g} ± {p.sd:.2g} {p.unit}".rstrip(" -") + f" ({p.shift:+.1f})" for name, p in first]
+    more = f", and {len(determined) - FEW} more" * (len(determined) > FEW)
+    parameters = (
+        f"These runs determine {len(determined)} of {len(found.parameters)} parameters (shift in prior sds): "
+        f"{', '.join(fitted) or 'none'}{more}."
+    )
+    held_out = []
+    for kind in list(found.held_out_alike)[:1]:
+        errors = found.held_out[kind].errors
+        percent = [f"{c.label} {errors[c.name].rms_percent:.1f} %" for c in found.channels if errors[c.name].rows]
+        held_out = [f"rms error with each {blocks.kind_in_words(kind)} left out of the fit: {', '.join(percent)}."]
+    to_check = sentences(fit_notes.remarks_with_codes(found.remarks, *TO_CHECK))
+    check = f"Check first: {as_paragraph(to_check)} " * bool(to_check)
+    others = count_noun(len(found.notes) - len(to_check), "further remark")
+    return f"{found.adequacy.statement}.", parameters, *held_out, f"{check}--verbose prints tables and {others}."
+
+
 #: Levels of a cluster that are listed, the farthest from nothing.
 LISTED = 6
 
 
 def residual_cluster(c: ResidualCluster) -> str:
-    """Residuals that go with a column without a role."""
+    """Residuals that depend on a column that the model does not use."""
     subject = f"residuals of {channels.find_channel(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"
-    role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
+    role = "a column that the model does not use" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
             f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}, {p}), "

@@ -461,11 +461,13 @@ def percent_text(error: Mapping[str, float | int]) -> str:
 
 
 def errors_of_written_robot(found: DiscoveryResult) -> list[str]:
-    """Errors of the written robot on fitted and on held-out rows, by kind of block."""
+    """Errors of the written robot on fitted and on held-out rows, by kind of block, or "No"."""
     when = 1 if found.written else 0
-    lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
+    if found.headline.level == "undescribed":
+        return ["No: this model does not describe these runs."]
+    lines = [f"**These conditions**: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
     for kind, error_pair in found.errors_held_out.items():
-        lines.append(f"Another {blocks.kind_in_words(kind)}: {_rms(error_pair[when], len(found.runs))}.")
+        lines.append(f"**Another {blocks.kind_in_words(kind)}**: {_rms(error_pair[when], len(found.runs))}.")
     return lines
 
 
@@ -476,7 +478,7 @@ def _rms(errors: Errors, total: int) -> str:
         return "no row can be simulated"
     rms, worst, rows = (max(float(e[name]) for e in non_empty) for name in ("rms_percent", "max_percent", "rows"))
     few = f" ({rows:.0f} of {total} rows simulated)" if rows < total else ""
-    return f"rms ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
+    return f"rms error ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
 
 
 def largest_share(found: DiscoveryResult) -> str:

@@ -117,8 +117,9 @@ class ClimbDerivatives(NamedTuple):
     Attributes:
         climb: the simulated climb.
         found: outputs of the climb.
-        by: derivatives of the outputs, of shape (values,). slope, slope_sd: slopes of straight lines through `BESIDE`
-            runs along each value, and the standard deviations of these slopes.
+        by: derivatives of the outputs, of shape (values,).
+        slope, slope_sd: slopes of straight lines through `BESIDE` runs along each value, and their standard
+            deviations.
     """
 
     climb: ClimbRuns

@@ -87,7 +87,8 @@ class LeverStep(NamedTuple):
 
     Attributes:
         torque: torque on the levers [N·m].
-        rate: angular speed after the step [rad/s]. voltage, current: voltage and current of their motors [V], [A].
+        rate: angular speed after the step [rad/s].
+        voltage, current: voltage and current of their motors [V], [A].
         holds: True if a pair is held by its worm alone, without current.
     """
 

@@ -132,7 +132,7 @@ def thermal_margin(robot: Robot, point: EnvelopePoint, current: Scalar, limit: S
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 
-def _cell_margin(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
+def _cell_voltage_margin(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
     """Margin of a cell above its cut-off voltage [V], inf with an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
@@ -145,7 +145,7 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     """
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     signals, status, _ = operating_state(robot_there, conditions)
-    outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
+    outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
     warm = dataclasses.replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
@@ -162,7 +162,7 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
         "battery": robot_there.battery.current(signals.total_current),
         "adhesion": 1 - signals.demand / signals.adhesion_limit,
         "left": steepest_slope.travel_margin(robot_there, signals),
-        "cell": _cell_margin(rated, signals, point),
+        "cell": _cell_voltage_margin(rated, signals, point),
     }
     return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
 
@@ -191,7 +191,7 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
     """
     most = CONDITIONS["payload"].range[1]
 
-    def left(robot: Robot, payload: Scalar) -> Scalar:
+    def smallest_margin(robot: Robot, payload: Scalar) -> Scalar:
         loaded_point = dataclasses.replace(point, payload=payload)
         robot_there, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
         signals, _, _ = operating_state(robot_there, conditions)
@@ -201,21 +201,21 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
             steepest_slope.travel_margin(robot_there, signals),
             hot,
             torque,
-            _cell_margin(rated, signals, point),
+            _cell_voltage_margin(rated, signals, point),
         ]
         return functools.reduce(jnp.minimum, margins)
 
-    found, holds = _find_sign_change(left, robot, jnp.zeros(()), jnp.asarray(most))
+    found, holds = _find_sign_change(smallest_margin, robot, jnp.zeros(()), jnp.asarray(most))
     unladen_robot, conditions = _robot_and_conditions_at(
         robot, dataclasses.replace(point, payload=jnp.zeros(())), rated
     )
     signals, status, _ = operating_state(unladen_robot, conditions)
-    outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
+    outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
     return QuantityValue(jnp.where(holds, found, 0.0), outcome)
 
 
-def _find_sign_change(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
-    """Point between low and high at which `left` becomes negative, and True if `left` is positive at low.
+def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    """Point between low and high at which `margin` becomes negative, and True if `margin` is positive at low.
 
     `high` if it does not become negative. Derivatives are implicit, forward and reverse.
     """
@@ -224,19 +224,19 @@ def _find_sign_change(left, robot: Robot, low: Array, high: Array) -> tuple[Arra
     def halve(bracket: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         a, b = bracket
         middle = (a + b) / 2
-        holds = left(still, middle) > 0
+        holds = margin(still, middle) > 0
         return (jnp.where(holds, middle, a), jnp.where(holds, b, middle)), None
 
     begin, end = jax.lax.stop_gradient((low, high))
     (a, b), _ = jax.lax.scan(halve, (begin, end), None, length=HALVINGS)
     at = (a + b) / 2
-    steep = jax.jvp(lambda x: left(still, x), (at,), (jnp.ones_like(at),))[1]
+    steep = jax.jvp(lambda x: margin(still, x), (at,), (jnp.ones_like(at),))[1]
     usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
-    step = left(robot, at) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
+    step = margin(robot, at) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
     edge = at - jnp.where(usable & jnp.isfinite(step), step, 0.0)
     # A margin that jumps has no root for a Newton step.
     edge = jnp.where(jnp.abs(edge - at) < 1e-3 * (end - begin) + 1e-9, edge, at)
-    return jnp.where(left(still, end) > 0, high, edge), left(still, begin) > 0
+    return jnp.where(margin(still, end) > 0, high, edge), margin(still, begin) > 0
 
 
 #: Nodes of the integral over the charge.
@@ -290,7 +290,7 @@ def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str)
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
     signals, motion, status = circling_signals(robot_there, conditions)
-    low = jnp.any(jnp.asarray(_cell_margin(rated, signals.signals, point)) < 0)
+    low = jnp.any(jnp.asarray(_cell_voltage_margin(rated, signals.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     rolls = motion.speed**2 + motion.speed_lateral**2
     # A root of 0 has no derivative.

@@ -221,7 +221,7 @@ def _peak_between(before: Array, after: Array, rise: Array, fall: Array) -> Arra
     return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
-def _cell_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
+def _cell_voltage_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
     """Margin of a cell above its cut-off voltage [V]. Large on an external supply."""
     battery = asked.robot.battery
     cell = battery.voltage_cell(*law.supply_current_and_charge(asked, y, stands))
@@ -242,7 +242,7 @@ def event_functions(
     standing = smallest_of(slow, grips, stays - FIRMLY)
     battery, discharge = demand.robot.battery, law.supply_current_and_charge(demand, y, stands)[1]
     empty = jnp.where(demand.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
-    above = _cell_margin(law, demand, y, stands)
+    above = _cell_voltage_margin(law, demand, y, stands)
     falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
@@ -379,7 +379,7 @@ class _SegmentIntegrator(NamedTuple):
         demand = law.asked_at(robot, otherwise, segment, y, carry.stands)
         stands = carry.stands & (_holding_margin(law, demand, y, carry.stands) >= 0)
         # They may also change the cell voltage across its cut-off.
-        below = jnp.asarray(_cell_margin(law, demand, y, stands) < 0)
+        below = jnp.asarray(_cell_voltage_margin(law, demand, y, stands) < 0)
         low = jnp.where(below & carry.below, carry.low, 0.0)
         step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
         events = event_functions(law, robot, otherwise, segment, y, stands, below)

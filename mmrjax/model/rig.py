@@ -106,7 +106,7 @@ class Rig(eqx.Module):
         start: start of histories: `rest`, `measured` (by the first samples) or `free` (the same as prior means).
         begins: initial states of histories that do not begin at rest, once their table is known.
         between_rows: course of the imposed quantity between rows of histories, one of `BETWEEN`. An imposed speed
-        is always interpolated linearly.
+            is always interpolated linearly.
         surfaces: (configuration, another configuration that differs only by its ground).
         inherits: True if a packaged robot supplies what the file leaves open. False: nothing comes from another.
         unknown: parameters that nobody stated and that have no substitute. Their fields hold a packaged robot's value

@@ -137,7 +137,8 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, NewtonState]):
     A member is solved after a step whose square is below `atol`.
 
     Attributes:
-        atol: absolute tolerance of f. rtol, norm: not read.
+        atol: absolute tolerance of f.
+        rtol, norm: not read.
         apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches. False: all
             together, a program of a third of the size.
     """

@@ -129,7 +129,7 @@ def _loop_over_stages(
     for row, weights in enumerate(_C):
         turns[row, : len(weights)] = weights
 
-    def stage(k: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+    def solve_next_stage(k: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
         u, v = found
         a, c = jnp.asarray(reach)[k], jnp.asarray(turns)[k]
         f, g = rates(y0 + a @ u)
@@ -137,6 +137,6 @@ def _loop_over_stages(
         return u.at[k + 1].set(now), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ now))
 
     stage_arrays = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
-    u, v = jax.lax.fori_loop(0, 5, stage, (stage_arrays[0], stage_arrays[1]))
+    u, v = jax.lax.fori_loop(0, 5, solve_next_stage, (stage_arrays[0], stage_arrays[1]))
     last = jnp.asarray(reach)[4].at[5].set(1.0)
     return y0 + last @ u, q0 + last @ v, u, v

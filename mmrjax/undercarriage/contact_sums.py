@@ -63,10 +63,11 @@ class ContactSums(eqx.Module):
     Attributes:
         traction, normal: F and R [N].
         moment, rear: moments of F - F~ and R - R~ on pitch and driven pulley [N·m].
-        front: moments of F and R on the driving pulley [N·m]. guide_front, guide_rear: moments of R's share on the
-        guide, on both pulleys, for a coefficient of friction of 1 [N·m]. fallen_x, fallen_z, fallen_front: F~ and
-        R~ along the ground and off it [N] and on the driving pulley [N·m]. rise, rise_front: rise of F with all
-        sliding speeds [N·s/m], and of its part of `front` [N·s].
+        front: moments of F and R on the driving pulley [N·m].
+        guide_front, guide_rear: moments of R's share on the guide, on both pulleys, for a friction coefficient of 1
+            [N·m].
+        fallen_x, fallen_z, fallen_front: F~ and R~ along the ground and off it [N] and on the driving pulley [N·m].
+        rise, rise_front: rise of F with all sliding speeds [N·s/m], and of its part of `front` [N·s].
     """
 
     traction: Scalar

@@ -40,12 +40,13 @@ _END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0
 
 class ContactState(eqx.Module):
     """Position, motion and load of the contacts of one side at an instant. Grousers come first.
+
     Attributes:
         lever_x, lever_z: contact point from the middle of the wheelbase [m].
         rate_x, rate_z: velocity of the contact per belt speed [-].
         weight: share of the driven pulley in that belt speed [-].
-        speed_x: velocity of the contact over the ground, uphill [m/s]. gap, gap_rate: height over the ground [m]
-        and its rate [m/s].
+        speed_x: velocity of the contact over the ground, uphill [m/s].
+        gap, gap_rate: height over the ground [m] and its rate [m/s].
         compliance: compliance of the belt under it at its tension [m/N].
         force: normal force R_z [N].
         damped: decrease of the force with the gap's rate [N·s/m].

@@ -1,4 +1,4 @@
-"""The command `calibrate`: from a table of runs to a run folder with the calibrated robot."""
+"""The command `calibrate`: fits a robot to a table of runs and writes a run folder."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
-    """Calibrate a robot to a table and write a run folder. Returns the exit code.
-
-    0 done. 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
+    """Calibrates a robot to a table and writes a run folder. Returns the exit code: 0 if done, 3 if the search or a
+    fit without a block did not converge, or the solver failed for a row.
     """
     if config.feedforward is not None:
         return feedforward_fit.execute(config, beside)
@@ -34,7 +33,8 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
         result.save(folder.results(), config.robot, folder.tables)
-        document = print_report(calibration_report.calibration_document(result, config.robot))
+        report = calibration_report.calibration_document(result, config.robot, feedforward_fit.voltage_fit(runs))
+        document = print_report(report, brief=not beside.verbose)
         settled = result.converged and all(b.converged for h in result.held_out.values() for b in h.blocks.values())
         manifest = {"seed": result.seed, "statuses": result.counts}
         return finish_run_folder(

@@ -72,7 +72,7 @@ def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
 
 def _write_folder(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
     folder.write_text("requirements.toml", found.asked.text)
-    # Outcomes as a table, one row for each requirement
+    # outcomes as a table, one row for each requirement
     nan = float("nan")
     folder.write_table(
         "requirements.csv",

@@ -1,4 +1,4 @@
-"""The command `climb`: a robot over an obstacle, or the largest obstacle that it can climb."""
+"""The command `climb`: a robot climbs an obstacle, or the largest obstacle that it can climb is found."""
 
 from __future__ import annotations
 
@@ -34,16 +34,15 @@ from sweeps.report import climb_report
 from sweeps.report.climb_report import Along, ClimbResult
 from sweeps.store import finish_run_folder, open_folder, print_report
 
-#: Runs of a round of a search.
+#: Number of runs in a round of a search.
 ROUND = 12
-#: Widths over which slopes are taken, in the units of axes; of others this share of their value.
+#: Widths over which slopes are fitted, in the units of the axes. Other variables: share of their value.
 WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0, SIZE: 1.0}, 0.02
 
 
 def execute(config: configuration.Climb, beside: configuration.FolderPart) -> int:
-    """Simulates a climb and writes a run folder. Returns the exit code.
-
-    0 done, whatever the verdict. 3 numbers went wrong.
+    """Simulates a climb and writes a run folder. Returns the exit code: 0 for any verdict, 3 if numbers are not
+    finite.
     """
     file = load_robot(config)
     robot = file.robot
@@ -145,7 +144,7 @@ def _derivative_variables(
     """Variables with respect to which derivatives are computed. None: no derivatives.
 
     Raises:
-        BadConfiguration: an unknown name, or one without effect on this climb.
+        BadConfiguration: a name is unknown or has no effect on this climb.
     """
     names = config.derivatives
     if not names:
@@ -202,8 +201,8 @@ def _search_largest(
 ) -> tuple[Terrain, ClimbRuns, int, tuple[tuple[float, str], ...], float | None]:
     """Largest size of an obstacle that is climbed [mm], by rounds of sizes in parallel.
 
-    Each round divides the interval between the largest size below which all were climbed, and the next one. The run
-    of the largest climbed size, or of the smallest tried, is reported.
+    Each round divides the interval above the largest size up to which all were climbed. The run of the largest
+    climbed size, or of the smallest size tried, is reported.
     """
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
@@ -225,7 +224,7 @@ def _search_largest(
 
 
 def _obstacle_terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
-    """Obstacle (in a search, of this `size` [m]) and its description."""
+    """Obstacle (in a search, with this `size` [m]) and its description."""
     nose = config.nose_mm / 1000
     if config.terrain is not None:
         return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"
@@ -249,10 +248,10 @@ def _obstacle_terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrai
 
 
 def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> LeverSequence:
-    """Returns the motion of the levers.
+    """Motion of the levers.
 
     Raises:
-        BadConfiguration: a configuration without levers, an angle beyond their range, a lever that begins below the
+        BadConfiguration: the configuration has no levers, an angle is beyond their range, or a lever begins below the
             ground.
     """
     lever_options = config.sequence, config.levers_front_deg, config.levers_rear_deg

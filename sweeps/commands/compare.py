@@ -26,7 +26,7 @@ from sweeps.report import comparison_report
 from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
 from sweeps.store import RunFolder, open_folder, print_report
 
-#: Fidelity that follows time histories, and over what their errors are shown besides.
+#: Fidelity for time histories, and further axes over which their errors are shown.
 HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
@@ -123,7 +123,7 @@ def _write_result(
     found: Comparison,
     notes: Names,
 ) -> int:
-    """Print a comparison and write its folder, with these notes in `result.json`. Returns the exit code."""
+    """Prints a comparison and writes its folder, with these notes in `result.json`. Returns the exit code."""
     document = print_report(comparison_report.comparison_document(found), file)
     answer = comparison_report.comparison_answer(found)
     further = {"statement": answer, "errors": found.summary, "notes": [*file.remarks, *notes]}
@@ -135,7 +135,7 @@ def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile |
     """The robot of `--against`, or None.
 
     Raises:
-        BadConfiguration: for the same reasons as `load_robot`, or its channels are not those of the first robot.
+        BadConfiguration: for the same reasons as `load_robot`, or its channels differ from those of the first robot.
     """
     if config.against is None:
         return None
@@ -146,7 +146,7 @@ def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile |
 
 
 def _second_name(config: configuration.Compare, file: RobotFile, second: RobotFile | None) -> str:
-    """Name of the second robot, with its folder if both files have the same name. "" if there is none."""
+    """Name of the second robot, with its folder if both files have the same name. "" without one."""
     if second is None:
         return ""
     name = capabilities.displayed_name(second)

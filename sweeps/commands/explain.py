@@ -1,4 +1,4 @@
-"""The command `explain`: meaning of a name, from the code that defines it."""
+"""The command `explain`: meaning of a name, taken from the code that defines it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Names, effect_file
+from calibration.data import Names, effect_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.words import experiment_words
 from mmrjax import derived, effects
@@ -29,18 +29,25 @@ from sweeps.report.climb_report import VERDICTS
 Library = dict[str, type[Effect]]
 #: A line of an explanation: heading and text.
 Line = tuple[str, str]
-#: Lines on a name, none if it has another meaning.
+#: Function that returns lines on a name, none if it has no such meaning.
 Explain = Callable[[str, Library], Iterator[Line]]
 WIDTH, INDENT = 80, 16
-#: Of a run, solved for, and of a mission.
+#: Outputs of runs, and of missions.
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
+
+#: Keys of robot files that no fit frees, with their meanings.
+KEYS: dict[str, str] = {
+    **{name: str(about[-1]).strip("()") for name, about in (robot_file.COUNTS | robot_file.RATINGS).items()},
+    **robot_file.SWITCHES,
+    **{name: meaning for name, (_, meaning) in robot_file.CHOICES.items()},
+}
 
 
 def explain_name(name: str | None, files: Names = ()) -> int:
-    """Explain an effect, status, flag, output, channel or parameter by its name. Without a name, list all.
+    """Explains an effect, status, flag, output, channel or parameter by its name. Without a name, lists all.
 
     Raises:
-        BadConfiguration: unknown name. The message lists the nearest.
+        BadConfiguration: the name is unknown. The message lists the nearest ones.
     """
     library = {**effect_file.effect_library(files), **effects.BESIDE}
     names = explainable_names(library)
@@ -67,7 +74,7 @@ def explain_name(name: str | None, files: Names = ()) -> int:
 
 
 def _wrapped(heading: str, text: str) -> str:
-    head = f"  {heading} ".ljust(INDENT)  # a parameter's name may be longer
+    head = f"  {heading} ".ljust(INDENT)  # the full name of a parameter may be longer
     return textwrap.fill(
         text, WIDTH, initial_indent=head, subsequent_indent=" " * INDENT, break_long_words=False,
         break_on_hyphens=False,
@@ -86,6 +93,7 @@ def explainable_names(library: Library) -> dict[str, list[str]]:
         "channels": [c.name for c in channels.EVERY],
         "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
+        "keys that no fit frees": list(KEYS),
         "parameters": [p.name for p in params.walk_parameters(paper_robots.nominal())],
     }
 
@@ -167,7 +175,7 @@ def _status_lines(name: str, library: Library) -> Iterator[Line]:
 
 
 def _explain_by_table(meanings: Mapping[str, str], where: str = "") -> Explain:
-    """Function that explains names by a table of meanings. `where`: files in which they occur."""
+    """Function that explains the names in a table of meanings. `where`: files in which they occur."""
 
     def about(name: str, library: Library) -> Iterator[Line]:
         if name in meanings:
@@ -196,7 +204,7 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
             yield "" if k else "on a bench", test
 
 
-def _condition_lines(name: str, library: Library) -> Iterator[Line]:
+def _operating_condition_lines(name: str, library: Library) -> Iterator[Line]:
     if label := next((label for label in quantities.LABELS if label.name == name), None):
         yield "is", label.label
         yield "column", label.column
@@ -268,7 +276,7 @@ def _bounds_text(spec: Spec) -> str:
     return f"{low:g} to {high:g} {spec.unit}"
 
 
-#: What explains a name, by kind.
+#: Function that explains a name, by kind.
 EXPLAINED: dict[str, Explain] = {
     "effect": _effect_lines,
     "status": _status_lines,
@@ -282,7 +290,8 @@ EXPLAINED: dict[str, Explain] = {
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,
-    "condition": _condition_lines,
+    "key of a robot file": _explain_by_table(KEYS),
+    "condition": _operating_condition_lines,
     "word of the reports": _explain_by_table(
         {k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}
     ),

@@ -14,7 +14,7 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Export, beside: configuration.FolderPart) -> int:
-    """Export a drive and write a run folder with its files. Returns the exit code, 0."""
+    """Exports a drive and writes a run folder with its files. Returns the exit code, 0."""
     file = load_robot(config)
     with open_folder("export", config, file.robot, beside) as folder:
         exported = export_format(

@@ -1,7 +1,8 @@
-"""`calibrate --feedforward`: feedforward constants kS, kV, kA of a log, as in WPILib."""
+"""`calibrate --feedforward`: feedforward constants kS, kV and kA from a log, as in WPILib."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 from importlib import resources
@@ -11,22 +12,22 @@ import numpy as np
 from calibration.data import contents, robot_file
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.inference.feedforward import UNITS, DriveLog, Tolerances, fit_feedforward
+from calibration.inference.feedforward import UNITS, DriveLog, Feedforward, Tolerances, fit_feedforward
 from mmrjax.model.channels import EVERY
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import feedforward_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
-#: Names of signals with the battery's voltage.
+#: Names of signals with the battery voltage.
 BATTERY = re.compile(r"batt\w*volt", re.IGNORECASE)
-#: Columns of a velocity and its position, the first pair that has readings is fitted.
+#: Columns of a velocity and its position. The first pair with readings is fitted.
 PAIRS = (("output_speed_rpm", "output_angle_deg"), ("speed_mm_s", "position_mm"))
 ROTOR = "motor_speed_rpm", ""
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
-    """Fit the constants, print them and write a run folder. Returns the exit code, 0."""
+    """Fits the constants, prints them and writes a run folder. Returns the exit code, 0."""
     if has_robot := config.robot != "nominal":
         robot = load_robot(config).robot
     else:
@@ -50,15 +51,23 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
         return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=shown, runs=runs)
 
 
+def voltage_fit(runs: Runs) -> Feedforward | None:
+    """Constants of a log of voltage and speed. None for other data, or with too little motion."""
+    if runs.sampled and runs.layout.imposed == "voltage":
+        with contextlib.suppress(BadData):
+            return fit_feedforward(drive_log(runs))
+    return None
+
+
 def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:
     """Readings of a log, with positions in a given unit. None: the unit of the first pair of channels.
 
     Args:
-        as_logged: True for a log of SysId, which is in units of its own. `unit` is their name.
+        as_logged: True for a log of SysId, which has its own units. `unit` is their name.
 
     Raises:
-        BadData: no time, or neither velocity nor position.
-        BadConfiguration: a unit of length for an angle, or the reverse.
+        BadData: the log has no time, or neither velocity nor position.
+        BadConfiguration: an angle has a unit of length, or a length that of an angle.
     """
 
     factors = {channel.column: channel.factor for channel in EVERY}

@@ -1,4 +1,4 @@
-"""The command `inspect`: what a file of data contains, and which columns its signals may be."""
+"""The command `inspect`: contents of a data file, and columns that its signals may be."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from sweeps.report.terminal_renderer import print_document
 
 
 def inspect_file(file: str, as_json: bool) -> int:
-    """Print the signals of a file and the lines of `[columns]` for them. Returns 0.
+    """Prints the signals of a file and lines of `[columns]` for them. Returns 0.
 
     Raises:
-        BadData: a file that cannot be read.
+        BadData: the file cannot be read.
     """
     source = contents.inspect_source(file)
     if as_json:

@@ -15,7 +15,7 @@ from sweeps.store import PACKAGES
 
 
 def check_installation() -> int:
-    """Print one line for each check. Returns 0 if all pass, else 1."""
+    """Prints one line for each check. Returns 0 if all pass, otherwise 1."""
     import jax
 
     checks: dict[str, Callable[[], str]] = {
@@ -39,7 +39,7 @@ def check_installation() -> int:
 
 
 def _check_run() -> str:
-    """Check against a known answer: on level ground, a drive without losses turns at U / C_E and draws no current."""
+    """Checks a known answer: on level ground, a drive without losses turns at U / C_E and draws no current."""
     import jax.numpy as jnp
 
     from mmrjax.fidelities.steady import steady_batch

@@ -16,7 +16,7 @@ import numpy as np
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
 from calibration.data.runs import Runs
-from calibration.described import report_in_words
+from calibration.described import describe, report_in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import REFIT_FILE, OutOfTime
@@ -25,6 +25,7 @@ from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
 from calibration.inference.details import EquationErrors
+from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.simulation_errors import root_mean_square
 from calibration.words import loop_words
 from calibration.words.step_words import expected_time
@@ -39,16 +40,15 @@ from sweeps.report.fit_tables import Change
 from sweeps.store import SOLVER_FAILED, RunFolder, finish_run_folder, open_folder, print_report
 
 T = TypeVar("T")
-#: Schema of the file of what regression says before anything is confirmed.
+#: Schema of the file with the ranking by regression, before any confirmation.
 SCREENING = "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
-    """Run the closed loop on a table and write a run folder. Returns the exit code.
-
-    0 done, whatever the verdict. 3 done, but the fit that is proposed did not converge, or its time was out before
-    there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
-    With a model of several joints, each has a loop and a folder of its own.
+    """Runs the closed loop on a table and writes a run folder. Returns the exit code: 0 for any verdict, 3 if the
+    proposed fit did not converge, or if the time budget ended before a verdict. Finished stages are stored, so that
+    the same command continues after such an end or an interrupt. For a model of several joints, each joint has its
+    own loop and folder.
     """
     if config.model is not None:
         from sweeps.commands import loop_joints
@@ -114,6 +114,8 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
                 _report_out_of_time(within, begun=bool(stages))
+                for note in lost_motion_notes(runs, robot):  # then no effect is ranked
+                    print_message(describe(note))
             _report_stored_stages(stages, folder, config.robot)
             raise
         if config.resolve:
@@ -132,7 +134,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
 def _add_track_model_test(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
-    """Result with the test of the track model added: does a different running gear explain the misfit?"""
+    """Adds the test with the track model: does a different running gear explain the misfit?"""
     resolved = fit_track_model(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
         members=members, seed=config.seed, tell=report_in_words(progress),
@@ -142,17 +144,17 @@ def _add_track_model_test(
 
 def _report_out_of_time(within: float, begun: bool) -> None:
     """Reports that the time budget [s] ended before a verdict. `begun`: True if at least one stage has finished."""
-    more = max(5, math.ceil(within / 30))  # twice as much
+    more = max(5, math.ceil(within / 30))  # with twice the time
     first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
 
 
 @contextlib.contextmanager
 def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
-    """Context manager that raises `OutOfTime` in its block after this many seconds, as long as `wanted` is true.
+    """Context manager that raises `OutOfTime` in its block after this many seconds while `wanted` is true.
 
-    On platforms that allow it, it also interrupts a running step. It repeats every second, because a called function
-    may suppress the exception.
+    On some platforms it also interrupts a running step, and repeats this every second, because a called function may
+    suppress the exception.
     """
     if not hasattr(signal, "SIGALRM"):
         yield
@@ -172,7 +174,7 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
 
 
 def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
-    """Print the ranking by regression, the first answer, and write it to the run folder."""
+    """Prints the ranking by regression, the first answer, and writes it to the run folder."""
     first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
@@ -183,7 +185,7 @@ def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str]
 
 
 def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
-    """Reports which stages are stored. Without a verdict, writes the robot of the base fit if it is known."""
+    """Reports which stages are stored. Without a verdict, writes the robot of the base fit if available."""
     if not stages:
         return
     stored_stages = [name for name in stages if folder.keeps(name)]
@@ -216,7 +218,7 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
 
 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
-    """Change of settled runs by each effect. Empty for histories, and for effects that the written robot lacks."""
+    """Change of settled runs by each effect of the written robot. Empty for histories."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationErrors) or not added:
         return {}

@@ -1,4 +1,4 @@
-"""One loop for each joint of a MuJoCo model, with the torque of the moving model as the load of each joint."""
+"""One loop for each joint of a MuJoCo model. The load of each joint is the torque of the moving model."""
 
 from __future__ import annotations
 
@@ -37,29 +37,29 @@ from sweeps.report import catalogue
 from sweeps.report.document import Document
 
 ANGLE = channels.find_channel("output_angle")
-#: Stands for the name of a joint in the name of its robot's file.
+#: Placeholder for a joint's name in the name of its robot file.
 JOINT = "{joint}"
 #: Column of the current's sd.
 SD = "motor_current_sd_A"
-#: Smallest speed whose direction is certain, in errors of the speed, and smallest change that is a jump, in sds.
+#: Smallest speed whose direction is certain, in sds of the speed. Smallest change that counts as a jump, in sds.
 CERTAIN, JUMP = 2.0, 6.0
-#: Columns of the error of the torque [A] and of the smallest certain speed [rpm], while a joint's table is made.
+#: Temporary columns of a joint's table: error of the torque [A] and smallest certain speed [rpm].
 DOUBTS = ("error of torque", "least speed")
-#: Fewest readings of a run whose motion is smoothed.
+#: Fewest readings in a run for smoothing its motion.
 FEWEST = 12
 #: Median of the magnitude of sixth differences of white noise [sd].
 QUANTILE = 0.6745 * math.sqrt(math.comb(12, 6))
 
 
 class Chain:
-    """A model whose joints are all hinges, without friction, damping, rotors and contacts."""
+    """Model whose joints are all hinges, with friction, damping, rotors and contacts removed."""
 
     def __init__(self, source: Path) -> None:
-        """The model of a file.
+        """Reads the model from a file.
 
         Raises:
-            BadConfiguration: a model that MuJoCo refuses, with a joint that is no hinge or has several actuators, or
-                with loops that equality constraints close.
+            BadConfiguration: MuJoCo rejects the model, a joint is no hinge or has several actuators, or equality
+                constraints close a loop.
         """
         self.library, self.model = library, model = mujoco.mujoco_module(), read_mujoco_model(source)
         names = [library.mj_id2name(model, library.mjtObj.mjOBJ_JOINT, k) or "" for k in range(model.njnt)]
@@ -85,10 +85,10 @@ class Chain:
         model.opt.disableflags |= int(library.mjtDisableBit.mjDSBL_CONSTRAINT)
 
     def torques(self, motion: np.ndarray) -> np.ndarray:
-        """Torque that each joint needs [N·m], shape (rows, joints), for angles [rad], speeds and accelerations.
+        """Torque for the motion of each joint [N·m], shape (rows, joints).
 
         Args:
-            motion: shape (3, rows, joints).
+            motion: angles [rad], speeds and accelerations, shape (3, rows, joints).
         """
         data, needed = self.library.MjData(self.model), np.empty_like(motion[0])
         for row in range(len(needed)):
@@ -101,7 +101,7 @@ class Chain:
 def noise_of_angle(readings: np.ndarray) -> float:
     """Standard deviation of the noise of an angle, by its sixth differences.
 
-    Second differences, as in `estimate_noise`, contain 0.1 mrad of the curvature of a log of 200 Hz.
+    Second differences, as in `estimate_noise`, would contain 0.1 mrad from the curvature of a 200 Hz log.
     """
     return float(np.nanmedian(np.abs(np.diff(readings, 6)))) / QUANTILE
 
@@ -110,15 +110,15 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     """Motion at `times` on a smoothing spline, shape (4, times), and the number of the spline's knots.
 
     The motion is the angle [rad], the speed, the acceleration, and the slope of the line to the next speed. The
-    spline has the fewest knots with which readings are off by their noise. This noise is at least that of the
-    display's step if most readings repeat others. At a jump of the torque, knots crowd, so that the acceleration
-    jumps within a few samples.
+    spline has the fewest knots with which its residuals equal the noise. If most readings repeat others, this noise
+    is at least that of the display's step. Knots are dense at jumps of the torque, so that the acceleration jumps
+    within a few samples.
     """
     noise, steps = noise_of_angle(angle), np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
         noise = max(noise, steps.min() / math.sqrt(12))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that more knots would be needed, for readings without noise
+        warnings.simplefilter("ignore")  # more knots would be needed, for readings without noise
         curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
     speed = curve.derivative(1)(times)
     lines = np.diff(speed) / np.diff(times)
@@ -126,7 +126,7 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
 
 
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
-    """Columns of a log that are a joint's, without its name, and those of no joint."""
+    """Columns of a log for one joint, with the joint's name removed, and columns of no joint."""
     others = tuple(f"{name}." for name in joints if name != joint)
     joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(others)]
     return dataclasses.replace(
@@ -144,8 +144,8 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
     Both have the shape (4, rows, joints). The largest number of knots of a joint at degree 5 follows.
 
     Raises:
-        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. As
-            `check_units`.
+        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. Also as
+            in `check_units`.
     """
     motion, cubic = np.empty((2, 4, len(log), len(chain.names)))
     knots = np.zeros(len(chain.names), int)
@@ -182,19 +182,19 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
 def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) -> dict[str, Runs]:
     """Runs of each joint, with the torque of the rest of the model as the torque of its load.
 
-    It is what the model needs less the inertia and the weight that the joint's file states. The simulation moves
-    inertias by the slopes of the lines between speeds, half a row early, so the torque contains the difference. The
-    motor speed is that of the smoothed motion. Both err most where the torque jumps, within two knots by about their
-    difference from those of cubic splines. Within a knot of a jump of the current, the torque errs by up to that
-    jump. This error of the torque is part of the current's sd, unless the log states it. If it exceeds the current's
-    noise, one row for each knot is used. Readings are left out where the direction of the speed is uncertain, because
-    the friction of a wrong direction would count as an error.
+    It is the torque of the model minus the torque of inertia and weight in the joint's file. The simulation computes
+    accelerations from linear speeds between rows, half a row early, so the torque contains the difference. The motor
+    speed is that of the smoothed motion. Errors of both are largest where the torque jumps: within two knots of a
+    jump they are about the difference from a cubic spline. Within one knot of a jump of the current, the error of the
+    torque is up to that jump. This error is included in the current's sd, unless the log states the sd. If it exceeds
+    the current's noise, one row per knot is used. Readings are omitted if the direction of the speed is uncertain,
+    because friction in the wrong direction would count as an error.
 
     Args:
         robots: robot of each joint, by the joint's name.
 
     Raises:
-        BadData: as `smoothed_log` and `records.runs_of_arrays`.
+        BadData: as in `smoothed_log` and `runs.runs_of_arrays`.
     """
     motion, cubic, knots = smoothed_log(log, chain)
     torques, cubic_torques = chain.torques(motion[:3]), chain.torques(cubic[:3])
@@ -238,10 +238,11 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
 
 
 def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuration.Loop, Robot]:
-    """Configuration of the loop of a joint, and its robot.
+    """Configuration of a joint's loop, and the robot.
 
     Raises:
-        BadConfiguration: no such file, or no rig of one shaft whose motor speed is imposed and current read.
+        BadConfiguration: the file does not exist, or it is no rig of one shaft with imposed motor speed and measured
+            current.
     """
     robot_name = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
     one = config.model_copy(update={"robot": robot_name.replace(JOINT, joint), "joints": (joint,)})
@@ -251,7 +252,7 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
         raise BadConfiguration(
             f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" '
             'and channels = ["motor_current"]: the model\'s torque is valid only for the measured motion; '
-            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench begins one"
+            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench writes a template"
         )
     return one, robot
 
@@ -261,18 +262,17 @@ def run_joints(
     beside: configuration.LoopBeside,
     loop: Callable[[configuration.Loop, configuration.LoopBeside, Robot, Runs], int],
 ) -> int:
-    """Run the loop of each joint in a folder of its own, and write one page. Finished joints are kept.
+    """Runs the loop of each joint in its own folder, and writes one page. Finished joints are kept.
 
     Args:
-        loop: the loop of one joint.
+        loop: function that runs the loop of one joint.
 
     Returns:
-        The exit code: the largest of the joints'.
+        Largest exit code of the joints.
 
     Raises:
-        BadConfiguration: a joint that the model does not have or that nothing drives, or as `Chain` and
-            `robot_of_joint`.
-        BadData: no such file, or as `runs_of_joints`.
+        BadConfiguration: the model lacks a joint, or nothing drives it. Also as in `Chain` and `robot_of_joint`.
+        BadData: the file does not exist, or as in `runs_of_joints`.
     """
     assert config.model is not None
     chain, data = Chain(config.model), Path(beside.data)

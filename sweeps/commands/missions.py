@@ -1,4 +1,4 @@
-"""The command `simulate` with a profile: every run follows one mission. Results, segments and courses are tables."""
+"""The command `simulate` with a profile: all runs follow one mission. Results, segments and histories are tables."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from sweeps.report import mission_report
 from sweeps.report.mission_report import Missions
 from sweeps.store import open_folder, print_report
 
-#: Rows of history.csv: of a run at most, at least, and of all runs together.
+#: Rows of history.csv: most and fewest of one run, and most of all runs together.
 MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
-_LASTING = MARKS.index("battery_empty")  # events from here on are kept in history.csv: stops and starts are too many
+_LASTING = MARKS.index("battery_empty")  # only later marks are kept: stops and starts are too many
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs from a file, or one run from options, over a profile. Returns the exit code.
+    """Simulates runs from a file, or one run from options, over a profile. Returns the exit code.
 
     Raises:
-        BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
-            its cut-off at the start.
-        BadData: a wrong profile or table of runs.
+        BadConfiguration: options and profile state the same condition, or the battery is empty or below its cut-off
+            at the start.
+        BadData: the profile or the table of runs is wrong.
     """
     assert config.profile is not None
     file = load_robot(config)
@@ -80,10 +80,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     source.check_supply(config.battery)
     for column in source.stated:
         if column in beside.stated:
-            raise BadConfiguration(
-                f"{OPTIONS[column]}: got it in addition to {source.source}, which contains {column}; keep one of "
-                "the two"
-            )
+            raise BadConfiguration(f"{OPTIONS[column]}: {source.source} contains {column} too; keep one of the two")
     _check_battery_charge(robot, config)
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
@@ -114,8 +111,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 
 
 def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:
-    """Reject a robot that cannot turn if the profile drives its sides differently, and voltages above the supply
-    voltage."""
+    """Rejects a robot that cannot turn if the profile drives its sides differently, and voltages above the supply
+    voltage.
+    """
     if not source.turns:
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
@@ -152,7 +150,7 @@ def _check_battery_charge(robot: Robot, config: configuration.Simulate) -> None:
 
 
 def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
-    """Rejects missions that would start with cells below their cut-off voltage."""
+    """Rejects missions that start with cells below their cut-off voltage."""
     if not config.battery:
         return
     conditions = run.conditions_of_runs(robot, runs, config)
@@ -214,7 +212,7 @@ def _concatenate_tables(tables: list[Columns]) -> Columns:
 def _condition_columns(
     robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
 ) -> Columns:
-    """Conditions of the runs, empty where the profile states them or the battery sets them."""
+    """Conditions of the runs, empty if the profile states them or the battery determines them."""
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
     unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
@@ -270,7 +268,7 @@ def _segment_rows(
 
 
 def _segment_of_steps(found: Mission, k: int) -> np.ndarray:
-    """Segment of each stored step of a run. Steps after the last one get an index beyond the last segment."""
+    """Segment of each stored step of a run. Steps after the end have an index beyond the last segment."""
     assert found.course is not None  # it was asked for
     segment = np.asarray(found.course.segment[k])
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
@@ -292,7 +290,7 @@ def select_course_rows(
     firsts = np.flatnonzero(np.diff(segment, prepend=segment[0] - 1))
     ends = np.append(firsts[1:], len(segment))
     peaks = np.array([a + np.argmax(np.abs(current[a:b])) for a, b in zip(firsts, ends, strict=True)])
-    if len(peaks) > most // 2:  # of so many segments the highest
+    if len(peaks) > most // 2:  # if there are too many segments, those with the highest peaks
         peaks = peaks[np.argsort(-np.abs(current[peaks]), kind="stable")[: most // 2]]
     if marked is not None:
         peaks = np.union1d(peaks, np.flatnonzero(marked)[-(most // 4) :])
@@ -308,7 +306,7 @@ def _course_rows(
     filled = course.segment >= 0
     signals = course.signals
     marked = course.event[filled] >= _LASTING
-    largest = np.abs(signals.current).reshape(len(filled), -1).max(1)  # of either side
+    largest = np.abs(signals.current).reshape(len(filled), -1).max(1)  # both sides
     picked = np.flatnonzero(filled)[select_course_rows(course.segment[filled], largest[filled], most, marked)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, of_sides = course.signals, {}
@@ -321,7 +319,7 @@ def _course_rows(
         winding, housing = winding.max(1), housing.max(1)
     else:
         reading = balances.sensor(robot, signals)
-    # What the profile demands acts this much later than its rows say, and all that is written beside it with it.
+    # Demands act this much later than in the profile, as do the values written next to them.
     late = float(robot.rig.delay)
     segment = course.segment % source.segment_count
     length = np.asarray(found.segments.time[k]).ravel()

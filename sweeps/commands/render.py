@@ -24,8 +24,8 @@ from sweeps.store import DONE, SOLVER_FAILED
 
 
 def execute(config: configuration.Render, picture: configuration.Picture) -> int:
-    """Draw one run from standstill, or the climb in a folder, as a picture or film. Returns the exit code: 0 if
-    the run settles or is still accelerating, else 3.
+    """Draws a run from standstill, or the climb in a folder, as a picture or film. Returns the exit code: 0 if the
+    run settles or is still accelerating, otherwise 3.
     """
     file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
     if picture.climb is not None:
@@ -83,7 +83,7 @@ def _check_output_file(picture: configuration.Picture) -> None:
 
 
 def _write_completely(file: Path, draw: Callable[[Path], Any]) -> None:
-    """Write a picture or film completely or not at all."""
+    """Writes a picture or film completely or not at all."""
     with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:
             draw(aside)

@@ -1,4 +1,4 @@
-"""The command `reproduce`: the paper's figures and tables, remade for a robot."""
+"""The command `reproduce`: the paper's figures and tables for a robot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -> int:
-    """Write the paper's figures and tables for a robot into a run folder. Returns the exit code."""
+    """Writes the paper's figures and tables for a robot to a run folder. Returns the exit code."""
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "reproduce")

@@ -40,15 +40,14 @@ from sweeps.report import resonance_report
 from sweeps.report.resonance_report import SLOW, ResonanceResult
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
-CHUNK = 96  # runs in one call
-FEWEST = 5  # voltages over which a peak can be told
-SHORTEST = 0.5  # [s], of a run
+CHUNK = 96  # runs per call
+FEWEST = 5  # fewest voltages for finding a peak
+SHORTEST = 0.5  # duration of a run [s]
 
 
 def execute(config: configuration.Resonance, beside: configuration.FolderPart) -> int:
-    """Map the ripple of a robot and write a run folder. Returns the exit code.
-
-    0 done. 3 done, but some runs did not settle, or slid, tipped or failed.
+    """Maps the ripple of a robot and writes a run folder. Returns the exit code: 0 if done, 3 if some runs did not
+    settle, or slid, tipped or failed.
     """
     file = load_robot(config)
     robot = file.robot
@@ -111,7 +110,7 @@ def _speed_grid(
 
 
 def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
-    """Points of the grid and the missing points of Table 8, and the rows that belong to Table 8."""
+    """Points of the grid and further points of Table 8, and True for the points of Table 8."""
     parts = [
         grid_conditions(_speed_grid(config, v, p), robot)
         for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))

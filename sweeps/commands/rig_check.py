@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, has_template_number, is_example
-from calibration.described import describe, sentences
+from calibration.described import as_paragraph, describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
 from calibration.inference.foresight import InformationForecast, ParameterInformation
@@ -39,6 +40,9 @@ from sweeps.pages import words
 from sweeps.report.document import Block, Document, Note, Table, columns, remarks
 from sweeps.report.terminal_renderer import print_document
 
+#: Names of a list in a sentence, and remarks on a terminal.
+NAMED, FEW = 8, 3
+
 
 @dataclasses.dataclass(frozen=True)
 class RigCheck:
@@ -47,11 +51,11 @@ class RigCheck:
     Attributes:
         file: file that was read.
         robot: robot of the file.
-        examples: lines of the file that still have a number of the template, marked as an example.
-        unmarked: other lines with the name and number of a template's example. 0 and 1 may be anyone's.
+        examples: lines of the file that are marked as an example and still have the template's number.
+        unmarked: other lines with the name and number of a template's example, except 0 and 1.
         origins: origins of its numbers.
         facts: values that follow from its numbers.
-        runs: runs of the table, None without one.
+        runs: runs of the table, None without a table.
         foresight: parameters that the table can determine.
         doubts: sentences on doubts about a log: wrong signs, time or current in another unit.
     """
@@ -72,7 +76,10 @@ class RigCheck:
         count = int(robot.sides)
         motors = "One motor drives" if count == 1 else f"{count} motors with the same command drive"
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
-        loads = "; ".join(f"{name}: {_load_words(load)}" for name, load in robot.configurations.items())
+        names: dict[str, list[str]] = {}
+        for name, load in robot.configurations.items():
+            names.setdefault(_load_words(load), []).append(name)
+        loads = "; ".join(f"{_few(one)}: {load}" for load, one in names.items())
         imposed = "the voltage (times the duty in histories)"
         words = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}
         words |= {goal: f"the goal of a controller ({goal.removeprefix('goal_')})" for goal in GOALS}
@@ -83,7 +90,7 @@ class RigCheck:
             "free": "start from a fitted state",
         }
         delay = float(rig.delay)
-        late = f", {delay:g} s late" if delay else ""
+        late = f", with a delay of {delay:g} s" if delay else ""
         lines = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
         coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
@@ -120,7 +127,7 @@ class RigCheck:
             if o.why.startswith("the file") and o.sd is None and o.value
         ]
         if loose and not self.robot.rig.inherits:
-            notes.append(f"no ± is given, so the default ± is used: {', '.join(loose)}")
+            notes.append(f"no ± is given, so the default ± is used: {_few(loose)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
             notes.append(
@@ -139,7 +146,7 @@ class RigCheck:
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
             instrument = rig.instrument(channel.name)
-            usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
+            usual = f"{channel.sd_column} of the table, otherwise {100 * channel.sd_share:g} % of the reading"
             rows.append(
                 {
                     "channel": channel.name,
@@ -177,7 +184,7 @@ class RigCheck:
         return rows
 
     def _does_not_apply(self, column: str) -> bool:
-        """True if a column missing from the table does not apply to this rig: ground, or another kind of drive."""
+        """True if a column that the table lacks does not apply to this rig: ground, or another kind of drive."""
         idle = Layout.of(self.robot).idle
         return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
@@ -194,10 +201,9 @@ class RigCheck:
         ]
         others = [name for name in self.runs.unknown if name not in names_by_column]
         without = (
-            f"{', '.join(others)}: without a role, so residuals are tested for differences between their values. "
-            "If one has a role, name it under "
+            f"{', '.join(others)}: not used by the model. Residuals are tested for differences between their values. "
+            "To use one, name it under [columns] in the rig's file"
         )
-        without += "[columns] in the rig's file"
         return [*notes, *([without] if others else [])]
 
     def statement(self) -> str:
@@ -258,7 +264,7 @@ def _noise_source_words(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     words_by_source = {
         "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
-        "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
+        "assumed": f"assumed, {100 * channel.sd_share:g} %, since there is no column {channel.sd_column}",
     }  # fmt: skip
     return words_by_source.get(word, word)
 
@@ -267,6 +273,11 @@ def _default_origin(robot: Robot, origin: NumberOrigin) -> str:
     """Line on a number without ±, with the default prior width that a fit uses."""
     sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first names of a list, and the number of others."""
+    return ", ".join(names[:NAMED]) + f" and {len(names) - NAMED} others" * (len(names) > NAMED)
 
 
 def _load_words(load: Any) -> str:
@@ -292,12 +303,14 @@ def _use_of_column(column: str, robot: Robot) -> str:
     return "condition"
 
 
-def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None) -> int:
-    """Report how a rig's file was interpreted, and which parameters a table can determine. Returns 0.
+def check_rig_file(
+    file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None, verbose: bool = False
+) -> int:
+    """Reports how a rig file was interpreted, and which parameters a table can determine. Returns 0.
 
     Raises:
-        BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.
-        BadData: a table that cannot be used with this rig.
+        BadConfiguration: the file cannot be read, or lacks entries. The message lists all of them.
+        BadData: the table cannot be used with this rig.
     """
     if file.is_dir():
         raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
@@ -307,7 +320,7 @@ def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, 
     if as_json:
         print_json(check.to_json())
     else:
-        print_document(check_document(check))
+        print_document(check_document(check), brief=not verbose)
     return 0
 
 
@@ -356,7 +369,25 @@ def check_document(found: RigCheck) -> Document:
             *remarks(found.remarks()),
             *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
         ),
+        brief=_brief(found),
     )
+
+
+def _brief(found: RigCheck) -> Names:
+    """Lines printed below the answer: the rig, columns of the table, and what to check."""
+    table: Names = ()
+    if found.runs is not None:
+        used = [
+            c["theirs"] or c["column"]
+            for c in found.columns()
+            if c["use"] not in ("condition", "not in the table") or (c["use"] == "condition" and c["values"] > 1)
+        ]
+        unused = f" Not in use: {', '.join(found.runs.unknown)}." * bool(found.runs.unknown)
+        table = (f"{count_noun(len(found.runs), 'row')}. Columns in use: {', '.join(used)}.{unused}",)
+    notes = found.remarks()
+    check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
+    more = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
+    return " ".join(found.understood()), *table, f"{check} --verbose prints all tables{more}."
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:
@@ -379,7 +410,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     settled = {
         *words.SETTLED,
         *(["stalled"] if has_clamped_rows else []),
-    }  # a shaft that is held stands still, as it should
+    }  # a held shaft is meant to stand still
     others = [
         f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]

@@ -1,4 +1,4 @@
-"""Numbers of a driven joint of a MuJoCo model, the reverse of `export --to mujoco`."""
+"""Numbers of a driven joint of a MuJoCo model, the inverse of `export --to mujoco`."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_an
 from sweeps.commands.rig_template import StatedNumber
 from sweeps.export import mujoco
 
-#: Largest model that is read [bytes].
+#: Largest model file that is read [bytes].
 LARGEST = 2**26
-#: Elements that name files of the same format, and attributes that name folders.
+#: Elements that include files of the same format, and attributes that name folders.
 NESTED, FOLDERS = ("include",), ("meshdir", "texturedir", "assetdir")
-#: Attributes that are no numbers.
+#: Attributes that are not numbers.
 NAMES = ("name", "class", "childclass", "file")
-#: Elements that copy their content, and attributes with sizes of elements.
+#: Elements that replicate their content, and attributes with sizes of elements.
 COPIES = ("replicate", "composite", "flexcomp")
 SIZES = {
     **dict.fromkeys(COPIES, ("count",)), "numeric": ("size",), "hfield": ("nrow", "ncol"),
     "texture": ("width", "height"), "mesh": ("params",), "user": ("dim",), "general": ("actdim", "nsample"),
 }  # fmt: skip
-#: Most copies of an element, most elements of a model with copies, and largest product of the sizes of one element.
+#: Most copies of an element, most elements including copies, and largest product of the sizes of an element.
 MOST_COPIES, MOST_ELEMENTS, MOST_CELLS = 2_000, 50_000, 2**24
-#: Largest vertical component of the axis of a wheel, and largest relative difference between radii of equal wheels.
+#: Largest vertical component of a wheel axis, and largest relative difference between radii of equal wheels.
 LEVEL, EQUAL = 0.1, 0.01
 
 
 def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
     """Numbers of a hinge. Defaults are resolved by MuJoCo's compiler.
 
-    With a `<dcmotor>` on the hinge, its winding and effects are those of the motor.
+    A `<dcmotor>` on the hinge supplies winding and effects.
 
     Args:
         source: the model.
         joint: name of the joint. None: the only driven one.
 
     Raises:
-        BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
+        BadConfiguration: MuJoCo rejects the model, or the joint is missing or no hinge.
     """
     return _MujocoModel(mujoco.mujoco_module(), read_mujoco_model(source), source.name).numbers(joint)
 
@@ -56,22 +56,22 @@ def read_mujoco_model(source: Path) -> Any:
     """Model of a file, compiled by MuJoCo.
 
     Raises:
-        BadConfiguration: a model that MuJoCo refuses.
+        BadConfiguration: MuJoCo rejects the model.
     """
     check_mujoco_model(source)
     try:
         model = mujoco.mujoco_module().MjModel.from_xml_path(str(source))
     except (ValueError, RuntimeError) as error:
         raise BadConfiguration(f"{source}: MuJoCo cannot read it ({' '.join(str(error).split())})") from error
-    check_memory(source, VALUE * model.nv**2)  # of its matrix of inertia
+    check_memory(source, VALUE * model.nv**2)  # of its inertia matrix
     return model
 
 
 def check_mujoco_model(source: Path) -> None:
-    """Rejects a model with sizes or files for which MuJoCo's compiler does not end, before that compiler starts.
+    """Rejects a model for which MuJoCo's compiler would not terminate, before it starts.
 
     Raises:
-        BadConfiguration: numbers that are not finite, too many copies, elements or cells, or a file that is a pipe or
+        BadConfiguration: a number is not finite, there are too many copies, elements or cells, or a file is a pipe or
             a device.
     """
     pending, roots = [source], dict[Path, Element]()
@@ -100,11 +100,11 @@ def check_mujoco_model(source: Path) -> None:
 
 
 def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequence[str]) -> int:
-    """Returns the number of copies that an element makes of its content. Refuses its numbers and files.
+    """Number of copies that an element makes of its content, after its numbers and files are checked.
 
     Args:
         folder: folder of the model.
-        inside: folders in it that may hold files.
+        inside: its subfolders that may contain files.
     """
     tag, place_words, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
     for key, text in element.attrib.items():
@@ -199,7 +199,7 @@ class _MujocoModel:
         )  # fmt: skip
 
     def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
-        """Inertia of the rotating parts and their weight as `hanging`, with other joints in the reference pose."""
+        """Inertia of the rotating parts, and their weight as `hanging`, with other joints in the reference pose."""
         model, data, place = self.model, self.data, self.model.jnt_qposadr[joint]
         weights = []
         for angle in (np.pi / 2, 0.0):
@@ -212,7 +212,7 @@ class _MujocoModel:
         return float(mass[dof, dof]) - armature, hanging_torque_and_angle(weights[1], weights[0])
 
     def _radius(self, joint: int) -> Found | None:
-        """Radius of the largest cylinder or sphere about the axis, of collisions if there are any."""
+        """Radius of the largest cylinder or sphere about the axis, from collision geometry if there is any."""
         model, data, geom = self.model, self.data, self.library.mjtGeom
         welded = model.body_weldid[model.jnt_bodyid[joint]]
         radii: list[tuple[bool, float, str]] = []
@@ -288,7 +288,7 @@ def _effects(dynamic: Sequence[float], bias: Sequence[float], ratio: float) -> d
         }  # fmt: skip
     if amplitude:
         amplitudes["cogging"] = {"amplitude": -amplitude, "ripples": ripples, "phase": phase}
-    if stiffness > 0:  # of the motor's shaft, here at the joint
+    if stiffness > 0:  # from the motor shaft to the joint
         amplitudes["presliding"] = {"amplitude": coulomb * ratio, "angle_breakaway": static / stiffness / ratio}
         if static > coulomb:
             excess = (static - coulomb) * ratio

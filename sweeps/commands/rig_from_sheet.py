@@ -1,4 +1,4 @@
-"""Constants of a motor from the six usual numbers of its data sheet."""
+"""Motor constants from the six usual numbers of a data sheet."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from calibration.data.input_errors import BadConfiguration, parse_number, three_
 from sweeps.commands.rig_template import StatedNumber
 
 _GRAVITY, _POUND_FORCE, _INCH = 9.80665, 4.4482216, 0.0254
-#: Units of torque: as read, without dots and capitals, and in N·m.
+#: Units of torque: normalised spelling, and value in N·m.
 TORQUES = {
     "Nm": 1.0, "mNm": 1e-3, "Ncm": 1e-2, "kg·cm": 1e-2 * _GRAVITY, "kgf·cm": 1e-2 * _GRAVITY,
     "g·cm": 1e-5 * _GRAVITY, "gf·cm": 1e-5 * _GRAVITY, "oz·in": _POUND_FORCE / 16 * _INCH,
     "ozf·in": _POUND_FORCE / 16 * _INCH, "lb·in": _POUND_FORCE * _INCH, "lbf·in": _POUND_FORCE * _INCH,
 }  # fmt: skip
 _CURRENTS = {"A": 1.0, "mA": 1e-3}
-#: Numbers of a sheet, as options are called: units in SI.
+#: Numbers of a data sheet, by the name of their option: units in SI.
 NUMBERS: dict[str, dict[str, float]] = {
     "voltage": {"V": 1.0, "mV": 1e-3},
     "no-load-speed": {"rpm": math.pi / 30, "1/min": math.pi / 30, "rad/s": 1.0},
@@ -26,9 +26,9 @@ NUMBERS: dict[str, dict[str, float]] = {
     "stall-current": _CURRENTS,
     "resistance": {"ohm": 1.0, "Ω": 1.0, "mohm": 1e-3, "mΩ": 1e-3},
 }
-#: Largest relative difference between two numbers of a sheet that should be equal.
+#: Largest relative difference between two values of a number.
 LARGEST = 0.1
-#: Least widths of resistance and torque constant; makers print three digits and allow 5 to 10 % between motors [%].
+#: Smallest sds of resistance and torque constant [%]. Makers print three digits and allow 5 to 10 % between motors.
 WIDTH_RESISTANCE, WIDTH_CONSTANT = 5.0, 3.0
 
 
@@ -51,16 +51,16 @@ def _parse_quantity(name: str, text: str) -> float:
 
 
 def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
-    """Returns resistance, torque constant and friction of a motor as lines of a rig's file.
+    """Resistance, torque constant and friction of a motor as lines of a rig file.
 
-    U = R I_s at stall. U = R I_0 + k ω_0 and friction k I_0 at no load. M_s = k (I_s - I_0) at the stalled shaft.
+    At stall U = R I_s and M_s = k (I_s - I_0). At no load U = R I_0 + k ω_0, with friction torque k I_0.
 
     Args:
-        stated: text with unit of each of `NUMBERS`.
+        stated: text with unit for each of `NUMBERS`.
 
     Raises:
-        BadConfiguration: text without number or unit, too few numbers, or numbers that differ by more than
-            `LARGEST` where these equations make them equal.
+        BadConfiguration: a text has no number or unit, there are too few numbers, or numbers differ by more than
+            `LARGEST` although these equations make them equal.
     """
     if not stated:
         others = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
@@ -109,10 +109,10 @@ def _ratio_or_none(one: float | None, other: float | None) -> float | None:
 
 
 def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
-    """Stall current less no-load current [A].
+    """Stall current minus no-load current [A].
 
     Raises:
-        BadConfiguration: numbers that do not determine it, or a no-load current that is not the smaller one.
+        BadConfiguration: the numbers do not determine it, or the no-load current is not the smaller one.
     """
     voltage, speed, idle, torque, stall, resistance = map(sheet.get, NUMBERS)
     if idle is None:

@@ -13,34 +13,34 @@ from mmrjax.errors import list_some
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
 
-#: Types of a joint that turns.
+#: Joint types that turn.
 TURNS = ("revolute", "continuous")
-#: Name of a root link that stands still.
+#: Name of a fixed root link.
 FIXED_ROOT = "world"
-#: Largest vertical component of the axis of a wheel.
+#: Largest vertical component of a wheel axis.
 LEVEL = 0.1
-#: Spellings of the reduction of a transmission, of ROS 1 and ROS 2.
+#: Names of a transmission's reduction in ROS 1 and ROS 2.
 REDUCTIONS = ("mechanicalReduction", "mechanical_reduction")
-#: Least inertia of what turns [kg·m²]; less is rounding of a rotation.
+#: Smallest inertia of rotating parts [kg·m²]. Smaller values are rounding errors of rotations.
 LEAST_INERTIA = 1e-12
 #: Largest relative difference between radii of equal wheels.
 EQUAL = 0.01
 
-#: A rotation, shape (3, 3), and a position [m], shape (3,).
+#: Rotation, shape (3, 3), and position [m], shape (3,).
 Pose = tuple[np.ndarray, np.ndarray]
 
 
 def read_urdf_joint(root: Element, file: str, joint: str | None) -> JointNumbers:
-    """Returns the numbers of a joint of a robot.
+    """Numbers of a joint of a robot.
 
     Args:
         root: element `<robot>`.
         file: its name.
-        joint: by name, None: the only driven one.
+        joint: name of the joint. None: the only driven one.
 
     Raises:
-        BadConfiguration: an unknown joint, a joint that does not turn, a loop of links, a number that is wrong or
-            negative, or no inertia.
+        BadConfiguration: the joint is unknown or does not turn, links form a loop, a number is wrong or negative, or
+            there is no inertia.
     """
     robot = _UrdfRobot(root, file)
     return robot.numbers(robot.chosen(joint))
@@ -86,7 +86,7 @@ class _UrdfRobot:
         """Name of a joint that turns.
 
         Raises:
-            BadConfiguration: an unknown joint, or one that is fixed or slides.
+            BadConfiguration: the joint is unknown, fixed, or slides.
         """
         turning = [name for name, element in self.joints.items() if element.get("type") in TURNS]
         candidates = [name for name in turning if self._driven(name)] or turning
@@ -156,7 +156,7 @@ class _UrdfRobot:
         return rotation, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
 
     def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
-        """Links that turn with a link, or are fixed to it, and their poses in its frame, other joints at zero."""
+        """Links that turn with a link or are fixed to it, and their poses in its frame with other joints at zero."""
         pending: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
         met: set[str] = set()
         while pending:
@@ -178,7 +178,7 @@ class _UrdfRobot:
         met.add(link)
 
     def _to_root(self, joint: str) -> tuple[Pose, str]:
-        """Pose of a joint in the frame of the root link, and the name of that."""
+        """Pose of a joint in the frame of the root link, and the name of the root link."""
         pose: Pose = (np.eye(3), np.zeros(3))
         joint_name: str | None = joint
         link, met = "", set[str]()
@@ -204,7 +204,7 @@ class _UrdfRobot:
         return self._number(element, "value", f"link {link}, <mass>", "kg", 0.0)
 
     def _inertial(self, link: str, pose: Pose, axis: np.ndarray) -> tuple[float, float, np.ndarray]:
-        """Mass, inertia about the axis, and first moment of a link. It adds none without `<inertial>`."""
+        """Mass, inertia about the axis, and first moment of a link. All are 0 without `<inertial>`."""
         inertial = self.links[link].find("inertial")
         if inertial is None:
             return 0.0, 0.0, np.zeros(3)
@@ -220,7 +220,7 @@ class _UrdfRobot:
         return mass, float(own_axis @ tensor @ own_axis + mass * lever @ lever), mass * centre
 
     def _radius(self, joint: str) -> Found | None:
-        """Radius of the largest cylinder or sphere about the axis: of collisions, else of what is shown."""
+        """Radius of the largest cylinder or sphere about the axis, from collision or else visual geometry."""
         axis = self._axis(joint)
         link = self._link(self.joints[joint], "child", joint)
         for tag in ("collision", "visual"):
@@ -263,9 +263,9 @@ class _UrdfRobot:
         return commanded or any(True for _ in self._transmissions(joint))
 
     def _ratio(self, joint: str) -> Found | None:
-        """Product of the reductions on the way from the motor to the joint."""
+        """Product of the reductions between motor and joint."""
         for element in self._transmissions(joint):
-            shared = len(element.findall("joint")) > 1  # then actuators belong to no single joint
+            shared = len(element.findall("joint")) > 1  # actuators then belong to no single joint
             of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
             owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
             texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
@@ -287,7 +287,7 @@ class _UrdfRobot:
         return (value, place_words) if value else None
 
     def _armature(self, joint: str) -> Found | None:
-        """Inertia of the rotor at the joint: an attribute `armature` of its dynamics."""
+        """Inertia of the rotor at the joint: attribute `armature` of `<dynamics>`."""
         place_words = f"joint {joint}, <dynamics armature>"
         value = self._number(self.joints[joint].find("dynamics"), "armature", place_words, "kg·m²", 0.0)
         return (value, place_words) if value else None
@@ -335,12 +335,12 @@ def _rotation_about(axis: int, angle: float) -> np.ndarray:
 
 
 def _compose(outer: Pose, inner: Pose) -> Pose:
-    """A pose in the frame of another one."""
+    """Pose composed with another one."""
     return outer[0] @ inner[0], outer[1] + outer[0] @ inner[1]
 
 
 def _hanging_weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
-    """As `hanging`, of a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
+    """As `hanging`, for a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
     across = np.cross(axis, moment)
-    flat = np.cross(across, axis)  # the moment without its part along the axis
+    flat = np.cross(across, axis)  # moment without its component along the axis
     return hanging_torque_and_angle(float(axis @ np.cross(flat, gravity)), float(axis @ np.cross(across, gravity)))

@@ -1,4 +1,4 @@
-"""Numbers of one driven joint of a model, and the lines of a rig file that follow from them."""
+"""Numbers of a driven joint of a model, and the lines of a rig file that follow from them."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from sweeps.commands.rig_template import StatedNumber
 
-#: A number and the element of the model that states it.
+#: Number, and the element of the model that states it.
 Found = tuple[float, str]
 
-#: Kinds of rig on the ground, and kinds that a joint which turns can be.
+#: Kinds of rig on the ground, and kinds for a joint that turns.
 VEHICLES = ("wheeled", "tracked")
 TURNING = (*VEHICLES, "bench", "dyno", "pendulum", "servo")
-#: Least torque of gravity that counts as an arm [N·m].
+#: Smallest gravity torque that counts as an arm [N·m].
 LEAST_WEIGHT = 1e-9
-#: Largest distance of a wheel's centre from its axis, as a share of its radius; largest sine between their axes.
+#: Largest distance between wheel centre and joint axis, as a share of the radius, and largest sine between the axes.
 OFF_AXIS = 0.02
-#: Share of the stall torque that a loss may take that a model does not state.
+#: Upper limit of a loss that the model does not state, as a share of the stall torque.
 UNSTATED = 0.05
-#: Width of each number: models round masses and guess losses.
+#: Sd of each number: models round masses and guess losses.
 WIDTHS = {
     "mass": "20 %", "radius": "5 %", "inertia": "50 %", "ratio": "5 %", "armature": "50 %", "friction": "100 %",
     "damping": "100 %", "weight": "20 %", "angle": "0.1",
@@ -32,20 +32,20 @@ WIDTHS = {
 
 @dataclasses.dataclass(frozen=True)
 class JointNumbers:
-    """Numbers of a joint and of what it moves [SI]. None where the model has none.
+    """Numbers of a joint and its load [SI]. None if the model has no value.
 
     Attributes:
         file, joint: names of the file and the joint.
         rolls: True if the joint turns a wheel of a body that is free to move.
         mass: mass of the whole model.
-        sides: number of equal joints, such as the wheel on the other side.
+        sides: number of equal joints, such as wheels on both sides.
         inertia: moment of inertia about the joint's axis of everything that turns with it, without `armature`.
         radius: radius of the wheel.
-        ratio: turns of the motor per turn of the joint.
+        ratio: motor turns per turn of the joint.
         friction, damping, armature: friction, damping and armature at the joint.
-        weight: largest torque of gravity [N·m].
+        weight: largest gravity torque [N·m].
         angle: angle of the load at rest under gravity.
-        drive: numbers of the motor by dotted name. They take precedence over what follows from the others.
+        drive: numbers of the motor by dotted name. They take precedence over values that follow from the others.
     """
 
     file: str
@@ -64,10 +64,10 @@ class JointNumbers:
     drive: Mapping[str, StatedNumber] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
-        """The kind of rig: `stated`, or else the kind that fits the joint's load.
+        """Kind of rig: `stated`, or else the kind that fits the joint's load.
 
         Raises:
-            BadConfiguration: a kind whose load slides.
+            BadConfiguration: the load of this kind slides.
         """
         if stated is None:
             return "wheeled" if self.rolls else "bench" if self.weight is None else "pendulum"
@@ -77,7 +77,7 @@ class JointNumbers:
         return stated
 
     def numbers(self, kind: str) -> dict[str, StatedNumber]:
-        """Numbers for the file of a rig of this kind, by dotted name."""
+        """Numbers for the rig file of this kind, by dotted name."""
         by_name: dict[str, StatedNumber] = {}
 
         def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
@@ -111,11 +111,11 @@ class JointNumbers:
 
 
 def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict[str, StatedNumber]:
-    """Numbers of a rig of a kind, with losses of the joint free that its model lacks or leaves at the default 0.
+    """Numbers of a rig, with those losses of the joint free that its model lacks or leaves at the default 0.
 
-    Each may take `UNSTATED` of the stall torque k n U / R, that with the speed at no-load speed U / (k n). Without
-    motor constants and ratio, or without the voltage U for the constant loss, the template's line is kept, and 0 is
-    held.
+    Each may be up to `UNSTATED` of the stall torque k n U / R, the speed-dependent loss at no-load speed U / (k n).
+    Without motor constants and ratio, or without the voltage U for the constant loss, the template's line is kept,
+    and a value of 0 is fixed.
     """
     freed = dict(numbers)
     constant, resistance, ratio, limit = (
@@ -143,10 +143,10 @@ def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[floa
     """Amplitude M [N·m] and rest angle θ_0 [rad] of the gravity torque -M sin(θ - θ_0). None: M is negligible.
 
     Args:
-        torque, torque_quarter: torques of gravity about the axis at θ = 0 and at a quarter turn [N·m].
+        torque, torque_quarter: gravity torques about the axis at θ = 0 and at a quarter turn [N·m].
     """
     weight = math.hypot(torque, torque_quarter)
-    angle = math.atan2(torque, -torque_quarter) + 0.0  # not -0.0, which the file would show
+    angle = math.atan2(torque, -torque_quarter) + 0.0  # avoids -0.0 in the file
     return (weight, angle) if weight > LEAST_WEIGHT else None
 
 
@@ -154,9 +154,9 @@ def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndar
     """True if a cylinder or sphere turns about its own axis.
 
     Args:
-        centre: centre from a point of the joint's axis.
+        centre: centre relative to a point on the joint's axis.
         axis: axis of the joint.
-        along: axis of the cylinder, None: a sphere. Axes are unit vectors, shape (3,).
+        along: axis of the cylinder. None: a sphere. Axes are unit vectors, shape (3,).
     """
     off = np.linalg.norm(np.cross(axis, centre))
     tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))

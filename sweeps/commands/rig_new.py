@@ -1,4 +1,4 @@
-"""The command `rig new`: writes a rig file to fill in, with the source of each number."""
+"""The command `rig new`: writes a rig file template, with the source of each number."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ LARGEST = 2**26
 
 
 def joint_numbers(source: Path, joint: str | None) -> JointNumbers:
-    """Numbers of a driven joint of a URDF or MuJoCo model. The first element of the file decides which it is.
+    """Numbers of a driven joint of a URDF or MuJoCo model. The first element of the file determines the format.
 
     Args:
-        joint: by name, None: the only driven one.
+        joint: name of the joint. None: the only driven one.
 
     Raises:
-        BadConfiguration: no file, no such format, or a joint that it does not have or that does not turn.
+        BadConfiguration: the file is missing or has another format, or the joint is missing or does not turn.
     """
     text = file_bytes(source, source, BadConfiguration, LARGEST)
     try:
@@ -37,7 +37,7 @@ def joint_numbers(source: Path, joint: str | None) -> JointNumbers:
             from sweeps.commands import rig_from_urdf
 
             return rig_from_urdf.read_urdf_joint(ElementTree.fromstring(text), source.name, joint)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # an encoding that Python does not know
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # unknown encoding
         raise BadConfiguration(
             f"{source}: not a readable XML file ({error}); expected URDF or MuJoCo's XML"
         ) from error
@@ -49,13 +49,13 @@ def joint_numbers(source: Path, joint: str | None) -> JointNumbers:
 
 
 def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet: Mapping[str, str] | None) -> str:
-    """Text of a rig's file, with the numbers of a joint and of a data sheet in their lines.
+    """Text of a rig file with the numbers of a joint and a data sheet.
 
     Args:
-        kind: None: what the joint moves, else `USUAL`.
-        source: a model.
-        joint: by name.
-        sheet: numbers by name.
+        kind: kind of rig. None: that of the joint's load, otherwise `USUAL`.
+        source: model file.
+        joint: name of the joint.
+        sheet: numbers of a data sheet by name.
 
     Raises:
         BadConfiguration: for the same reasons as `joint_numbers` and `rig_from_sheet.read_data_sheet`.
@@ -91,14 +91,14 @@ def write_new_rig(
     joint: str | None = None,
     sheet: Mapping[str, str] | None = None,
 ) -> int:
-    """Write a rig's file to fill in, or one with the numbers of a model or data sheet. Returns 0.
+    """Writes a rig file template, or a rig file with the numbers of a model or data sheet. Returns 0.
 
     Args:
-        kind, source, joint, sheet: as of `new_rig_text`.
+        kind, source, joint, sheet: as in `new_rig_text`.
 
     Raises:
-        BadConfiguration: no such kind, model, joint or folder, a contradictory sheet, or a file that exists without
-            `force`.
+        BadConfiguration: a kind, model, joint or folder does not exist, the data sheet is contradictory, or the file
+            exists and `force` is false.
     """
     if joint is not None and source is None:
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")

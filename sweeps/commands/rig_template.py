@@ -1,4 +1,4 @@
-"""Templates of rig files, and their lines filled in with numbers of a model or data sheet."""
+"""Templates of rig files, filled in with numbers of a model or data sheet."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = {
     "wheeled": "a robot on wheels",
     "tracked": "a robot on tracks",
 }
-#: Name of the load's table in the names of numbers; the template's own name replaces it.
+#: Name of the load's table in dotted names, which the template's own name replaces.
 LOAD = "load"
 
 
@@ -30,8 +30,8 @@ class StatedNumber:
 
     Attributes:
         value: value in `unit`.
-        source: its file and element.
-        width: text after ±, or empty.
+        source: file and element that state it.
+        width: text after ±, empty if there is none.
     """
 
     value: float
@@ -41,24 +41,24 @@ class StatedNumber:
 
     @property
     def text(self) -> str:
-        """The number as the file has it. 0 has no share of itself as its width."""
+        """Number as text for the file. A relative sd of 0 is omitted."""
         number = repr(self.value if isinstance(self.value, int) else float(f"{self.value:.12g}"))
         exact = not self.width or (self.value == 0 and self.width.endswith("%"))
         return number if exact else f'"{number} ± {self.width}"'
 
 
 def rig_template(kind: str) -> str:
-    """The file of a kind, to fill in."""
+    """Template for a kind of rig."""
     return resources.files("calibration.data").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
 
 
 def fill_rig_template(kind: str, numbers: Mapping[str, StatedNumber], heading: str) -> str:
-    """Returns the file of a kind with numbers in their lines.
+    """Template of a kind of rig, filled in with numbers.
 
-    A number whose line the template lacks is added at the end of its table.
+    Numbers without a line in the template are added at the end of their table.
 
     Args:
-        numbers: by dotted name, `load.` for the table of the load.
+        numbers: numbers by dotted name, with `load.` for the table of the load.
         heading: sentence for the first line.
     """
     lines = rig_template(kind).splitlines()
@@ -71,7 +71,7 @@ def fill_rig_template(kind: str, numbers: Mapping[str, StatedNumber], heading: s
 
 
 def _one_line(text: str) -> str:
-    """Text for a comment: names of a model may have line breaks, which would end it."""
+    """Text on one line, because line breaks in names of a model would end a comment."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 

@@ -1,4 +1,4 @@
-"""The command `sensitivity`: the influence of each parameter on the outputs, and the most informative next runs."""
+"""The command `sensitivity`: influence of each parameter on the outputs, and the most informative next runs."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from sweeps.points.run import check_runs_bearable
 from sweeps.report import sensitivity_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
-#: Operating points of methods that draw a sample at each: ends of Table 8, and the middle of its slopes.
+#: Operating points for methods that draw a sample at each: ends of Table 8, and the middle of its slopes.
 CORNERS = {
     "voltages_V": (VOLTAGES_V[0], VOLTAGES_V[-1]),
     "payloads_kg": (PAYLOADS_KG[0], PAYLOADS_KG[-1]),
     "slopes_deg": SLOPES_DEG[::2],
 }
 WHOLE = {"voltages_V": VOLTAGES_V, "payloads_kg": PAYLOADS_KG, "slopes_deg": SLOPES_DEG}
-#: Condition that may vary → the axis of operating points that it takes the place of.
+#: Condition that may vary → axis of operating points that it replaces.
 AXES = {
     "voltage": "voltages_V",
     "motor_speed": "motor_speeds_rpm",
@@ -55,9 +55,8 @@ AXES = {
 
 
 def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
-    """Run a sensitivity study of a robot and write a run folder. Returns the exit code.
-
-    0 done. 3 done, but the solver failed at some operating points.
+    """Runs a sensitivity study of a robot and writes a run folder. Returns the exit code: 0 if done, 3 if the solver
+    failed at some operating points.
     """
     file = load_robot(config)
     if config.method not in METHODS:
@@ -105,7 +104,7 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
 
 
 def _varied_ranges(vary: Names) -> dict[str, tuple[float, float]]:
-    """Range of every varied condition, from options `name=low:high`."""
+    """Range of each varied condition, from options `name=low:high`."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in vary:
         name, _, ends = text.partition("=")
@@ -124,16 +123,16 @@ def _varied_ranges(vary: Names) -> dict[str, tuple[float, float]]:
 def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
-    """The grid of operating points. For a condition with --vary it contains one value, the middle of the range."""
+    """Grid of operating points. For a condition with --vary it contains one value, the middle of the range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
         raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
-    table8: dict[str, tuple[float, ...]] = {}
-    if layout.table8:
-        table8 = CORNERS if config.method in ("sobol", "morris") else WHOLE
-        if not set(OF_TURNS).isdisjoint(ranges):  # which settle on level ground alone
-            table8 = {**table8, "slopes_deg": (0.0,)}
-    axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+    usual_axes: dict[str, tuple[float, ...]] = {}
+    if layout.uses_paper_conditions:
+        usual_axes = CORNERS if config.method in ("sobol", "morris") else WHOLE
+        if not set(OF_TURNS).isdisjoint(ranges):  # which settle only on level ground
+            usual_axes = {**usual_axes, "slopes_deg": (0.0,)}
+    axes = {key: getattr(config, key) or usual_axes.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
         ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
         imposed.check_acting(robot, ground, shaft)
@@ -190,11 +189,13 @@ def _uncertain_inputs(
 
 
 def _candidate_runs(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> CandidateRuns:
-    """Candidate runs: a table, or Table 8 in every configuration. For a rig or for turns, the operating points."""
+    """Candidate runs: those of a table, or Table 8 in every configuration. For a rig or for turns, the operating
+    points.
+    """
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source
-    elif turns or not Layout.of(robot).table8:
+    elif turns or not Layout.of(robot).uses_paper_conditions:
         runs, source = points, "the operating points"
     else:
         runs = grid_conditions(GridPart(surface=config.surface), robot)

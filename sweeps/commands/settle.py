@@ -1,4 +1,4 @@
-"""The command `settle`: find the settled runs of a log over time."""
+"""The command `settle`: finds the settled runs in a log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Settle, beside: configuration.SettledLog) -> int:
-    """Find the settled runs of a log and write a run folder with their table. Returns the exit code, 0."""
+    """Finds the settled runs in a log and writes a run folder with their table. Returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     column_options = [] if config.columns is None else ["--columns", config.columns]
@@ -51,8 +51,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
 
 
 def segments_table(found: Settled) -> Columns:
-    """Table with a row for each segment of a log: position, reason if it was left out, means, their sds and
-    changes."""
+    """Table with a row for each segment of a log: position, reason if omitted, means, their sds, and changes."""
     stretches = found.stretches
     table: Columns = {
         "run_id": np.array([s.run for s in stretches]),

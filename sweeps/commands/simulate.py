@@ -1,4 +1,4 @@
-"""The command `simulate`: a few given runs, over time if the fidelity allows it."""
+"""The command `simulate`: simulates a few given runs, over time if the fidelity allows it."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ from sweeps.report.runs_report import PEAK
 from sweeps.report.words import posture_words
 from sweeps.store import RunFolder, open_folder, print_report
 
-_HISTORIES = 1000  # runs of which histories are kept
-_SHOWN = 6  # runs on the console
-#: Channels that histories of a shaft have in any case.
+_HISTORIES = 1000  # most runs with stored histories
+_SHOWN = 6  # most runs on the terminal
+#: Channels that histories of a shaft always have.
 OF_SHAFT = ("motor_speed", "output_angle")
-#: The same of a vehicle.
+#: The same for a vehicle.
 OF_VEHICLE = ("speed",)
-#: Columns of the currents of the motors of either side, where sides are driven apart.
+#: Columns of each side's motor currents, if the sides are driven independently.
 _OF_SIDES = tuple(channels.find_channel(f"motor_current_{side}").column for side in channels.SIDES)
-#: Runs are filled up to a multiple of this, so that tables of about one size share what is compiled.
+#: The number of runs is padded to a multiple of this, so that tables of similar size share compiled programs.
 PAD = 16
-#: Column of the time that a run's current may flow before its windings are at their limit.
+#: Column with the time for which a run's current may flow until the windings reach their limit.
 PERMISSIBLE = "permissible_time_s"
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs from a file, or one run from options, and write a run folder. Returns the exit code.
+    """Simulates runs from a file, or one run from options, and writes a run folder. Returns the exit code.
 
     Raises:
-        BadConfiguration: more runs than histories can be kept of.
+        BadConfiguration: there are more runs than histories can be stored for.
     """
     if config.profile is not None or config.turns:
         module = "turn" if config.profile is None else "missions"
@@ -104,7 +104,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 def _simulate_table(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
 ) -> tuple[Columns, RunBatch | None]:
-    """Table of the runs. If the fidelity simulates them over time, the histories are written and returned too."""
+    """Table of the runs. If the fidelity simulates over time, histories are written and returned too."""
     fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
         return run.evaluate_runs(robot, runs, config, folder), None
@@ -119,7 +119,7 @@ def _simulate_table(
         "history.csv", capabilities.drop_inapplicable_columns(robot, history_table(robot, batch.history, runs))
     )
     if batch.history.reactions is not None:
-        # Loads inside one side's running gear over time [N], a row a sample
+        # loads inside one side's running gear over time [N], one row per sample
         loads = batch.history.reactions
         assert loads is not None  # the fidelity resolves them
         table = {
@@ -208,7 +208,7 @@ def motor_currents(robot: Robot, table: Columns) -> np.ndarray:
 
 
 def run_remarks(robot: Robot, table: Columns) -> list[str]:
-    """Remarks that the numbers alone do not show, one sentence each, on a few runs at most."""
+    """Remarks on facts that the numbers do not show, one sentence each, on a few runs at most."""
     remarks: list[str] = []
     several = len(table["status"]) > 1
     times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible_durations(robot, table)

@@ -1,4 +1,4 @@
-"""The command `size`: search for a robot that meets requirements."""
+"""The command `size`: searches for a robot that meets requirements."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ from sweeps.report.size_report import SizeResult, describe_design
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
-def execute(config: configuration.Size, beside: configuration.FolderPart) -> int:
-    """Search for a design and write a run folder. Returns the exit code.
-
-    The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
+def execute(config: configuration.Size, beside: configuration.VerbosePart) -> int:
+    """Searches for a design and writes a run folder. Returns the exit code: 0 whether or not a design meets
+    everything, 3 if the solver failed at a worst corner of the best design.
     """
     requirements = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
@@ -67,6 +66,7 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
         document = print_report(
             size_report.size_document(result, capabilities.displayed_name(file)),
             dataclasses.replace(file, robot=best),
+            brief=not beside.verbose,
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.every_run_solved(Counter(o.status for o in outcomes))

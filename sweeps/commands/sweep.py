@@ -34,21 +34,22 @@ from sweeps.report.run_tables import endings_table
 from sweeps.report.terminal_renderer import print_table
 from sweeps.store import DONE, IDENTITY, SOLVER_FAILED, default_path, finish_run_folder, open_folder, print_report
 
-#: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
+#: Most runs of a grid for which a table (runs.csv) is written. More runs go to a store, which takes a tenth of time
+#: and space.
 TABLE = 100_000
-#: Bytes that are to stay free on the disk beside a store.
+#: Space on the disk that must stay free besides the store [bytes].
 MARGIN = 64 * 2**20
-#: Points on which the time of a slow fidelity is estimated.
+#: Number of points for estimating the time of a slow fidelity.
 PROBED = 64
 
 
 def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
-    """Simulate a sweep and write a run folder, with a table if the grid has at most `TABLE` runs. Returns the exit
+    """Simulates a sweep and writes a run folder, with a table if the grid has at most `TABLE` runs. Returns the exit
     code.
 
     Args:
-        config: the configuration.
-        options: options of a store. With any of them a small grid leaves one too.
+        config: configuration of the sweep.
+        options: options of a store. With any of them, small grids also use a store.
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
@@ -109,7 +110,7 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
         files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
         same = job_identity(config, robot, files, device)
         if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
-            _reject_without_space(layout.size, 1.0, path)  # a sweep that goes on needs less
+            _reject_without_space(layout.size, 1.0, path)  # a continued sweep needs less
         store = SweepStore(path, same, layout, force=options.force)
         try:
             if not store.finished:
@@ -137,7 +138,7 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
         small = Blocks.of(job.plan.design.shape, PROBED)
         compiled = scale.Compiled(dataclasses.replace(job, blocks=small))
     spent = []
-    for _ in range(2 if slow else 4):  # the first compiles
+    for _ in range(2 if slow else 4):  # the first call compiles
         start = time.perf_counter()
         scale.fetch_values(compiled(compiled.points(0)), 1)
         spent.append(time.perf_counter() - start)
@@ -169,11 +170,11 @@ def _free_bytes(path: Path) -> int:
 
 
 def _reject_without_space(size: int, share: float, path: Path) -> None:
-    """Reject a sweep whose results would not fit on the disk.
+    """Rejects a sweep whose results would not fit on the disk.
 
     Args:
         size: size of the whole store [bytes].
-        share: share of it that is still to be written.
+        share: share that is not yet written.
     """
     needed, free = math.ceil(size * share) + MARGIN, _free_bytes(path)
     if needed > free:
@@ -185,7 +186,7 @@ def _reject_without_space(size: int, share: float, path: Path) -> None:
 
 
 def bytes_text(size: float) -> str:
-    """A number of bytes as text."""
+    """Number of bytes as text."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
             return f"{size:.3g} {unit}" if size < 1e6 else f"{size:,.0f} {unit}"
@@ -194,7 +195,7 @@ def bytes_text(size: float) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """A duration as text."""
+    """Duration as text."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.1f} {unit}"
@@ -211,11 +212,10 @@ def chunks_of_shard(share: tuple[int, int], chunks: int) -> range:
 
 
 def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, pool: Any) -> None:
-    """Compute and write the chunks of this process's share that are not done.
+    """Computes and writes the unfinished chunks of this process's share.
 
     Raises:
-        BadConfiguration: no room on the disk, before anything is computed, or in the middle. The scheduler's workers
-            are lost for good.
+        BadConfiguration: the disk has too little space or becomes full, or the scheduler's workers are lost for good.
     """
     store.begin(options.share)
     done = store.done()
@@ -258,7 +258,7 @@ def finish_sweep(
     if not store.finished:
         with store.last() as is_complete:
             if is_complete:
-                # Write all files of a run folder except the store, then move the store into place
+                # write all files of a run folder except the store, then move the store into place
                 summary = sweep_summary(store.layout, job, store.done().values())
                 store.write_json("result.json", summary)
                 manifest = {
@@ -318,6 +318,6 @@ def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
 
 
 def points_by_status(done: Iterable[Done]) -> dict[str, int]:
-    """Number of points by status. Every status is included."""
+    """Number of points with each status, zeros included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""The command `simulate` for one run with different commands for the two sides: its turn, motor currents and path."""
+"""The command `simulate` for one run with different commands for the two sides: turn, motor currents and path."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from sweeps.report import turn_report
 from sweeps.report.words import posture_words, turn_words
 from sweeps.store import open_folder, print_report
 
-#: Duties of the inner side, as shares of the outer one's, over which a settled turn is shown.
+#: Duties of the inner side for which settled turns are shown, as shares of the outer side's duty.
 SHARES = np.linspace(1.0, -1.0, 97)
-#: Channels of a turn, beside the robot's own.
+#: Channels of a turn, in addition to the robot's channels.
 SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate one run from options with different commands for the two sides, and write a run folder. Returns the
+    """Simulates one run from options with different commands for the two sides, and writes a run folder. Returns the
     exit code.
 
     Raises:
-        BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
+        BadConfiguration: runs are from a file, the robot cannot turn, or the turn has no steady state.
     """
     if beside.runs is not None:
         raise BadConfiguration("--runs: got a file in addition to --left, --right or --heading; either put "
@@ -98,27 +98,26 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         return run.write_run_folder(folder, config, result, print_report(document, file))
 
 
-#: Of a demanded turn: as how much wider a robot slides than it is, to begin with; what its load takes, in shares of
-#: the faster side's voltage, one after the other until one is near enough; how near is there [m/s]; and the voltages
-#: tried from each at most.
+#: Search for a demanded turn: initial ratio of effective to real track width. Initial loads, as shares of the faster
+#: side's voltage, tried in turn. Tolerance [m/s]. Most voltages tried from each.
 WIDER, LOADED, NEAR, TRIED = 2.0, (0.1, 0.05, 0.2, 0.4), 1e-7, 100
 
 
 def _run_for_demand(
     robot: Robot, asked: Conditions, runs: Runs, config: configuration.Simulate
 ) -> tuple[Conditions, Runs]:
-    """The run whose duties give the demanded speed and yaw rate in a settled turn.
+    """Run whose duties give the demanded speed and yaw rate in a settled turn.
 
     Raises:
-        BadConfiguration: no duties give it, or they need more voltage than the supply has.
+        BadConfiguration: no duties give them, or the supply voltage is too low.
     """
     chassis = robot.configurations[str(runs.configurations_named(robot)[0])]
     width = float(chassis.turning.width)
-    assert config.speed_m_s is not None and config.yaw_rate_rad_s is not None  # one comes with the other
+    assert config.speed_m_s is not None and config.yaw_rate_rad_s is not None  # both are stated
     speeds_wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
 
     def driven(volts: np.ndarray) -> Conditions:
-        """Voltage of an external supply. A battery sets its own."""
+        """Voltage of an external supply. A battery determines its own."""
         most = max(supply, float(np.abs(volts).max()))
         left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / most, most))
         voltage = asked.voltage if config.battery else source
@@ -130,10 +129,11 @@ def _run_for_demand(
         return np.array([speed, 0.5 * width * turn]) - speeds_wanted
 
     def at_full_voltage() -> tuple[np.ndarray, np.ndarray]:
-        """Speeds and yaw rates of settled turns with all of the supply's voltage on the side that is to be the
-        faster, from straight travel to the spot."""
+        """Speeds and yaw rates of settled turns with the full supply voltage on the faster side, from straight travel
+        to turning on the spot.
+        """
         faster = np.abs(belts) == np.abs(belts).max()
-        faster &= np.cumsum(faster) == 1  # of two, on the spot
+        faster &= np.cumsum(faster) == 1  # two at a time, on the spot
         reading = _turns_to_compare(robot, driven(np.where(faster, np.sign(belts) * supply, 0.0)))[0].result.reading
         return np.asarray(reading["speed"])[1:], np.asarray(reading["yaw_rate"])[1:]
 
@@ -176,10 +176,10 @@ def _end_of_run(history: History | None) -> dict[str, float] | None:
 
 
 def check_can_turn(robot: Robot, named: str) -> None:
-    """Reject a robot that cannot turn in this configuration.
+    """Rejects a robot that cannot turn in this configuration.
 
     Raises:
-        BadConfiguration: why.
+        BadConfiguration: it cannot turn. The message has the reason.
     """
     imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
@@ -187,11 +187,11 @@ def check_can_turn(robot: Robot, named: str) -> None:
 
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
-    """Columns of the run: both duties, and the supply voltage. Without --voltage it is the larger side voltage."""
+    """Columns of the run: both duties, and the supply voltage, by default the larger side voltage."""
     columns: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
         return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}
-    if config.left_V is None or config.right_V is None:  # those of a demand are found later
+    if config.left_V is None or config.right_V is None:  # duties for a demand are found later
         return columns | {name: 1.0 for name in SIDES}
     most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
     if supply is not None and supply < most:
@@ -210,7 +210,7 @@ def _displayed_channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
 
 
 def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:
-    """The requested settled turn, and turns at other duties of the slower side, in one batch."""
+    """Settled turns in one batch: the requested one, and turns at other duties of the slower side."""
     left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
     outer, shares = max(left, right, key=abs), len(SHARES)
     others = outer * SHARES
@@ -233,7 +233,7 @@ def _turn_table(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions
 
 
 def history_table(history: History, shown: tuple[Channel, ...]) -> Columns:
-    """A turn over time as a table, with a row for each sample."""
+    """Table of a turn over time, with a row for each sample."""
     read = {c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown if c.over_time}
     return {"time_s": np.ravel(history.time), **read, "displacement_m": np.ravel(history.distance)}
 

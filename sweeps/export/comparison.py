@@ -125,7 +125,7 @@ def compare_format(
     names = tuple(e.name for e in joint.inside)
     fates_found = list(fates)
     for effect in joint.inside:
-        without_effect = situation.without((effect.name,))
+        without_effect = situation.solve_without_effects((effect.name,))
         share = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, without_effect)
         verdict = HELD if effect.name in held else DROPPED if share < LITTLE else APPROXIMATED
         how = held.get(effect.name) or approximated(effect.balance)
@@ -138,7 +138,7 @@ def compare_format(
         models[TRANSLATED] = situation.readings(_law_at(law, law.start, situation))
     if names:
         plain = law_of(joint, dict.fromkeys(names, 0.0))
-        bare = refit_parameters(plain, situation, situation.without(names))
+        bare = refit_parameters(plain, situation, situation.solve_without_effects(names))
         models[WITHOUT] = situation.readings(_law_at(plain, bare, situation))
     reference = situation.measured if situation.is_measured else situation.native
     return ExportComparison(

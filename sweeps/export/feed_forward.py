@@ -90,7 +90,7 @@ def steady_state_map(
 
 
 class TableLaw(eqx.Module):
-    """The tables, with linear interpolation between points. Attributes: as of `comparison.FormatLaw`."""
+    """The tables, with linear interpolation between points. Attributes: as in `comparison.FormatLaw`."""
 
     speed: jax.Array
     torque: jax.Array

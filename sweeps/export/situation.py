@@ -86,7 +86,7 @@ class ComparisonRuns:
         """True if there are readings to compare with."""
         return bool(np.isfinite(self.measured).any())
 
-    def without(self, names: Names) -> JointResult:
+    def solve_without_effects(self, names: Names) -> JointResult:
         """The joint's own model with amplitudes of some of its effects at 0."""
         _, signals = _solve_runs(_with_absent_effects(self.joint, names), self.conditions)
         ratio = float(self.joint.robot.gearbox.ratio)
@@ -139,7 +139,7 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     """
     robot = joint.file.robot
     if data is None:
-        if not Layout.of(robot).table8 and imposed.imposed_limit(robot) is None:
+        if not Layout.of(robot).uses_paper_conditions and imposed.imposed_limit(robot) is None:
             raise BadConfiguration(
                 f"--data: not given, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
                 "points; give a table of runs, or add the limit"

@@ -113,10 +113,10 @@ def draw_correlations(found: CalibrationResult) -> Figure:
     s = np.maximum(found.identifiability.singular_values, 1e-6)
     right.semilogy(np.arange(1, len(s) + 1), s, "o-", color=BLUE)
     right.axhline(1.0, color=ORANGE, lw=1)
-    right.text(len(s), 1.1, "below: mainly determined by the prior", fontsize=8.5, ha="right", va="bottom")
+    right.text(len(s), 1.1, "below: known from the prior", fontsize=8.5, ha="right", va="bottom")
     right.set_xticks(np.arange(1, len(s) + 1, 2))
     right.set(xlabel="direction", ylabel="singular value (prior sd / data sd)")
-    right.set_title("combinations that the data determine")
+    right.set_title("combinations of parameters")
     return fig
 
 

@@ -26,7 +26,6 @@ from sweeps.pages.figure_style import (
     colour_bar,
     new_figure,
 )
-from sweeps.pages.words import short_name
 from sweeps.points.climbs import SIZE
 from sweeps.points.zarr_store import Layout
 
@@ -72,7 +71,7 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
     fig, ((histogram, *others),) = new_figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
     histogram.hist(output, bins=_number_of_bins(output, BARS), color=BLUE)
-    histogram.set(xlabel=label, ylabel="points", title="how often")
+    histogram.set(xlabel=label, ylabel="points", title="distribution")
     for axes, name in zip(others, names, strict=False):
         values = varied[name].values
         bin_index, middles = bin_values(values)
@@ -82,7 +81,7 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         shares = variance_share(values, output)
         if shares > variance_share_by_chance(values):
             add_corner_note(axes, f"{100 * shares:.0f} % of the variance")
-        axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
+        axes.set(xlabel=varied[name].label, ylabel=label)
         _set_ticks(axes.xaxis, varied[name])
     if len(names) == 2:
         _draw_map(fig, others[2], varied[names[0]], varied[names[1]], output, label)
@@ -182,7 +181,7 @@ def _draw_map(
         cells.flat[number] = np.median(values)
     mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
     colour_bar(fig, mesh, axes, label=f"median {label}")
-    axes.set(xlabel=one.label, ylabel=other.label, title="over both")
+    axes.set(xlabel=one.label, ylabel=other.label)
     _set_ticks(axes.xaxis, one)
     _set_ticks(axes.yaxis, other)
     axes.grid(False)

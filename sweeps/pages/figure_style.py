@@ -234,7 +234,7 @@ def figure_as_svg(fig: Figure) -> str:
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S).replace(
         "'DejaVu Sans'", "'DejaVu Sans', Verdana"
     )
-    axes = html.escape(json.dumps([_axes_position(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
+    axes = html.escape(json.dumps([_axes_geometry(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
     return text.replace("<svg ", f'<svg data-axes="{axes}" ', 1)
 
 
@@ -324,7 +324,7 @@ def _luminance(channels: np.ndarray) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def _axes_position(fig: Figure, axes: Axes) -> Json:
+def _axes_geometry(fig: Figure, axes: Axes) -> Json:
     """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)

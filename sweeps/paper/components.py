@@ -127,7 +127,7 @@ def _mark_rows(axes: Axes, robot: Robot, rows: data.PaperRows) -> None:
 
 
 def draw_battery(robots: dict[str, Robot]) -> Figure:
-    """Fig. 10: cell voltage over load current (a), no-load voltage over discharge (b) with the capacity."""
+    """Fig. 10: cell voltage over load current (a), no-load voltage (b) with the capacity."""
     from mmrjax.model.power import COULOMB_PER_MAH
 
     fig, grid = new_figure(1, 2, 3.7)
@@ -172,7 +172,7 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
         )
     right.text(1.03 * capacity, volts.max(), "beyond: status battery_empty", fontsize=8.5, color=INK, va="top")
     right.set(xlabel="discharge $C_b$ [mAh]", ylabel="no-load cell voltage [V]", xlim=(0, charge[-1]))
-    right.set_title("b) no-load voltage over discharge")
+    right.set_title("b) no-load voltage")
     return fig
 
 

@@ -1,1 +1,1 @@
-"""Points of sweeps: plans and designs, what simulates them, and the store that keeps them."""
+"""Points of sweeps: plans and designs, their simulation, and the store with the results."""

@@ -1,4 +1,4 @@
-"""The design that a configuration states: axes, ranges, distributions and fixed conditions, each checked by name."""
+"""Design of a sweep from its configuration: axes, ranges, distributions and fixed conditions, checked by name."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, Joi
 from sweeps.points.tasks import task_of_configuration
 
 CONFIGURATION, SURFACE = "configuration", "surface"
-#: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone, and on a load on a shaft alone.
+#: Condition of each imposed quantity (`rig.IMPOSED`). Conditions that act only on vehicles, and only on loads on a
+#: shaft.
 AXIS = {name: name for name in IMPOSED}
 ON_GROUND, ON_SHAFT = ("slope_deg", "payload", "total_mass", "adhesion"), ("load_torque",)
-#: Most values of one axis: they are kept in memory, samples are not.
+#: Most values of one axis, which are kept in memory, unlike samples.
 LONGEST = 10_000_000
-#: Most points: beyond it their numbers leave 64 bits.
+#: Most points. The numbers of more points would exceed 64 bits.
 MOST = 2**62
 
 Quantile = Callable[[np.ndarray], np.ndarray]
@@ -46,12 +47,12 @@ class SweepPlan:
 
     Attributes:
         design: the points.
-        axes: unit and limits of each name.
+        axes: unit and limits of each varied name.
         conditions: constant conditions by name, `configuration` as an index.
-        surface: surface of Table 5, which scales the adhesion by configuration, None where adhesion is stated or
+        surface: surface of Table 5, which scales the adhesion of each configuration. None if adhesion is stated or
             varies.
-        data: files of the design, in addition to the configuration.
-        rows: conditions of the runs of a table, among which the axis `ROW` counts.
+        data: input files of the design, in addition to the configuration.
+        rows: conditions of the runs of a table, which the axis `ROW` selects.
     """
 
     design: Design
@@ -63,16 +64,16 @@ class SweepPlan:
 
     @staticmethod
     def of_rows(rows: Conditions, samples: DrawnSamples | None = None) -> SweepPlan:
-        """The runs of a table, of shape (runs,), each combined with every sample."""
+        """Plan with the runs of a table, of shape (runs,), each combined with every sample."""
         return SweepPlan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
 
     def varied(self, robot: Robot) -> variation.Variation:
-        """The robot and the varied parameters and conditions, without the axes that belong to a task."""
+        """Robot with the varied parameters and conditions, without axes that belong to a task."""
         names = variation.variable_names(robot)
         return variation.Variation(robot, tuple(name for name in self.design.names if name in names))
 
     def fixed(self) -> Conditions:
-        """The conditions that do not vary, of shape ()."""
+        """Conditions that do not vary, of shape ()."""
         from mmrjax.model.conditions import Conditions
 
         configuration_index = int(self.conditions.get(CONFIGURATION, 0))
@@ -80,14 +81,14 @@ class SweepPlan:
 
 
 def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
-    """The design of a configuration, checked.
+    """Checks a configuration and returns its plan.
 
     Args:
-        where: its file, for messages.
+        where: name of its file, for messages.
 
     Raises:
-        BadConfiguration: an unknown name, an axis without values, a range upside down, a value out of its bounds, a
-            name stated twice, and the like, one sentence.
+        BadConfiguration: a name is unknown or stated twice, an axis has no values, a range is reversed, a value is
+            out of bounds, or similar.
     """
     data: list[str] = []
     task = task_of_configuration(config, robot)
@@ -134,7 +135,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
 
 
 def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
-    """Reject conditions that do not act on a robot."""
+    """Rejects conditions that do not act on the robot."""
     kinds = {
         "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
         "motor_current": ("motor_current",),
@@ -156,7 +157,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
 
 
 def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
-    """Adhesion of each of the robot's configurations on a surface, as a ratio to the bench's."""
+    """Adhesion of each configuration on a surface, relative to that on the bench."""
     return tuple(adhesion_ratio(surface, float(c.on_tracks) > 0.5) for c in robot.configurations.members)
 
 
@@ -170,7 +171,7 @@ def _known_axis(name: str, robot: Robot, where: str) -> Axis:
 
 
 def _axis_value(name: str, value: Any, where: str) -> float:
-    """A number. Of the battery also true or false."""
+    """A number, for the battery also true or false."""
     return float(value) if name == "battery" and isinstance(value, bool) else stated_number(value, where)
 
 
@@ -310,7 +311,7 @@ def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> JointD
     return posterior
 
 
-#: Numbers that each distribution states.
+#: Keys of each distribution.
 DISTRIBUTIONS: dict[str, Names] = {
     "uniform": ("low", "high"),
     "loguniform": ("low", "high"),
@@ -322,7 +323,7 @@ DISTRIBUTIONS: dict[str, Names] = {
 
 
 def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
-    """The quantile function of a distribution, cut off at the bounds of what is sampled."""
+    """Quantile function of a distribution, truncated at the bounds of the sampled quantity."""
     axis = _known_axis(name, robot, where)
     if name == CONFIGURATION:
         raise BadConfiguration(f"{where}: cannot be sampled; put it under axes or conditions")
@@ -350,7 +351,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
 
 
 def _prior(name: str, robot: Robot) -> Quantile:
-    """The quantile function of a parameter's prior, as in `calibrate` and `sensitivity`."""
+    """Quantile function of a parameter's prior, as in `calibrate` and `sensitivity`."""
     from scipy.special import ndtri
 
     from calibration.inference import priors
@@ -381,7 +382,7 @@ def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float],
             low + np.sqrt(u * (high - low) * (mode - low)),
             high - np.sqrt((1 - u) * (high - low) * (high - mode)),
         )
-    # normal in the value or in its logarithm: of the whole curve, the part between the bounds
+    # normal in the value or its logarithm, truncated at the bounds
     if kind == "normal":
         mean, sd = numbers["mean"], numbers["sd"]
         first, last = (special.ndtr((b - mean) / sd) for b in bounds)

@@ -1,4 +1,4 @@
-"""Climbs as points of a sweep: each one run over an obstacle, or the largest obstacle that it gets over."""
+"""Climbs as points of a sweep: each is a run over an obstacle, or a search for the largest one that is climbed."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from mmrjax.model.signals import CONVERGED, NOT_SETTLED
 from mmrjax.model.signals import FAILED as FAILED_POINT
 from sweeps.config_campaign import SIZE, Obstacle
 
-#: Sizes [mm] between which a search begins, and how near its ends come.
+#: Initial interval of a search, and its final width [mm].
 SOUGHT = {"step": (10.0, 450.0), "stairs": (20.0, 400.0), "gap": (20.0, 800.0)}
 NEAR = 1.0
-#: Voltage where none is stated [V]: slow enough that a robot climbs rather than leaps.
+#: Default voltage [V]: so low that a robot climbs instead of leaping.
 SLOW = 12.0
-#: How many points in one call on a processor and an accelerator; interval of their record [s].
+#: Points per call on a processor and on an accelerator. Interval of their record [s].
 AT_ONCE, SAMPLE = (64, 2048), 0.05
-#: Outputs with units and words, a search has the first two: currents are the largest, places those of the robot's
-#: middle from where the obstacle begins; 0 where nothing is got over.
+#: Outputs with units and descriptions. A search has only the first two, with size 0 if no obstacle is climbed.
+#: Currents are maxima. Positions are of the middle of the robot, from the start of the obstacle.
 VERDICT, LARGEST = "verdict", "largest_mm"
 OUTPUTS: dict[str, tuple[str, str]] = {
     VERDICT: (
@@ -59,7 +59,7 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 }
 
 
-#: Size of each obstacle, which may vary from point to point.
+#: Size of each kind of obstacle, which may vary between points.
 SIZES = {
     kind: Axis(SIZE, "mm", meaning, (1.0, 5000.0), None)
     for kind, meaning in (
@@ -71,7 +71,7 @@ SIZES = {
 
 
 def climb_attributes(obstacle: Obstacle) -> dict[str, Json]:
-    """Outputs that a point has, by name, with their attributes in a store."""
+    """Outputs of a point, by name, with their attributes in a store."""
     names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
     attributes: dict[str, Json] = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
     del attributes[VERDICT]["units"]
@@ -83,11 +83,11 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
     """Further conditions: a low voltage, if a sweep of climbs states none.
 
     Args:
-        varied: what varies or is stated, with its values.
+        varied: varied and stated quantities, with their values.
 
     Raises:
-        BadConfiguration: a robot that cannot climb. No size, or a size and a search. Angles and a sequence of angles.
-            Angles beyond the levers' range or that begin below the ground.
+        BadConfiguration: the robot cannot climb. There is no size, or a size and a search. Angles are stated in
+            addition to a sequence, are beyond the levers' range, or begin below the ground.
     """
     if (why := climb_refusal(robot)) is not None:
         raise BadConfiguration(f"{where}, obstacle: {why}")
@@ -113,7 +113,7 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
 
 
 def climb_refusal(robot: Robot) -> str | None:
-    """Reason why a robot cannot climb, or None."""
+    """Reason why a robot cannot climb. None if it can."""
     if not robot.has_ground:
         return "the robot's load is a shaft; a climb needs a vehicle"
     if robot.rig.imposed != "voltage":
@@ -136,10 +136,10 @@ def compute_climbs(
     """Outputs and status of points, by name.
 
     Args:
-        conditions: what does not vary, of shape (points,).
-        values: values of the variation, a row a point.
-        sizes: sizes of the obstacles [mm]. None: they are searched for, all side by side.
-        told: what share is done.
+        conditions: conditions that do not vary, of shape (points,).
+        values: varied values, one row for each point.
+        sizes: sizes of the obstacles [mm]. None: searches for all points run in parallel.
+        told: callback for the share of the work that is done.
     """
     robot, conditions_there = variation.at(jnp.asarray(values), conditions)
     points = len(values)
@@ -191,7 +191,7 @@ def _lever_sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, p
 
 
 def _until_verdict(found: ClimbRuns) -> Columns:
-    """Numbers of runs until their verdicts."""
+    """Outputs of runs, evaluated until their verdicts."""
     r, during = found.record, found.before_verdict
 
     def most(values: Any) -> np.ndarray:
@@ -214,8 +214,9 @@ def _until_verdict(found: ClimbRuns) -> Columns:
 def _search_all(
     obstacle: Obstacle, points: int, run: Callable[..., ClimbRuns], told: Callable[[float], None]
 ) -> Columns:
-    """Largest sizes that are climbed, by simultaneous bisection for all points, and the result for the next larger
-    size."""
+    """Largest sizes that are climbed, by bisection of all points in parallel, and the result for the next larger
+    size.
+    """
     low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
     climbed, beyond, verdict, sizes = (

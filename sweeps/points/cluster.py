@@ -1,6 +1,6 @@
-"""Chunks of a sweep on the workers of a dask scheduler: one worker a device, lost workers' chunks computed again.
+"""Chunks of a sweep on the workers of a dask scheduler, one worker per device. Chunks of lost workers are recomputed.
 
-Workers send their chunks to the process that was started by hand, which alone writes, so they need no disk in common.
+Workers send their chunks to the process that the user started. Only this process writes, so no shared disk is needed.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from sweeps.points.scale import Job, Produced
 from sweeps.points.zarr_store import identity_differences, installed_versions, module_hashes
 from sweeps.store import PACKAGES
 
-#: Longest wait for a scheduler to answer, and for it to have a worker [s].
+#: Longest wait for an answer of the scheduler, and for its first worker [s].
 ANSWER, WORKER = 4.0, 60.0
-#: How often a chunk is given to another worker before the sweep ends.
+#: Attempts for a chunk on other workers before the sweep ends.
 RETRIES = 5
-#: Chunks that wait at each worker beside the one that it computes.
+#: Chunks that are queued at each worker.
 AHEAD = 1
 GONE = "--scheduler: connection lost; restart the scheduler, and the same command resumes"
 
@@ -56,8 +56,9 @@ class Pool:
         """Yields chunks as workers finish them. If a worker is lost, its chunk is computed again.
 
         Raises:
-            LostWorkers: a chunk's workers were lost too often, none was left for a minute, or the scheduler is gone.
-            BadConfiguration: a worker has another program, or another kind of device.
+            LostWorkers: the workers of a chunk were lost too often, there was no worker for a minute, or the
+                scheduler is gone.
+            BadConfiguration: a worker has other software, or another kind of device.
         """
         from distributed import CancelledError, KilledWorker, TimeoutError, as_completed
 
@@ -77,7 +78,7 @@ class Pool:
             return future
 
         def fill() -> None:
-            """Submit enough work for the present workers. Some may have joined later."""
+            """Submits enough work for the present workers. Some may have joined later."""
             room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
             for chunk in itertools.islice(chunks_left, max(room, 0)):
                 under_way.add(submit(chunk))
@@ -111,14 +112,14 @@ class Pool:
         """Number of workers."""
         try:
             return len(self.client.scheduler_info(n_workers=-1)["workers"])
-        except Exception as error:  # whatever comes of asking one that is no more
+        except Exception as error:  # a scheduler that is gone may raise anything
             raise LostWorkers(GONE) from error
 
     def _next(self, under_way: Any) -> Any:
-        """Next finished future. Waits as long as at least one worker is connected.
+        """Next finished future. Waits while at least one worker is connected.
 
         Raises:
-            TimeoutError: no worker for `WORKER` seconds.
+            TimeoutError: there was no worker for `WORKER` seconds.
             LostWorkers: the scheduler is gone.
         """
         finished: list[Any] = []
@@ -171,7 +172,7 @@ def _pack_job(job: Job) -> bytes:
 
 
 def connect_workers(address: str) -> Pool:
-    """A scheduler's workers, of one program and one kind of device.
+    """Workers of a scheduler, with the same software and kind of device.
 
     Raises:
         BadConfiguration: dask is not installed, nobody answers at the address, there is no worker, or workers differ
@@ -205,7 +206,7 @@ def connect_workers(address: str) -> Pool:
 
 
 def _connect_client(address: str) -> Any:
-    """A client of the scheduler at an address, in `ANSWER` seconds or not at all.
+    """Client of the scheduler at an address. It must answer within `ANSWER` seconds.
 
     dask limits the wait for a connection but not for messages over it, so this waits in a thread.
     """
@@ -217,7 +218,7 @@ def _connect_client(address: str) -> Any:
     def ask() -> None:
         try:
             clients.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
-        except BaseException as error:  # whatever comes of talking to something that is no scheduler
+        except BaseException as error:  # a server that is no scheduler may cause any error
             failed.append(error)
 
     with _silence_dask():
@@ -256,13 +257,13 @@ _compiled: dict[str, Any] = {}
 
 
 def program_identity() -> dict[str, dict[str, str]]:
-    """Hash of each module, and the versions that numbers depend on."""
+    """Hash of each module, and versions of the packages that affect results."""
     return {"code": module_hashes(), "versions": installed_versions(PACKAGES)}
 
 
 @functools.cache
 def _start_worker() -> None:
-    """Prepares a worker process: compiled programs are kept, as in the main process."""
+    """Prepares a worker process: compiled programs are stored, as in the main process."""
     from sweeps import compilation_cache
 
     compilation_cache.keep_programs()
@@ -277,15 +278,15 @@ def introduce_worker() -> tuple[dict[str, dict[str, str]], str]:
 
 
 def compute_on_worker(work: bytes, name: str, chunk: int, expected: Json) -> Columns:
-    """A chunk on this worker's devices. A job is unpacked and compiled once.
+    """Computes a chunk on this worker's devices. A job is unpacked and compiled once.
 
     Args:
         work: the job, packed.
         name: name of the job.
-        expected: program and device of the other workers.
+        expected: software and device of the other workers.
 
     Raises:
-        BadConfiguration: this worker, which has come later than the others, is not like them.
+        BadConfiguration: this worker joined later and differs from the others.
     """
     host, device = introduce_worker()
     differ = identity_differences(expected, {**host, "device": {"device": device}})
@@ -296,7 +297,7 @@ def compute_on_worker(work: bytes, name: str, chunk: int, expected: Json) -> Col
     from mmrjax.compile.precision import double_precision
     from sweeps.points.scale import Compiled, fetch_values
 
-    with _lock, double_precision():  # of a worker that may have other work, in its user's own precision
+    with _lock, double_precision():  # restores the precision of the worker's other jobs
         if name not in _compiled:
             _compiled.clear()
             _compiled[name] = Compiled(pickle.loads(work))

@@ -33,24 +33,25 @@ def sweep(
     model: str = "steady",
     **options: Any,
 ) -> Results:
-    """Simulate every combination of a grid, slope varying fastest. The default is Table 8.
+    """Simulates every combination of a grid. The slope varies fastest. The default is Table 8.
 
     Args:
-        configurations: names, all by default.
-        voltages: [V], or for a rig that imposes it motor_speeds_rpm [rpm] or motor_currents_A [A].
-        payloads: [kg].
-        slopes_deg: [deg].
+        configurations: names. None: all.
+        voltages: voltages [V]. Rigs with another imposed quantity take motor_speeds_rpm [rpm] or motor_currents_A [A]
+            instead.
+        payloads: payloads [kg].
+        slopes_deg: slopes [deg].
         surface: surface of Table 5.
         load_torques: load torques of a load on a shaft [N·m].
         battery: True if the on-board battery feeds the motors.
-        discharge: charge already taken from it [C].
-        model, options: as for `simulate`.
+        discharge: charge drawn from it so far [C].
+        model, options: as in `simulate`.
 
     Returns:
         Results of shape (runs,).
 
     Raises:
-        BadConfiguration: a configuration, axis or surface that the robot does not have.
+        BadConfiguration: the robot lacks a configuration or an axis, or the surface is unknown.
         UsageError: for the same reasons as `simulate`.
     """
     names = (configurations,) if isinstance(configurations, str) else configurations

@@ -1,4 +1,4 @@
-"""The results of a store as one table, CSV or Parquet, written chunk by chunk."""
+"""Results of a store as a CSV or Parquet table, written chunk by chunk."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps.points.zarr_store import STORE, Layout
 
-#: Columns of conditions, as tables of runs and options have them, and the value of a unit of each in that of the
-#: store; what has no such column keeps its name.
+#: Columns of conditions, as in tables of runs and options, and their unit in the unit of the store. Other quantities
+#: keep their names.
 COLUMNS = {c.field: (c.column, 1.0) for c in quantities.SET if c.in_tables and c.field} | {
     "motor_speed": ("motor_speed_rpm", quantities.RPM),
     "motor_current": ("motor_current_A", 1.0),
@@ -26,9 +26,9 @@ COLUMNS = {c.field: (c.column, 1.0) for c in quantities.SET if c.in_tables and c
 
 
 def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
-    """Write `runs.csv` or `runs.parquet` into a finished run folder. Returns its path.
+    """Writes `runs.csv` or `runs.parquet` into a finished run folder. Returns the path.
 
-    A row a point, in the order of the points. Numbers that are not finite become empty cells.
+    One row for each point, in order. Numbers that are not finite become empty cells.
     """
     path = folder / f"runs.{kind}"
     aside = path.with_name(path.name + ".writing")
@@ -41,7 +41,7 @@ def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
 
 
 def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
-    """The points of each chunk as an Arrow table."""
+    """Yields the points of each chunk as an Arrow table."""
     import pyarrow as pa
     import zarr
 

@@ -20,31 +20,31 @@ from sweeps.points import imposed
 
 G = TypeVar("G", bound=GridPart)
 
-#: Option that states an axis.
+#: Option of each axis.
 OPTIONS = {
     "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds",
     "motor_currents_A": "--motor-currents", "payloads_kg": "--payloads",
     "slopes_deg": "--slopes", "surface": "--surface", "load_torques_Nm": "--load-torques",
 }  # fmt: skip
-#: Those that act on a vehicle alone, and on a load on a shaft alone.
+#: Axes that act only on vehicles, and only on loads on a shaft.
 ON_GROUND, ON_SHAFT = ("payloads_kg", "slopes_deg", "surface"), ("load_torques_Nm",)
-#: Axis of what is imposed (`rig.IMPOSED`).
+#: Axis of each imposed quantity (`rig.IMPOSED`).
 AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm", "motor_current": "motor_currents_A"}
 
 
 def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
-    """The grid with every axis of the robot stated.
+    """Grid with values for every axis of the robot.
 
-    The packaged robot takes imposed quantities, payloads and slopes of Table 8. A rig takes thirds of its limit
-    (`sweeps.points.imposed`), no payload and level ground.
+    Defaults for the packaged robot are the imposed quantities, payloads and slopes of Table 8. For a rig they are
+    thirds of its limit (`sweeps.points.imposed`), no payload and level ground.
 
     Args:
-        battery: whether the runs are on the battery, which removes the axis of voltages.
-        notes: receives a sentence on values taken from a rig's limits.
+        battery: True if the runs are on the battery, which removes the axis of voltages.
+        notes: callback for a sentence on values that follow from a rig's limits.
 
     Raises:
-        BadConfiguration: an axis that the robot does not have, an axis neither stated nor given by a limit, or an
-            unknown surface or configuration.
+        BadConfiguration: the robot lacks an axis, an axis is neither stated nor determined by a limit, or a surface
+            or configuration is unknown.
     """
     layout = Layout.of(robot)
     check_axes(config, robot)
@@ -55,20 +55,20 @@ def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str
     elif getattr(config, own_axis) is None:
         update[own_axis] = imposed.imposed_levels(robot, OPTIONS[own_axis], notes)
     if robot.has_ground:
-        table8 = robot.rig.inherits
+        inherits = robot.rig.inherits
         update |= {
-            "payloads_kg": config.payloads_kg or (PAYLOADS_KG if table8 else (0.0,)),
-            "slopes_deg": config.slopes_deg or (SLOPES_DEG if table8 else (0.0,)),
-            "surface": config.surface or (BENCH if table8 else None),
+            "payloads_kg": config.payloads_kg or (PAYLOADS_KG if inherits else (0.0,)),
+            "slopes_deg": config.slopes_deg or (SLOPES_DEG if inherits else (0.0,)),
+            "surface": config.surface or (BENCH if inherits else None),
         }
     return config.model_copy(update=update)
 
 
 def check_axes(config: GridPart, robot: Robot) -> None:
-    """Reject axes that a robot does not have.
+    """Rejects axes that the robot does not have.
 
     Raises:
-        BadConfiguration: such an axis, or a surface not in Table 5 for a robot that takes its surfaces.
+        BadConfiguration: there is such an axis, or a surface is not in Table 5 although the robot uses its surfaces.
     """
     layout = Layout.of(robot)
     for key in AXIS.values():
@@ -84,11 +84,11 @@ def check_axes(config: GridPart, robot: Robot) -> None:
 
 
 def grid_axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:
-    """Values of each axis of a grid by the column of a table, the slope last.
+    """Values of each axis of a grid, by column. The slope is last.
 
     Args:
-        config: as `resolve_grid` makes it.
-        battery: whether the runs are on the battery.
+        config: grid from `resolve_grid`.
+        battery: True if the runs are on the battery.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have.
@@ -103,11 +103,11 @@ def grid_axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str
 
 
 def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
-    """Every combination of the axes as a table of conditions, slope varying fastest.
+    """Every combination of the axes as a table of conditions. The slope varies fastest.
 
     Args:
-        config: as `resolve_grid` makes it, or not yet.
-        battery: whether the runs are on the battery.
+        config: grid, resolved or not.
+        battery: True if the runs are on the battery.
 
     Raises:
         BadConfiguration: for the same reasons as `resolve_grid`.
@@ -122,7 +122,7 @@ def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Ru
 
 
 def grid_configurations(config: GridPart, robot: Robot) -> Names:
-    """Configurations of a grid: the stated ones, or all of the robot's.
+    """Configurations of a grid: the stated ones, or all configurations of the robot.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have.

@@ -1,4 +1,4 @@
-"""Default of the quantity imposed on a rig's motors: shares of the limit in its file."""
+"""Default values of the quantity imposed on a rig's motors: shares of the limit in its file."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import NO_BRAKE, Robot, turn_error
 from sweeps import capabilities
 
-#: A limit from which on there is none (`robots.blank`).
+#: A limit of this size means no limit (`robots.blank`).
 UNLIMITED = 1e8
-#: Supply voltage of one run where none is stated [V], the highest of Table 8.
+#: Default supply voltage of a single run [V], the highest of Table 8.
 VOLTAGE = 33.0
 #: Levels of a grid, as shares of the limit.
 SHARES = (1 / 3, 2 / 3, 1.0)
@@ -26,8 +26,9 @@ SHARES = (1 / 3, 2 / 3, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class ImposedWords:
-    """Description of an imposed quantity: words, unit, the parameter that limits it, and example options for one run
-    and for a grid."""
+    """Description of an imposed quantity: name in words, unit, limiting parameter, and example options for one run
+    and for a grid.
+    """
 
     words: str
     unit: str
@@ -44,7 +45,7 @@ SAID = {
 
 
 def imposed_limit(robot: Robot) -> float | None:
-    """Largest value to impose: supply voltage [V] or motor speed [rpm]. None: not stated, as for a current."""
+    """Largest imposed value: supply voltage [V] or motor speed [rpm]. None if not stated, as for currents."""
     if robot.rig.imposed == "motor_current":
         return None
     if robot.rig.imposed == "voltage":
@@ -54,18 +55,18 @@ def imposed_limit(robot: Robot) -> float | None:
 
 
 def _digits(value: float) -> float:
-    """Two significant digits, downward."""
+    """Rounded down to two significant digits."""
     size = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(np.round(math.floor(value / size + 1e-9) * size, 9))
 
 
 def imposed_default(robot: Robot, option: str) -> float:
-    """Default of the imposed quantity of a single run: the limit. For the paper's robot `VOLTAGE`.
+    """Default imposed value of a single run: the limit, or `VOLTAGE` for the paper's robot.
 
     Raises:
-        BadConfiguration: the file states none.
+        BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).table8:
+    if Layout.of(robot).uses_paper_conditions:
         return VOLTAGE
     most = imposed_limit(robot)
     if most is None:
@@ -74,7 +75,7 @@ def imposed_default(robot: Robot, option: str) -> float:
 
 
 def imposed_example(robot: Robot) -> float:
-    """Imposed value of an example, `imposed_default` if the file states a limit [V, rpm]."""
+    """Imposed value for an example [V, rpm]: `imposed_default` if the file states a limit."""
     try:
         return imposed_default(robot, "")
     except BadConfiguration:
@@ -82,15 +83,15 @@ def imposed_example(robot: Robot) -> float:
 
 
 def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
-    """Default of the imposed quantity of a grid: a third, two thirds and all of the limit, or Table 8's.
+    """Default imposed values of a grid: one third, two thirds and all of the limit, or those of Table 8.
 
     Args:
-        notes: receives a sentence that states these values.
+        notes: callback for a sentence with these values.
 
     Raises:
-        BadConfiguration: the file states none.
+        BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).table8:
+    if Layout.of(robot).uses_paper_conditions:
         return VOLTAGES_V
     most = imposed_limit(robot)
     if most is None:
@@ -110,7 +111,7 @@ def _robot_phrase(robot: Robot) -> str:
 
 def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
     unit = SAID[robot.rig.imposed].unit
-    if robot.rig.imposed == "motor_current":  # which no file limits
+    if robot.rig.imposed == "motor_current":  # not limited by files
         return f"{option}: not given; give it [{unit}], such as {option} {example}"
     return (
         f"{option}: not given, and the robot's file has no motor.{_robot_phrase(robot)}; "
@@ -120,7 +121,7 @@ def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
 
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
-    """Reason why an option is rejected for a quantity that is not imposed."""
+    """Reason for rejecting an option for a quantity that is not imposed."""
     reason = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
         return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
@@ -128,13 +129,13 @@ def option_refusal(robot: Robot, option: str, instead: str) -> str:
 
 
 def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] = ()) -> None:
-    """Reject conditions of the ground for a load that has none, and those of a load on a shaft for a vehicle.
+    """Rejects ground conditions for a load without ground, and shaft conditions for a vehicle.
 
     Args:
-        ground, shaft: options or places that state one.
+        ground, shaft: options or places in a file that state such conditions.
 
     Raises:
-        BadConfiguration: the first of them.
+        BadConfiguration: there is one.
     """
     for option in shaft if robot.has_ground else ground:
         why = "the robot's load is a shaft, on which slope, payload, mass and surface have no effect; remove it"
@@ -142,22 +143,22 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
 
 
 def check_battery(robot: Robot) -> None:
-    """Reject a battery that the file of a rig does not state.
+    """Rejects use of the battery if the rig file does not state one.
 
     Raises:
-        BadConfiguration: its speed is imposed, or its file states no battery.
+        BadConfiguration: the motor speed is imposed, or the file states no battery.
     """
     if robot.rig.imposed != "voltage":
         imposed_words = SAID[robot.rig.imposed].words
         raise BadConfiguration(
-            f"--battery: the {imposed_words} is imposed on this robot, whatever the supply; remove it"
+            f"--battery: the {imposed_words} is imposed on this robot, regardless of the supply; remove --battery"
         )
     if not capabilities.has_battery(robot):
         raise BadConfiguration("--battery: the robot's file has no battery; add [battery], or give --voltage")
 
 
 def check_on_ground(robot: Robot, command: str) -> None:
-    """Reject a command of the running gear for a load that has none.
+    """Rejects a command about running gear for a load without it.
 
     Raises:
         BadConfiguration: the load is a shaft.
@@ -170,17 +171,17 @@ def check_on_ground(robot: Robot, command: str) -> None:
 
 
 def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
-    """Reject a robot that cannot turn in some of these configurations.
+    """Rejects a robot that cannot turn in one of these configurations.
 
     Raises:
-        BadConfiguration: opens with `where`, and says why.
+        BadConfiguration: it cannot turn. The message begins with `where` and gives the reason.
     """
     if why := turn_error(robot, names):
         raise BadConfiguration(f"{where}: {why}")
 
 
 def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
-    """Reject conditions that free a robot to turn which cannot, or that leave open what drives a side.
+    """Rejects conditions of a turn if the robot cannot turn, or if the drive of a side is not stated.
 
     Args:
         stated: names of conditions.

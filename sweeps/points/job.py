@@ -1,4 +1,6 @@
-"""Job of a plan: the computation at each point, checked before the first is simulated, and its layout in a store."""
+"""Job of a plan: the computation at each point, checked before the first one is simulated, and the layout of its
+store.
+"""
 
 from __future__ import annotations
 
@@ -26,20 +28,20 @@ from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import Task, task_of_configuration
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
 
-#: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
+#: Number of points that the fidelity checks before the first one is simulated.
 ASKED = 48
 
 
 def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
-    """The robot, with instruments for both sides and for yaw if conditions of these names let it turn."""
+    """Robot with instruments for both sides and yaw, if conditions of these names let it turn."""
     return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
 
 def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str) -> scale.Job:
-    """The job of a resolved configuration.
+    """Job of a resolved configuration.
 
     Raises:
-        BadConfiguration: an output that the fidelity does not have, or a point that it cannot bear.
+        BadConfiguration: the fidelity lacks an output, or cannot simulate a point.
     """
     profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
     repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
@@ -65,12 +67,12 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
 
 
 def _profile(name: str, robot: Robot, plan: axes.SweepPlan, where: str) -> Profile:
-    """The profile that every point follows.
+    """Profile that every point follows.
 
     Raises:
         BadData: for the same reasons as `profiles.read_profile`.
-        BadConfiguration: it states what the plan states too, a supply voltage where a point is on the battery, or
-            surfaces.
+        BadConfiguration: it states a condition of the plan, surfaces, or a supply voltage although a point is on the
+            battery.
     """
     source = profiles.read_profile(name)
     for note in source.notes:
@@ -86,9 +88,7 @@ def _profile(name: str, robot: Robot, plan: axes.SweepPlan, where: str) -> Profi
         )
     for field in source.values:
         if field in (*plan.conditions, *plan.design.names):
-            raise BadConfiguration(
-                f"{where}, {field}: got it in addition to {source.source}, which contains it; keep one of the two"
-            )
+            raise BadConfiguration(f"{where}, {field}: {source.source} contains it too; keep one of the two")
     on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
     source.check_supply(bool(on_battery))
     return source.profile(robot, plan.fixed())
@@ -98,7 +98,7 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
     """Lets the fidelity check points spread over the design, including its corners.
 
     Raises:
-        BadConfiguration: a point that the fidelity refuses.
+        BadConfiguration: the fidelity rejects a point.
     """
     fidelity = fidelities.get_fidelity(task.model)
     shape = plan.design.shape
@@ -116,7 +116,7 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
 
 
 def store_layout(config: Campaign, job: scale.Job) -> Layout:
-    """Arrays of the store of a job, with units and long names."""
+    """Arrays in the store of a job, with units and long names."""
     variables = [
         Variable(name, scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
         for name in job.outputs
@@ -135,5 +135,5 @@ def store_layout(config: Campaign, job: scale.Job) -> Layout:
 
 
 def _store_attributes(about: Json) -> Json:
-    """Attributes in the form of a store, with the unit 1 for a quantity without unit."""
+    """Attributes as in a store, with unit 1 for quantities without unit."""
     return {**about, "units": "1"} if about.get("units") in ("-", "") else about

@@ -1,4 +1,4 @@
-"""The runs of a table as a sweep, and the table of what came out."""
+"""Simulation of the runs of a table as a sweep, and the table of results."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ from sweeps.store import Page, RunFolder, finish_run_folder
 
 Table = Columns
 
-#: Steps of `compare` in place of each step of a fit.
+#: Number of steps of `compare` for each step of a fit.
 PARTS = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
-    """Result of a command that simulates. All its files are written from it.
+    """Result of a command that simulates, from which all its files are written.
 
     Attributes:
-        command: command that simulated.
+        command: name of the command.
         model: fidelity.
         robot: robot that was simulated.
         runs: runs that were simulated.
-        table: conditions and results, by column as in `runs.csv`.
+        table: conditions and results by column, as in `runs.csv`.
         further: further entries of `result.json`.
     """
 
@@ -65,7 +65,7 @@ class SimulationResult:
 
     @property
     def statuses(self) -> dict[str, int]:
-        """Number of runs by status. Every status is included."""
+        """Number of runs with each status, zeros included."""
         return {status: int(np.sum(self.table["status"] == status)) for status in STATUSES}
 
     @property
@@ -86,16 +86,16 @@ class SimulationResult:
 
 
 def ending_columns(robot: Robot, batch: RunBatch) -> Columns:
-    """Columns with the results at the end of a batch of runs, including those specific to the fidelity."""
+    """Columns with results at the end of a batch of runs, including those specific to the fidelity."""
     result, further = jax.device_get((batch.result, batch.columns))
     return outputs.output_columns(result, robot.channels, further)
 
 
 def check_runs_bearable(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
-    """Reject options that do not suit every run, before the first run is simulated.
+    """Rejects options that do not suit every run, before the first run is simulated.
 
     Raises:
-        BadConfiguration: no whole number of steps, a step too large for the stiffness, and the like.
+        BadConfiguration: the number of steps is not whole, a step is too large for the stiffness, or similar.
     """
     try:
         fidelities.get_fidelity(config.model).check(robot, conditions, config.options)
@@ -104,7 +104,7 @@ def check_runs_bearable(robot: Robot, conditions: Conditions, config: FidelityPa
 
 
 def conditions_of_runs(robot: Robot, runs: Runs, config: Part) -> Conditions:
-    """The conditions of the runs, with the supply of the configuration, by default the external one."""
+    """Conditions of the runs, with the supply of the configuration, by default the external one."""
     if not isinstance(config, SupplyPart):
         return runs.conditions(robot)
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
@@ -117,11 +117,11 @@ def compute_chunks(
     advance: Callable[[float], None],
     kept: Callable[[Table], Table] = dict,
 ) -> Table:
-    """Kept outputs of all chunks of a job, in order.
+    """Outputs of all chunks of a job, in order.
 
     Args:
-        folder: holds chunks under this name. Chunks left by an interrupted command are not computed again.
-        kept: selects from the outputs of a chunk, by default all: in the units of tables, shape (points,).
+        folder: folder and name for the chunks. Chunks from an interrupted command are not computed again.
+        kept: function that selects outputs of a chunk, in the units of tables, shape (points,). Default: all.
     """
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
@@ -146,7 +146,7 @@ def job_of_run_table(robot: Robot, runs: Runs, config: FidelityPart, samples: Dr
     """Job for every output of the runs of a table, each combined with every sample if there are samples.
 
     Raises:
-        BadConfiguration: a run that the fidelity could not bear.
+        BadConfiguration: the fidelity cannot simulate a run.
     """
     rows = conditions_of_runs(robot, runs, config)
     check_runs_bearable(robot, rows, config)
@@ -165,13 +165,13 @@ def evaluate_runs(
     folder: RunFolder | None,
     advance: Callable[[float], None] | None = None,
 ) -> Columns:
-    """Simulate every run and return the table of conditions and outcomes.
+    """Simulates every run and returns the table of conditions and results.
 
-    Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
+    Chunks in the folder, from an interrupted run with the same configuration, are not simulated again.
 
     Args:
-        advance: called with the number of runs done since its last call. Of a chunk under way, its share. None:
-            a bar on stderr where it takes long.
+        advance: callback with the number of runs since its last call, including shares of chunks in progress. None: a
+            progress bar on stderr for long simulations.
     """
     job = job_of_run_table(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
@@ -188,16 +188,16 @@ def evaluate_runs(
 
 
 def simulate_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
-    """Conditions and simulated outputs at every row of a table of time histories.
+    """Conditions and simulated outputs for every row of a table of time histories.
 
-    Its steps are finer than those of fits, which use the grid up to thousands of times.
+    Its steps are finer than in fits, which simulate up to thousands of times.
 
     Args:
         robot: prepared for the table.
         model: requested fidelity. None: the fidelity for histories.
 
     Raises:
-        BadConfiguration: a fidelity that cannot follow them.
+        BadConfiguration: the fidelity cannot simulate time histories.
     """
     histories = jax.device_get(
         _observe(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
@@ -212,7 +212,7 @@ def _observe(observe: observers.Observer, robot: Robot) -> Observation:
 
 
 def condition_table(robot: Robot, runs: Runs) -> Columns:
-    """The condition columns of a table, with the robot's total mass if the table has none."""
+    """Condition columns of a table, with the robot's total mass if the table has none."""
     columns = dict(runs.columns)
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
         own_mass = np.array([float(chassis.mass) for chassis in robot.configurations.members])
@@ -222,7 +222,7 @@ def condition_table(robot: Robot, runs: Runs) -> Columns:
 
 
 def run_names(runs: Runs) -> np.ndarray:
-    """Names of runs: those of their table, or else by number."""
+    """Names of runs: those of their table, otherwise numbers."""
     return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
 
 
@@ -232,7 +232,7 @@ def write_run_folder(
     result: SimulationResult,
     page: Page,
 ) -> int:
-    """Write the files common to all simulating commands, and move the folder into place. Returns the exit code.
+    """Writes the files common to all simulating commands, and moves the folder into place. Returns the exit code.
 
     Args:
         folder: folder of the command.

@@ -1,6 +1,6 @@
-"""The points of a sweep: axes of a grid crossed with a sampled design, each point known from its number alone.
+"""Points of a sweep: axes of a grid crossed with a sampled design. Each point is a function of its number.
 
-Nothing here depends on chunks, devices or jax: point k of a design is a function of the seed and of k, in NumPy.
+Nothing here depends on chunks, devices or JAX: NumPy computes point k from the seed and k.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from jaxtyping import Float, Int, UInt64
 
 from calibration.data import Columns, Names
 
-#: Dimension of the sampled points in a store.
+#: Name of the sampled dimension in a store.
 SAMPLE = "sample"
-#: The axis along which the runs of a table are counted.
+#: Axis with the number of a table's run.
 ROW = "run"
 
 
 class JointDistribution(Protocol):
-    """Several quantities that are sampled together, from as many independent normal scores as it has coordinates."""
+    """Several quantities that are sampled together, from one independent normal score for each coordinate."""
 
     @property
     def names(self) -> Names:
@@ -42,10 +42,10 @@ class JointDistribution(Protocol):
         ...
 
 
-#: Points that a distribution computes together: with jax each number of them is compiled, and a sum over coordinates
-#: may depend on it.
+#: Number of points that a distribution computes together. JAX compiles a program for each number, and sums over
+#: coordinates may depend on it.
 TOGETHER = 4096
-#: Points that a thread makes at once, a multiple of these.
+#: Number of points that a thread computes at once is a multiple of this.
 PART = 16 * TOGETHER
 
 
@@ -56,10 +56,10 @@ class Samples:
     Attributes:
         design: one of `DESIGNS`.
         number: number of points.
-        seed: seed of everything random.
+        seed: random seed.
         marginals: quantile function of each name, from (0, 1) to its unit.
-        names: theirs.
-        joint: further names that are sampled together, a posterior. They take the design's last dimensions.
+        names: names of `marginals`.
+        joint: posterior of further names that are sampled together. It uses the last dimensions of the design.
     """
 
     design: str
@@ -74,7 +74,9 @@ class Samples:
         return (*self.marginals, *(self.joint.names if self.joint is not None else ()))
 
     def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
-        """Values of `count` points from number `first` on, a row a name. Many are made on all processors."""
+        """Values of `count` points from number `first` on, one row for each name. Many points are computed on all
+        processors.
+        """
         if count <= PART:
             return self._values(first, count)
         starts = range(first - first % PART, first + count, PART)
@@ -100,8 +102,8 @@ class DrawnSamples:
     """Sampled points that are already available.
 
     Attributes:
-        names: what is sampled.
-        table: its values, a row a name.
+        names: sampled names.
+        table: their values, one row for each name.
     """
 
     names: Names
@@ -113,7 +115,7 @@ class DrawnSamples:
         return self.table.shape[1]
 
     def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
-        """Values of `count` points from number `first` on, a row a name."""
+        """Values of `count` points from number `first` on, one row for each name."""
         return self.table[:, first : first + count]
 
 
@@ -121,7 +123,7 @@ def in_blocks(
     values: Callable[[Any], Any],
     normal_scores: Float[np.ndarray, "points coordinates"],
 ) -> Float[np.ndarray, "points names"]:
-    """Values of a JAX function at many points, computed on the CPU whatever device the sweep uses."""
+    """Values of a JAX function at many points, computed on the CPU regardless of the sweep's device."""
     import jax
 
     points = len(normal_scores)
@@ -134,10 +136,10 @@ def in_blocks(
 
 @dataclasses.dataclass(frozen=True)
 class Design:
-    """Every combination of the axes' values, each crossed with every sampled point.
+    """Every combination of the axes' values, combined with every sampled point.
 
     Attributes:
-        axes: values of each name, in order. The last varies fastest, the samples faster still.
+        axes: values of each name, in order. The last axis varies fastest, and samples even faster.
         samples: None for a plain grid.
     """
 
@@ -164,8 +166,10 @@ class Design:
         """Number of points."""
         return math.prod(self.shape)
 
-    def block(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
-        """Values of the points of a box, a row a point, in the order of `names`. Laid out a column a name."""
+    def values_in_slices(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
+        """Values of the points in a box, one row for each point, in the order of `names`. Columns are contiguous in
+        memory.
+        """
         sizes = tuple(b.stop - b.start for b in box)
         values = np.empty((len(self.names), *sizes))
         for k, axis in enumerate(self.axes.values()):
@@ -178,18 +182,20 @@ class Design:
         return values.reshape(len(self.names), -1).T
 
     def at(self, numbers: Int[np.ndarray, " points"]) -> Float[np.ndarray, "points names"]:
-        """Values of single points by their number, the last dimension fastest, for few points."""
+        """Values of a few points by their numbers. The last dimension varies fastest."""
         places = np.array(np.unravel_index(np.asarray(numbers), self.shape)).T
-        return np.concatenate([self.block(tuple(slice(i, i + 1) for i in map(int, place))) for place in places])
+        return np.concatenate(
+            [self.values_in_slices(tuple(slice(i, i + 1) for i in map(int, place))) for place in places]
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """The chunks of a sweep: equal boxes of consecutive points, those at the end of the split axis smaller.
+    """Chunks of a sweep: equal boxes of consecutive points. Boxes at the end of the split axis may be smaller.
 
     Attributes:
         shape: shape of all points.
-        size: size of one box, 1 along the axes before the split one and whole along those after.
+        size: size of one box: 1 along axes before the split one, the whole length along axes after it.
     """
 
     shape: tuple[int, ...]
@@ -210,12 +216,12 @@ class Blocks:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Boxes along each axis."""
+        """Number of boxes along each axis."""
         return tuple(math.ceil(n / s) for n, s in zip(self.shape, self.size, strict=True))
 
     @property
     def points(self) -> int:
-        """Points of a full box."""
+        """Number of points in a full box."""
         return math.prod(self.size)
 
     def __len__(self) -> int:
@@ -230,29 +236,30 @@ class Blocks:
         return tuple(reversed(place))
 
     def box(self, number: int) -> tuple[slice, ...]:
-        """The points of a chunk along each axis."""
+        """Range of a chunk along each axis."""
         places = zip(self.place(number), self.size, self.shape, strict=True)
         return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in places)
 
     def count(self, number: int) -> int:
-        """Points of a chunk."""
+        """Number of points in a chunk."""
         return math.prod(b.stop - b.start for b in self.box(number))
 
 
-# --- designs: (seed, number of points, dimensions, first, count) to numbers in (0, 1), shape (dimensions, count) ----
+# --- designs: functions of (seed, number of points, dimensions, first, count) with values in (0, 1), (dimensions,
+# count) ----
 
 Unit = Float[np.ndarray, "dimensions points"]
 
 
 def _random_key(seed: int, dimension: int, use: str) -> int:
-    """128 bits that are unique to a dimension and a use of a seed."""
+    """128-bit key that is unique to a seed, a dimension and a use."""
     return int.from_bytes(hashlib.blake2b(f"{seed} {dimension} {use}".encode(), digest_size=16).digest(), "little")
 
 
 def philox_uniform(key: int, first: int, count: int) -> Float[np.ndarray, " points"]:
-    """Numbers in (0, 1) of a counter-based generator (Philox 4 x 64, Salmon et al. 2011), from number `first` on."""
+    """Numbers in (0, 1) from a counter-based generator (Philox 4 x 64, Salmon et al. 2011), from `first` on."""
     generator = np.random.Philox(key=key)
-    generator.advance(first // 4)  # each step of its counter gives four words
+    generator.advance(first // 4)  # each counter value gives four words
     words = generator.random_raw(first % 4 + count)[first % 4 :]
     return ((words >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
 
@@ -263,9 +270,9 @@ def random_points(seed: int, number: int, dimensions: int, first: int, count: in
 
 
 def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
-    """Latin hypercube: one point in each of `number` equal slices of every dimension (McKay et al. 1979).
+    """Latin hypercube: one point in each of `number` equal slices of each dimension (McKay et al. 1979).
 
-    The slice of point k is a keyed permutation of k, so that no point needs the others.
+    The slice of point k is a keyed permutation of k, so points are independent of one another.
     """
     unit = np.empty((dimensions, count))
     for d in range(dimensions):
@@ -276,17 +283,18 @@ def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: 
     return np.clip(unit, 2.0**-54, 1 - 2.0**-53)
 
 
-#: Rounds of the network that permutes; four are what Luby and Rackoff (1988) need, the rest for weak round functions.
+#: Rounds of the Feistel network. Luby and Rackoff (1988) need four. The others make up for weak round functions.
 ROUNDS = 8
-#: Points that are permuted together: what is worked on stays in the processor's cache, and threads seldom meet.
+#: Points that are permuted together, so few that they stay in the processor's cache.
 CACHED = 65_536
 
 
 def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:
-    """A keyed pseudo-random permutation of 0 .. number - 1 at some points.
+    """Keyed pseudo-random permutation of 0 .. number - 1, evaluated at some points.
 
-    A Feistel network on a x b >= number with additions modulo a and b in turn (Black and Rogaway 2002, FE2-like).
-    What falls outside walks the cycle until it is inside, which less than 2 / sqrt(number) of the points do.
+    Feistel network on a x b >= number with alternate additions modulo a and b (Black and Rogaway 2002, similar to
+    FE2). Results outside the range are permuted again until they are inside: fewer than 2 / sqrt(number) of the
+    points.
     """
     if number == 1:
         return np.zeros_like(points)
@@ -314,19 +322,19 @@ Words = UInt64[np.ndarray, " n"]
 
 
 def _add_modulo(x: Words, word: Words, most: np.uint64, scratch: Words) -> None:
-    """x = x + r modulo `most` (below 2^32), r being what the upper half of a word is of 0 .. most - 1."""
+    """x = x + r modulo `most` (below 2^32). r scales the upper half of a word to 0 .. most - 1."""
     word >>= np.uint64(32)
     word *= most
     word >>= np.uint64(32)
     x += word
     np.subtract(x, most, out=scratch)
-    np.minimum(x, scratch, out=x)  # below 0 it wraps round to what is larger
+    np.minimum(x, scratch, out=x)  # a negative difference wraps to a larger number
 
 
 def _mix_words(words: Words, key: np.uint64, x: Words, scratch: Words) -> Words:
-    """The finaliser of splitmix64 (Steele et al. 2014) on words and a key, in x.
+    """Finaliser of splitmix64 (Steele et al. 2014) for words and a key, stored in x.
 
-    In place throughout: memory that each thread asks for anew keeps the others waiting.
+    All operations are in place, because threads that allocate memory delay each other.
     """
     with np.errstate(over="ignore"):
         np.multiply(words, np.uint64(0x9E3779B97F4A7C15), out=x)
@@ -340,26 +348,27 @@ def _mix_words(words: Words, key: np.uint64, x: Words, scratch: Words) -> Words:
     return x
 
 
-#: Bits of a Sobol number, which a double holds beside the half that keeps it off 0.
+#: Bits of a Sobol number. A double has room for them and for the half that keeps it above 0.
 BITS = 52
-_LOW = 12  # bits of a point's number whose part is tabulated
+_LOW = 12  # low bits of a point's number, tabulated
 
 
 def sobol(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
-    """The scrambled Sobol sequence as `scipy.stats.qmc.Sobol` gives it (Joe and Kuo 2008), point by point.
+    """Scrambled Sobol sequence, equal to that of `scipy.stats.qmc.Sobol` (Joe and Kuo 2008), computed point by point.
 
-    The sequence without its first points is reached at once: point k is the sum modulo 2 of those direction numbers
-    that the Gray code of k has. Balanced where the number of points is a power of 2.
+    It can start at any point: point k is the sum modulo 2 of the direction numbers in the Gray code of k. It is
+    balanced if the number of points is a power of 2.
     """
     directions, shift = _directions(seed, dimensions)
-    table = np.zeros((dimensions, 1), np.uint64)  # of k = 0 .. 2^LOW - 1, in the order of Gray codes
+    table = np.zeros((dimensions, 1), np.uint64)  # for k = 0 .. 2^LOW - 1, in the order of Gray codes
     for bit in range(_LOW):
         table = np.concatenate([table, table[:, ::-1] ^ directions[:, bit : bit + 1]], axis=1)
     unit = np.empty((dimensions, count))
     size = 1 << _LOW
     for block in range(first >> _LOW, ((first + count - 1) >> _LOW) + 1):
         begin, end = max(first, block * size), min(first + count, (block + 1) * size)
-        # Gray code of block * 2^LOW + i is gray(i), its top bit turned over where the block is odd, and gray(block).
+        # The Gray code of block * 2^LOW + i is gray(block), then gray(i) with its top bit inverted if the block is
+        # odd.
         gray, high = block ^ (block >> 1), shift.copy()
         for bit in range(gray.bit_length()):
             if gray >> bit & 1:
@@ -377,7 +386,7 @@ def _directions(seed: int, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dimensions, scramble=True, bits=BITS, rng=np.random.default_rng(seed))
-    # SciPy keeps them to itself; a test compares with the points that it publishes.
+    # Private in SciPy. A test compares with its public points.
     return np.asarray(engine._sv, np.uint64), np.asarray(engine._shift, np.uint64)
 
 

@@ -1,7 +1,7 @@
-"""The engine of every sweep: chunks of one compiled shape over all local devices, kept while the next is computed.
+"""Engine of all sweeps: chunks of one compiled shape on all local devices, each stored while the next is computed.
 
-A grid, a plan, the rows of a table and draws of a posterior are designs of points. A Zarr store and the chunks of a
-run folder keep what comes out.
+A grid, a plan, the rows of a table and draws of a posterior are designs of points. Results are stored in a Zarr store
+or as chunks of a run folder.
 """
 
 from __future__ import annotations
@@ -38,13 +38,14 @@ from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import Task
 
 POINTS = "points"
-#: Chunks of more points on a device are filled up to a multiple, so that designs of all sizes share few programs.
+#: Chunks with more points per device are padded to a multiple of this, so that designs of all sizes share few
+#: programs.
 SHARED = 16_384
-#: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
+#: Chunks that may be queued for writing.
 WAITING = 1
-#: Time after an interrupt to write chunks that have been computed, for each of two steps [s].
+#: Time after an interrupt for writing computed chunks, in each of two steps [s].
 LAST = 2.5
-#: Types in which outputs that are no numbers are stored.
+#: Types of stored outputs that are not numbers.
 KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
 
@@ -54,9 +55,9 @@ class Job:
 
     Attributes:
         robot: robot that is varied.
-        task: what every point does.
-        outputs: names.
-        storage: type that they are stored in.
+        task: computation at each point.
+        outputs: names of the outputs.
+        storage: data type of stored outputs.
         profile: profile that every point follows, if any.
     """
 
@@ -71,8 +72,9 @@ class Job:
 
 @dataclasses.dataclass
 class Times:
-    """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is all of
-    computing). Waiting for what is computed, fetching it from the device, writing it, and the whole."""
+    """Durations of overlapping steps [s]: waiting for points, starting the computation (on CPUs the whole of it),
+    waiting for results, fetching them from the device, writing them, and the total.
+    """
 
     points: float = 0.0
     start: float = 0.0
@@ -89,20 +91,20 @@ def device_kind() -> str:
 
 
 def default_chunk(task: Task, device: str | None = None) -> int:
-    """Default number of points of a chunk, over all local devices or, with `device`, on one remote device."""
+    """Default number of points in a chunk, on all local devices or, with `device`, on one remote device."""
     count = len(jax.local_devices()) if device is None else 1
     accelerator = not (device or device_kind()).startswith("cpu")
     return task.at_once[accelerator] * count
 
 
 class Compiled:
-    """A job on the local devices: a program for chunks of one shape, split among the devices along the points."""
+    """A job on the local devices: a program for chunks of one shape, whose points are split among the devices."""
 
     def __init__(self, job: Job, devices: list[Any] | None = None) -> None:
         self.job = job
         devices = jax.local_devices() if devices is None else devices
         self.mesh = Mesh(np.array(devices), (POINTS,))
-        # Every device has the same number of points; the last ones stand for the chunk's last point again.
+        # Every device has the same number of points: the chunk's last point is repeated.
         share = -(-job.blocks.points // len(devices))
         share = share if job.task.run is not None else fidelities.fidelity_facts(job.task.model).filled(share)
         share = share if share < SHARED else -(-share // SHARED) * SHARED
@@ -118,14 +120,14 @@ class Compiled:
             job.task.model, tuple(job.task.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs),
             job.storage, surface,
         )  # fmt: skip
-        # What takes long in one call is run in parts, between which it says how far it is and can be interrupted.
+        # Long computations run in parts. Between parts they report progress and can be interrupted.
         is_split = len(devices) > 1 or self._variation.varies_robot
         self.in_parts = job.task.slow and (job.task.run is not None or not is_split)
         self._program = _one_device_kept if len(devices) == 1 else eqx.filter_jit(_split_among(self.mesh))
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
-        """Values of a chunk's points, the last ones repeated up to the compiled shape."""
-        values = self.job.plan.design.block(self.job.blocks.box(chunk))
+        """Values of a chunk's points, padded with the last one to the compiled shape."""
+        values = self.job.plan.design.values_in_slices(self.job.blocks.box(chunk))
         if len(values) == self.size:
             return values
         return values[np.minimum(np.arange(self.size), len(values) - 1)]
@@ -133,10 +135,10 @@ class Compiled:
     def __call__(
         self, values: Float[np.ndarray, "points names"], told: Callable[[float], None] | None = None
     ) -> dict[str, Array]:
-        """Start computing. Returns arrays of the compiled shape that may not be there yet.
+        """Starts the computation. Returns arrays of the compiled shape, which may still be in progress.
 
         Args:
-            told: called with the share that is done, where `in_parts`.
+            told: callback for the share that is done, if `in_parts`.
         """
         conditions, rows = self._fixed, self.job.plan.rows
         if rows is not None:
@@ -156,18 +158,18 @@ class Compiled:
         return values_by_name
 
     def _run(self, variation: Variation, conditions: Conditions, values: Array, _: Any, told: Advance) -> Any:
-        """A run of the fidelity."""
+        """Runs the fidelity."""
         robot, conditions = variation.at(values, conditions)
         run = fidelities.get_fidelity(self.job.task.model).run(robot, conditions, self.job.task.options, told)
         return pick_outputs(run, robot.channels, self.job.outputs)
 
 
 class _AskedOutputs(NamedTuple):
-    """Outputs of each point by a fidelity with its options, and their form in the store.
+    """Outputs of a fidelity with its options at each point, and their form in the store.
 
     Attributes:
-        factors: factors of each output, the SI value of its unit in tables.
-        surface: adhesion of each configuration as a ratio to the bench's.
+        factors: SI value of each output's unit in tables.
+        surface: adhesion of each configuration relative to that on the bench.
     """
 
     model: str
@@ -184,7 +186,7 @@ def _wide(conditions: Conditions, points: int) -> Conditions:
 def _on_surface(
     variation: Variation, conditions: Conditions, values: Array, surface: tuple[float, ...] | None
 ) -> Conditions:
-    """Conditions of points with the adhesion of their configurations on a surface, if one is stated."""
+    """Conditions of points, with the adhesion of their configurations on the stated surface, if any."""
     if surface is None:
         return conditions
     _, conditions_there = variation.at(values, conditions)
@@ -195,7 +197,7 @@ def _on_surface(
 def _one_device(
     variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
 ) -> dict[str, Array]:
-    """Outputs of points as they are stored."""
+    """Outputs of points in stored form."""
     conditions = _on_surface(variation, conditions, values, asked.surface)
     names = tuple(name for name, _ in asked.factors)
     values_by_name = evaluate_points(variation, asked.model, values, conditions, dict(asked.options), names, profile)
@@ -206,14 +208,14 @@ _one_device_kept = compiled(_one_device)
 
 
 def _stored(found: Mapping[str, Array], asked: _AskedOutputs) -> dict[str, Array]:
-    """Outputs in the units of tables and in the stored type. Those in `KINDS` keep their own type."""
+    """Outputs in the units of tables and in the stored type. Outputs in `KINDS` have their own type."""
     stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n not in KINDS}
     unconverted_names = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
     return {**stored, **{n: found[n].astype(KINDS[n]) for n in unconverted_names}}
 
 
 def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
-    """`_one_device` on each of several, its share of the points each."""
+    """`_one_device` on several devices, each with its share of the points."""
 
     def program(
         variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
@@ -225,7 +227,7 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
             variation, profile = eqx.combine(arrays, rest)
             return _one_device(variation, conditions, values, asked, profile)
 
-        # Each device searches its own roots and steps its own runs: none waits for another inside a loop.
+        # Each device has its own loops, so no device waits for another inside a loop.
         split = jax.shard_map(
             part,
             mesh=mesh,
@@ -244,9 +246,9 @@ class Piece:
 
     Attributes:
         chunk: number of chunk.
-        arrays: by variable, which may be on a device still.
-        values: values of its points, a row each, where they are at hand.
-        told: points of it that count as done already.
+        arrays: results by variable, possibly still on a device.
+        values: values of its points, one row each. None if they are not available.
+        told: number of its points that have been reported as done.
     """
 
     chunk: int
@@ -257,17 +259,17 @@ class Piece:
 
 Produced = Iterator[Piece]
 Advance = Callable[[float], None]
-#: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn_samples` gives them.
+#: Stores a chunk by its number: values of its points by variable, and its samples from `drawn_samples`.
 Keep = Callable[[int, Columns, np.ndarray | None], Any]
 
 
 def produce_chunks(
     compiled: Compiled, chunks: Iterable[int], times: Times, advance: Advance | None = None
 ) -> Produced:
-    """Compute chunks on the local devices, in order, the points of the next being made meanwhile.
+    """Computes chunks on the local devices, in order. The points of the next chunk are prepared meanwhile.
 
     Args:
-        advance: called with how many more points are done, of chunks that are computed in parts.
+        advance: callback for the number of further points that are done, for chunks that are computed in parts.
     """
     with Threads(1) as maker:
         ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
@@ -298,7 +300,7 @@ def _started(
 
 
 def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
-    """A function to be told what share of `count` runs is done so far, which passes on how many that adds."""
+    """Callback for the share of `count` runs that is done so far, which passes the increase to `advance`."""
     so_far = 0.0
 
     def told(share: float) -> None:
@@ -310,30 +312,30 @@ def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
 
 
 def fetch_values(arrays: Json, count: int) -> Columns:
-    """The first `count` values of each array, on this machine."""
+    """First `count` values of each array, fetched from the device."""
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
 
 
 def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
-    """Sample values along a chunk, a row a name, None if another chunk writes them."""
+    """Sample values along a chunk, one row for each name. None if another chunk writes them."""
     design, samples = job.plan.design, job.plan.design.samples
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
         return None
     along = job.blocks.box(piece.chunk)[-1]
-    if piece.values is not None:  # the samples vary fastest
+    if piece.values is not None:  # samples vary fastest
         return piece.values[: along.stop - along.start, len(design.axes) :].T
     return samples.values(along.start, along.stop - along.start)
 
 
 def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
-    """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
+    """Writes chunks as they arrive, in a separate thread, while the next is computed.
 
     Args:
-        keep: writes one.
-        advance: called with the points of each chunk that is done.
+        keep: function that stores a chunk.
+        advance: callback for the number of points in each finished chunk.
 
     Raises:
-        OSError: the disk is full, or the store cannot be written. Chunks written before are kept.
+        OSError: the disk is full, or the store cannot be written. Earlier chunks are kept.
     """
     waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
     stop, failures = threading.Event(), list[BaseException]()
@@ -349,7 +351,7 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
         count = job.blocks.count(piece.chunk)
         host_values = fetch_values(piece.arrays, count)
         transferred = time.perf_counter()
-        if stop.is_set() and not is_ready:  # interrupted while it was computed
+        if stop.is_set() and not is_ready:  # interrupted during its computation
             return
         keep(piece.chunk, host_values, drawn_samples(job, piece))
         times.compute += computed - start
@@ -379,7 +381,7 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
         stop.set()
         with contextlib.suppress(queue.Full):
             waiting.put(None, timeout=LAST)
-        writer.join(LAST)  # what is computed is written, what is still being computed is not waited for
+        writer.join(LAST)  # computed chunks are written, running computations are abandoned
         raise
     finally:
         times.total += time.perf_counter() - start_time

@@ -20,7 +20,7 @@ Attributes = dict[str, Json]
 
 
 def nothing_further(stated: Columns, robot: Robot, where: str) -> dict[str, float]:
-    """No conditions besides."""
+    """Returns no further conditions."""
     return {}
 
 
@@ -29,15 +29,16 @@ class Task:
     """Task of every point of a sweep.
 
     Attributes:
-        model: its name.
+        model: name of the task.
         options: options of a fidelity.
         attributes: attributes of its outputs in a store, by name.
-        usual: those of a store where none are stated.
-        slow: whether a call takes long and reports progress.
-        at_once: points in one, on processors or accelerators.
+        usual: names of the default outputs.
+        slow: True if a call takes long and reports progress.
+        at_once: points per call, on processors and accelerators.
         axes: names that may vary and are neither a condition nor a parameter of the robot.
-        further: returns conditions in addition to the varied and stated ones, refuses impossible points.
-        run: computes points, see `climbs.compute_climbs`. None: a program of the fidelity does.
+        further: function that returns conditions in addition to the varied and stated ones, and rejects impossible
+            points.
+        run: function that computes points, see `climbs.compute_climbs`. None: the program of the fidelity.
     """
 
     model: str
@@ -52,7 +53,7 @@ class Task:
 
 
 def task_of_configuration(config: Campaign, robot: Robot, turns: bool = False) -> Task:
-    """The task that a configuration states. `turns`: whether its profile drives the sides apart."""
+    """Task of a configuration. `turns`: True if its profile drives the sides independently."""
     if config.obstacle is None:
         return run_task(config.model, config.options, robot, config.profile is not None, turns)
     obstacle, attributes = config.obstacle, climbs.climb_attributes(config.obstacle)
@@ -76,7 +77,7 @@ def run_task(
     rows: dict[str, tuple[str, str]] = {r.name: (r.unit_shown, r.label) for r in outputs.output_table(robot.channels)}
     rows |= {name: ("", name.replace("_", " ")) for name in own_columns}
     if profiled:
-        from mmrjax.missions import mission_batch  # which imports an integrator
+        from mmrjax.missions import mission_batch  # imports an integrator
 
         output_names = (*mission_batch.OUTPUTS, *(mission_batch.OF_TURNS if turns else ()))
         rows, usual = {r.column: (r.unit, r.label) for r in output_names}, mission_batch.USUAL

@@ -1,4 +1,4 @@
-"""Results of a calibrated robot with their uncertainty: its posterior, drawn from and simulated."""
+"""Results of a calibrated robot with their uncertainty, from simulations of draws from its posterior."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from sweeps.points import run
 from sweeps.points.sampled_design import DrawnSamples
 from sweeps.store import RunFolder
 
-#: What is added to the column of an output: standard deviation, ends of the 95 % interval.
+#: Suffixes of an output's columns: standard deviation, ends of the 95 % interval.
 SD, LOWER, UPPER = "_sd", "_lower", "_upper"
-#: Share of the draws that converge.
+#: Column with the share of draws that converge.
 SHARE = "posterior_converged"
 QUANTILES = (0.025, 0.975)
-#: Draws are of this random seed.
+#: Random seed of the draws.
 SEED = 0
 
 
@@ -35,7 +35,7 @@ class Intervals:
     """Intervals of every run from draws of a posterior.
 
     Attributes:
-        columns: as `simulate_draws` names them, arrays of shape (runs,).
+        columns: columns from `simulate_draws`, arrays of shape (runs,).
         draws: number of draws.
         channels: channels of the robot.
     """
@@ -52,13 +52,13 @@ class Intervals:
 def simulate_draws(
     robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPart, draws: int, folder: RunFolder | None = None
 ) -> Intervals:
-    """Simulate every run with so many robots drawn from the posterior: a sweep of the runs crossed with the draws.
+    """Simulates every run with robots drawn from the posterior: a sweep of the runs combined with the draws.
 
-    It is the uncertainty of what the model says, without the noise of a reading. Each draw is one robot for all runs.
-    Draws that do not converge at a run count for nothing there. `SHARE` says how many do.
+    The result is the uncertainty of the model's prediction, without the noise of readings. Each draw is one robot for
+    all runs. Draws that do not converge in a run are omitted there. `SHARE` has the share of those that do.
 
     Returns:
-        For every output's column its sd and the ends of its 95 % interval, NaN where fewer than two draws converge.
+        For each output its sd and the ends of its 95 % interval, NaN if fewer than two draws converge.
     """
     samples = DrawnSamples(tuple(posterior.names), posterior.draw(draws, SEED).T)
     job = run.job_of_run_table(robot, runs, config, samples)
@@ -69,7 +69,7 @@ def simulate_draws(
         counts = np.isin(by_name[STATUS], DONE) & np.isfinite(by_name[robot.channels[0].name])
         return _summary({o.column: by_name[o.name] for o in outputs.output_table(robot.channels)}, counts)
 
-    draws_fit_chunk = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
+    draws_fit_chunk = job.blocks.size[-1] == draws  # then a chunk is stored as a summary
     with progress_bar(draws, quiet=not slow, doing="draws") as advance:
         chunks = run.compute_chunks(
             job, folder, "draws", lambda points: advance(points / len(runs)), summary if draws_fit_chunk else dict
@@ -78,12 +78,12 @@ def simulate_draws(
 
 
 def _summary(columns: Columns, counts: np.ndarray) -> Columns:
-    """Spread of each column over draws, arrays of shape (runs, draws), `counts`: where a draw converges."""
+    """Spread of each column over draws. Arrays have shape (runs, draws). `counts`: True if a draw converges."""
     enough = counts.sum(1) >= 2
     by_column: Columns = {}
     for column, values in columns.items():
         x = np.where(enough[:, None], np.where(counts, values, np.nan), 0.0)
-        with np.errstate(invalid="ignore"):  # of windings that settle at no temperature
+        with np.errstate(invalid="ignore"):  # windings that never settle
             low, high = np.nanquantile(x, QUANTILES, axis=1)
             spread = np.nanstd(x, 1, ddof=1)
         by_column |= {
@@ -94,7 +94,7 @@ def _summary(columns: Columns, counts: np.ndarray) -> Columns:
 
 
 def interval_ranges(table: Columns, found: Intervals) -> list[str]:
-    """Range of every channel over the runs, each end with its sd, and how many draws do not converge."""
+    """Range of every channel over the runs, each end with its sd, and the number of draws that do not converge."""
     first = found.channels[0].column
     finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])
     ranges = []
@@ -108,7 +108,7 @@ def interval_ranges(table: Columns, found: Intervals) -> list[str]:
 
 
 def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
-    """Number of robots that were drawn, and how many of them do not converge at how many runs, if some do not."""
+    """Number of drawn robots and, if some do not converge, their number and that of the runs."""
     is_incomplete = found.columns[SHARE] < 1
     remarks = [f"± one sd over {found.draws} robots drawn from the posterior. 95 % intervals are in {place}"]
     if is_incomplete.any():
@@ -121,7 +121,7 @@ def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
 
 
 def with_sd(value: float, sd: float, most: int) -> str:
-    """«4.19 ± 0.06», to two digits of the sd, at most so many after the point."""
+    """«4.19 ± 0.06», to two digits of the sd and at most `decimals` decimals."""
     if not (np.isfinite(sd) and sd > 0):
         return f"{value:z.{most}f} ± {sd:.{most}f}"
     digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, most))

@@ -1,8 +1,8 @@
-"""The store of a sweep: a Zarr group whose chunks are whole or absent, and the record of finished chunks.
+"""Store of a sweep: a Zarr group whose chunks are complete or absent, and a journal of finished chunks.
 
-Arrays are laid out in the Zarr format 3. Each chunk is a file, written under another name and moved into place, so
-that no file is ever partial. A chunk of the sweep counts as done when its line in a journal is complete. That line
-is written last and has a checksum of each file, which detects later damage.
+Arrays are in Zarr format 3. Each chunk is a file that is written under another name and moved into place, so files
+are never incomplete. A chunk of the sweep is done when its line in a journal is complete. This line is written last
+and contains a checksum of each file, to detect later damage.
 """
 
 from __future__ import annotations
@@ -52,22 +52,22 @@ from sweeps.store import (
     try_to_lock,
 )
 
-#: Packages besides those of every result whose version is part of a sweep's identity.
+#: Packages whose versions are part of a sweep's identity, in addition to those of every result.
 FURTHER = ("scipy", "zarr")
 
 Identity = dict[str, dict[str, str]]
 
 
 def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> Identity:
-    """Sections, each of words by key: configuration, data, code, versions, device.
+    """Identity of a job in sections: configuration, data, code, versions, device.
 
     Args:
-        config: configuration of the sweep, chunk and outputs resolved.
-        files: files that it reads.
+        config: configuration of the sweep, with chunk size and outputs resolved.
+        files: input files.
         device: kind of the devices.
 
     Raises:
-        BadConfiguration: a file that cannot be read.
+        BadConfiguration: a file cannot be read.
     """
     configuration = _flat(config.model_dump(mode="json", exclude={"report", "table"}), "")
     configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk_parameters(robot)}
@@ -117,7 +117,7 @@ def _flat(content: Json, prefix: str) -> dict[str, str]:
 def identity_differences(
     stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3
 ) -> str:
-    """In which sections two identities differ, with the first keys, empty where they do not."""
+    """Sections in which two identities differ, with the first keys. Empty if they are equal."""
     differences = []
     for section in dict.fromkeys((*now, *stored)):
         old, new = stored.get(section, {}), now.get(section, {})
@@ -132,15 +132,15 @@ def identity_differences(
 def _change(old: str | None, new: str | None, section: str) -> str:
     if old is None or new is None:
         return " is new" if old is None else " is gone"
-    # hashes say nothing to a person, and a long list not much
+    # hashes and long lists do not help a reader
     return "" if section in ("data", "code") or len(old) + len(new) > 80 else f" was {old}, is {new}"
 
 
-#: The command that a store's folder is marked with: a sweep into a table leaves other files.
+#: Name of the command in the folder of a store. Sweeps into tables leave other files.
 COMMAND = "sweep into a store"
 #: Status of a point that has not been simulated.
 ABSENT = 255
-#: Unit in which file systems give space to files and folders, and typical metadata of an array in its group [bytes].
+#: Typical block size of file systems, and typical size of an array's metadata [bytes].
 BLOCK, METADATA = 4096, 1024
 
 
@@ -165,10 +165,10 @@ class Layout:
 
     Attributes:
         design: the points.
-        blocks: its chunks.
-        variables: outputs, of all dimensions of the design.
+        blocks: chunks of the sweep.
+        variables: outputs, with all dimensions of the design.
         coordinates: units and long names of the varied names.
-        labels: words of an axis in place of its numbers.
+        labels: words that replace the numbers of an axis.
         attributes: attributes of the group.
         compression: `none` or `zstd`.
     """
@@ -183,7 +183,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Bytes of the store on a disk, uncompressed: blocks of its files and folders, metadata and journal."""
+        """Uncompressed size of the store on disk [bytes]: files and folders in blocks, metadata and journal."""
         counts, points = self.blocks.counts, self.blocks.points
         folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
         point_bytes = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
@@ -205,8 +205,8 @@ class Done:
     Attributes:
         chunk: number of chunk.
         statuses: number of points by status.
-        ranges: least and greatest finite value of each output that has one.
-        checks: checksum of the chunk's file of each array, CRC-32.
+        ranges: smallest and largest finite value of each output.
+        checks: CRC-32 checksum of the chunk's file for each array.
     """
 
     chunk: int
@@ -216,17 +216,17 @@ class Done:
 
 
 class SweepStore(Folder):
-    """The folder of a sweep, `path` + `.partial` until it is whole, shared by the processes of a job array."""
+    """Folder of a sweep, named `path` + `.partial` until it is complete, shared by the processes of a job array."""
 
     further = (LOCK, ASIDE, "runs.csv", "runs.parquet")
 
     def __init__(self, path: Path, identity: Identity, layout: Layout, *, force: bool = False) -> None:
-        """Begin a store, or take up one with the same identity.
+        """Creates a store, or continues one with the same identity.
 
         Raises:
-            BadConfiguration: `path` holds something else, or a sweep of another identity (the message says where they
-                differ), or another process is at work on what `force` would replace.
-            BadData: the sweep is finished, and a file of its store is damaged.
+            BadConfiguration: `path` holds something else or a sweep with another identity (the message lists the
+                differences), or another process is working on what `force` would replace.
+            BadData: the sweep is finished but a file of its store is damaged.
         """
         super().__init__(path)
         self.layout = layout
@@ -239,7 +239,7 @@ class SweepStore(Folder):
         self._aside = self.partial / ASIDE / "identity"
         self._sound: dict[int, Done] = {}
         self._damaged = set[int]()
-        cut_short = (path / LOCK).is_file()  # killed while the folder was moved into place
+        cut_short = (path / LOCK).is_file()  # the process was killed while it moved the folder into place
         if self._is_finished() and (not force or (cut_short and not self._differs(path))):
             self._take_finished()
             return
@@ -253,7 +253,7 @@ class SweepStore(Folder):
             raise
 
     def _enter(self, force: bool) -> bool:
-        """Begin the store or take it up, False where another process has removed it while this one waited for it."""
+        """Creates or continues the store. False if another process removed it while this one waited."""
         try:
             self.partial.mkdir(parents=True, exist_ok=True)
             self._lock = (self.partial / LOCK).open("a")
@@ -299,7 +299,7 @@ class SweepStore(Folder):
         if (self.partial / IDENTITY).is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
             self._mend_layout()
-        elif not force and self._is_finished():  # finished between our looking and our coming
+        elif not force and self._is_finished():  # finished by another process in the meantime
             self._take_finished()
             self._remove_partial()
         else:
@@ -338,10 +338,10 @@ class SweepStore(Folder):
     # --- layout -----------------------------------------------------------------------------------
 
     def _create(self) -> None:
-        """Metadata and axes, and the identity last: what has one is whole.
+        """Writes metadata and axes, then the identity: a store that has one is complete.
 
         Raises:
-            BadConfiguration: another process is writing to what would be replaced.
+            BadConfiguration: another process is writing to the store that would be replaced.
         """
         share = self._at_work()
         if share is not None:
@@ -355,7 +355,7 @@ class SweepStore(Folder):
         write_file(self.partial / IDENTITY, json.dumps(self._identity, indent=1).encode(), self._aside)
 
     def _altered(self, folder: Path) -> dict[Path, bytes]:
-        """Files of metadata and axes that are not as `create_store` writes them, with what they should hold."""
+        """Files of metadata and axes that differ from those of `create_store`, with their correct content."""
         with tempfile.TemporaryDirectory() as place:
             create_store(Path(place) / STORE, self.layout)
             file_contents = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
@@ -363,17 +363,17 @@ class SweepStore(Folder):
         return {p: content for p, content in contents.items() if not p.is_file() or p.read_bytes() != content}
 
     def _mend_layout(self) -> None:
-        """Write what is damaged of metadata and axes anew, with a note."""
+        """Rewrites damaged metadata and axes, with a note."""
         for file, content in self._altered(self.partial).items():
             print_message(f"{file}: damaged, so it is written again")
             file.parent.mkdir(parents=True, exist_ok=True)
             write_file(file, content, self._aside)
 
     def _refuse_damaged(self) -> None:
-        """Reject a finished sweep with a damaged file.
+        """Rejects a finished sweep with a damaged file.
 
         Raises:
-            BadData: names the first file.
+            BadData: a file is damaged.
         """
         damaged = next(iter(self._altered(self.path)), None)
         if damaged is None and len(self.done()) < len(self.layout.blocks):
@@ -386,10 +386,10 @@ class SweepStore(Folder):
     # --- chunks -----------------------------------------------------------------------------------
 
     def begin(self, shard: tuple[int, int] = (1, 1)) -> None:
-        """Open the journal of a share of the chunks. From now on no other process may work on it.
+        """Opens the journal of a share of the chunks, and locks this share.
 
         Raises:
-            BadConfiguration: another process does, or has removed the store or begun another one in its place.
+            BadConfiguration: another process holds the lock, or has removed or replaced the store.
         """
         name = f"{shard[0]}-of-{shard[1]}"
         file, self._aside = self.partial / JOURNAL / f"{name}.jsonl", self.partial / ASIDE / f"{name}-{os.getpid()}"
@@ -406,12 +406,12 @@ class SweepStore(Folder):
                 journal.close()
                 raise self._busy(name)
             self._journal, self._share = journal, file
-        if file.stat().st_size:  # a line cut short by a kill must not swallow the next
+        if file.stat().st_size:  # a line that a kill cut short must not absorb the next
             self._journal.write("\n")
             self._journal.flush()
 
     def _at_work(self) -> str | None:
-        """Share that another process is computing. None: no such share. Call within `_locked`."""
+        """Share that another process is computing, or None. Call within `_locked`."""
         return share_at_work(self.partial, self._share)
 
     def _busy(self, name: str) -> BadConfiguration:
@@ -421,7 +421,7 @@ class SweepStore(Folder):
         )
 
     def done(self) -> dict[int, Done]:
-        """Finished chunks by number, whose files are as they were written. A damaged one is reported once."""
+        """Finished chunks with undamaged files, by number. Each damaged chunk is reported once."""
         for chunk, records in self._records().items():
             if chunk in self._sound:
                 continue
@@ -434,7 +434,7 @@ class SweepStore(Folder):
         return dict(sorted(self._sound.items()))
 
     def _records(self) -> dict[int, list[Done]]:
-        """Lines of all journals that are whole, by chunk."""
+        """Complete lines of all journals, by chunk."""
         records: dict[int, list[Done]] = {}
         folder = self.path if self.finished else self.partial
         for file in sorted((folder / JOURNAL).glob("*.jsonl")):
@@ -445,7 +445,7 @@ class SweepStore(Folder):
         return records
 
     def _wrong_file(self, record: Done) -> Path | None:
-        """File of a chunk that is not as it was written, None if all are."""
+        """Damaged file of a chunk, or None."""
         store = (self.path if self.finished else self.partial) / STORE
         for name, file in self._files(record.chunk).items():
             try:
@@ -456,7 +456,7 @@ class SweepStore(Folder):
         return None
 
     def _files(self, chunk: int) -> dict[str, Path]:
-        """Files of a chunk within the store, by array: those of the samples at the beginning of all other axes."""
+        """Files of a chunk, by array. Those of samples belong to chunks at the beginning of all other axes."""
         place, samples = self.layout.blocks.place(chunk), self.layout.design.samples
         files = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
         if samples is not None and not any(place[:-1]):
@@ -464,11 +464,11 @@ class SweepStore(Folder):
         return files
 
     def write(self, chunk: int, arrays: Columns, drawn: np.ndarray | None) -> Done:
-        """Write a chunk and count it as done.
+        """Writes a chunk and marks it as done.
 
         Args:
-            arrays: by variable, a value a point of its box.
-            drawn: values of the samples there, a row a name, written by the chunks at the beginning of all axes.
+            arrays: values by variable, one for each point of its box.
+            drawn: values of the samples, one row for each name. Only chunks at the beginning of all axes write them.
         """
         layout, files = self.layout, self._files(chunk)
         box = layout.blocks.box(chunk)
@@ -493,8 +493,8 @@ class SweepStore(Folder):
         return record
 
     def _chunk(self, file: Path, values: np.ndarray, size: tuple[int, ...], empty: Any) -> int:
-        """Write the chunk of an array. Returns its checksum."""
-        if values.shape != size:  # chunks at the end of an axis are filled up, as the format wants
+        """Writes the chunk of an array and returns its checksum."""
+        if values.shape != size:  # the format requires padding of the last chunk of an axis
             full = np.full(size, empty, values.dtype)
             full[tuple(slice(n) for n in values.shape)] = values
             values = full
@@ -516,10 +516,10 @@ class SweepStore(Folder):
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """The finished folder, where it is to appear. To be called within `last`.
+        """Moves the finished folder to its final path and returns it. Call within `last`.
 
-        The folder that it replaces goes into the new one first, and is deleted there: after a kill between any two
-        steps the same command does the rest.
+        The folder that it replaces is first moved into the new one and deleted there. If the process is killed
+        between two steps, the same command completes the rest.
         """
         self.refuse_appeared(self._force)
         if self.path.is_dir():
@@ -532,21 +532,21 @@ class SweepStore(Folder):
         return self.path
 
     def _tidy(self) -> None:
-        """Delete what a finished folder does not need, the lock last: while there is one, something may be left."""
+        """Deletes what a finished folder does not need. The lock is last: while it exists, something may be left."""
         if (self.path / LOCK).is_file():
             shutil.rmtree(self.path / ASIDE, ignore_errors=True)
             (self.path / LOCK).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Let other processes work on what is left."""
+        """Releases the lock, so that other processes can continue."""
         for file in (self._journal, self._lock):
             if file is not None:
-                with contextlib.suppress(OSError):  # of a line that found no room, which has been said
+                with contextlib.suppress(OSError):  # the disk is full, which was reported
                     file.close()
         self._journal = self._share = self._lock = None
 
     def abandon(self) -> None:
-        """Leave nothing behind, where this process has begun, no chunk is done and nobody else is at work."""
+        """Removes the store if this process created it, no chunk is done, and no other process is working on it."""
         if self.finished or self._share is None:
             return
         with self._locked(), contextlib.suppress(OSError):
@@ -555,10 +555,10 @@ class SweepStore(Folder):
 
 
 def write_file(path: Path, content: Any, aside: Path) -> None:
-    """Write a file atomically, so that it also survives a loss of power.
+    """Writes a file atomically, so that it also survives a power failure.
 
     Args:
-        aside: temporary path on the same disk, moved into place at the end.
+        aside: temporary path on the same disk, which is renamed at the end.
     """
     try:
         with aside.open("wb") as stream:
@@ -610,7 +610,7 @@ def create_store(path: Path, layout: Layout) -> None:
             compressors=compressors, dimension_names=(SAMPLE,), attributes=dict(layout.coordinates[name]),
         )  # fmt: skip
     with warnings.catch_warnings():
-        # xarray opens a store with it at once, and one without it with a warning
+        # without it xarray warns
         warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
         zarr.consolidate_metadata(path)
 
@@ -644,7 +644,7 @@ def _line(record: Done) -> str:
 
 
 def _record(line: str) -> Done | None:
-    """A line of a journal, None where it is not whole."""
+    """Entry of a journal line, None if the line is incomplete."""
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None

@@ -1,1 +1,1 @@
-"""Reports: a document of sections, tables, figures and notes, with one renderer each for page and terminal."""
+"""Reports: documents of sections, tables, figures and notes, with one renderer for pages and one for the terminal."""

@@ -1,4 +1,4 @@
-"""The report of a calibration: adequate or not, its parameters, errors before and after, and their certainty."""
+"""Report of a calibration: adequacy, parameters, errors before and after, and their certainty."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ import numpy as np
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
 from calibration.inference import blocks
+from calibration.inference.feedforward import Feedforward
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import METHOD, CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from sweeps.pages import words
-from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report import catalogue, feedforward_report, fit_tables, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
 
 
-def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
+def calibration_document(
+    found: CalibrationResult, robot_name: str, voltage_fit: Feedforward | None = None
+) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
     chi, about = found.chi_square, found.identifiability
@@ -53,10 +56,12 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
             Section("Errors before and after, seen and unseen", (before_after,)),
             *_over_rows(found, sized),
+            *([feedforward_report.voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
             Section("How sure", tuple(_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
+        brief=fit_words.brief_calibration(found),
     )
 
 
@@ -74,7 +79,7 @@ def _parameters(found: CalibrationResult) -> Table:
 
 
 def _errors(found: CalibrationResult) -> Table:
-    """rms errors before, after, and of rows held out, with the number of rows that each reaches."""
+    """rms errors before and after, and of held-out rows, each with its number of rows."""
     lines = {"before": found.errors_before, "after": found.errors_after}
     lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
     rows = [
@@ -113,7 +118,9 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
         catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
-    yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
+    yield from (
+        Section(h, (f,)) for h, f in zip(("Parity", "Residuals against every condition"), figures, strict=True)
+    )
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:

@@ -1,4 +1,4 @@
-"""The report of a sweep into a store: how the points ended, what came out, and what it follows."""
+"""Report of a sweep into a store: status of the points, outputs, and what they depend on."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from sweeps.report import catalogue, run_tables
 from sweeps.report.climb_report import VERDICTS
 from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table
 
-#: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
+#: Most points for figures and quantiles, and most chunks to take them from. Most outputs that are drawn.
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
 
 
 def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path) -> Document:
-    """The report of a store whose every chunk is done.
+    """Report of a complete store.
 
     Args:
         result: `result.json`.
-        store: folder of the arrays.
+        store: folder of the store.
     """
     counts, model, total = result["statuses"], result["model"], result["points"]
     reached = sum(counts.get(s, 0) for s in words.SETTLED)
@@ -70,7 +70,7 @@ def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
 
 
 def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json) -> Iterable[Block]:
-    """Outputs with their extremes and quantiles. The first of them are drawn."""
+    """Section on the outputs, with extremes and quantiles. The first ones are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
     rows, figures = list[tuple[Any, ...]](), list[Figure]()
     for variable in (v for v in layout.variables if "units" in v.attributes):
@@ -83,7 +83,7 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
         if len(numbers) and len(figures) < DRAWN:
             spread = catalogue.figure(
                 "campaign.spread", numbers, Column(label, unit).title, values[usable], layout,
-                finding=f"{label} over what varies", words=(label.capitalize(),),
+                finding=f"{label} against the inputs", words=(label.capitalize(),),
             )  # fmt: skip
             figures.append(dataclasses.replace(spread, name=f"spread_{name}"))
     suffix = "" if len(values) == layout.design.points else " drawn at random"
@@ -108,10 +108,10 @@ def _largest_obstacle(values: np.ndarray, found: Columns, layout: Layout) -> str
 
 
 def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
-    """Some of the points, at random and always the same ones.
+    """Random selection of the points, always the same.
 
     Returns:
-        Values of what varies, shape (points, names), and outputs by name.
+        Varied values, shape (points, names), and outputs by name.
     """
     import zarr
 
@@ -124,14 +124,14 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
         rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
-        values.append(layout.design.block(box)[rows])
+        values.append(layout.design.values_in_slices(box)[rows])
         for variable in layout.variables:
             values_by_name[variable.name].append(group[variable.name][box].ravel()[rows])
     return np.concatenate(values), {name: np.concatenate(parts) for name, parts in values_by_name.items()}
 
 
 def _varied_rows(layout: Layout, values: np.ndarray) -> Table:
-    """Varied names, in words, a row each."""
+    """Varied names in words, one row for each."""
     rows = []
     for k, name in enumerate(layout.design.names):
         about = layout.coordinates[name]

@@ -1,4 +1,4 @@
-"""Figures, tables and notes of reports whose words are in `pages/templates/catalogue.toml`, by report and name."""
+"""Figures, tables and notes of reports with texts from `pages/templates/catalogue.toml`, by report and name."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ def _content() -> Json:
 
 
 def _entry(name: str) -> Json:
-    """Words of a figure, table or note, `report.name` of the catalogue."""
+    """Texts of a figure, table or note, by its name `report.name` in the catalogue."""
     room, _, key = name.partition(".")
     entry: Json = _content()[room][key]
     return entry
 
 
 def text(name: str, *words: Any) -> str:
-    """A text of the catalogue, with values in it."""
+    """Text of the catalogue with values filled in."""
     sentence: str = _entry(name).get("text", "")
     return sentence.format(*words) if words else sentence
 
 
 def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:
-    """A figure of the catalogue. Its drawing function is imported late, because matplotlib costs half a second.
+    """Figure of the catalogue. Its drawing function is imported late, because importing matplotlib takes half a
+    second.
 
     Args:
         name: name in the catalogue, `report.name`.
         drawn: arguments of the function that draws it.
-        finding: finding in words, if it depends on the result.
-        words: values in the caption.
-        more: end of the caption.
+        finding: finding in words if it depends on the result.
+        words: values to fill into the caption.
+        more: text to append to the caption.
     """
     entry = _entry(name)
     module, _, function = entry["draws"].rpartition(".")
@@ -53,11 +54,11 @@ def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (),
 
 
 def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **fields: Any) -> Table:
-    """A table of the catalogue.
+    """Table of the catalogue.
 
     Args:
         name: name in the catalogue, `report.name`.
-        more: columns, or their titles, in the place of "..." there.
+        more: columns, or their titles, that replace "..." in the catalogue.
     """
     entry = _entry(name)
     heads: list[Column] = []
@@ -69,6 +70,6 @@ def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **field
 
 
 def note(name: str, *words: Any) -> Note:
-    """A note of the catalogue, with values in its text."""
+    """Note of the catalogue with values filled in."""
     entry = _entry(name)
     return Note(text(name, *words), entry.get("kind", ""), entry.get("name", ""), entry.get("terminal", False))

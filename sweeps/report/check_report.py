@@ -1,4 +1,4 @@
-"""The report of `check`: requirements with their margins, and changes that would meet the missed ones."""
+"""Report of `check`: requirements with their margins, and changes that would meet the missed ones."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from sweeps.pages import words
-from sweeps.report import catalogue
+from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table
 from sweeps.report.words.posture_words import Drawn
 
-#: Missed requirements that the statement names.
+#: Number of missed requirements that the statement names.
 NAMED = 3
 
 
@@ -31,9 +31,9 @@ class CheckResult:
 
     Attributes:
         asked: the requirements.
-        robot: compared with them.
+        robot: the robot.
         outcomes: one for each requirement, in order.
-        drawn: the robot in the posture of each geometric requirement, see `posture_results.of_requirements`.
+        drawn: the robot in the posture of each geometric requirement, see `posture_words.of_requirements`.
     """
 
     asked: Requirements
@@ -47,7 +47,7 @@ class CheckResult:
         return [o for o in self.outcomes if not o.met]
 
     def statement(self) -> str:
-        """The answer: how many requirements are met, and those missed by most in percent of their limits."""
+        """The answer: number of requirements that are met, and those missed by the largest share of their limits."""
         number, missed = len(self.outcomes), sorted(self.missed, key=_margin_share)
         if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
@@ -69,12 +69,12 @@ class CheckResult:
 
 
 def _margin_share(outcome: RequirementOutcome) -> float:
-    """Margin as a share of the limit [-]. The least for a requirement without a value."""
+    """Margin as a share of the limit [-]. -inf for a requirement without a value."""
     return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
 
 
 def requirement_label(outcome: RequirementOutcome) -> str:
-    """Name of a requirement, with its duty."""
+    """Name of a requirement, including its duty."""
     point = outcome.at
     duty = ""
     if "duty" in point:
@@ -127,12 +127,12 @@ def worst_corner_text(outcome: RequirementOutcome) -> str:
     return ", ".join(parts)
 
 
-#: Changes that the terminal shows of each missed requirement.
+#: Number of changes for each missed requirement on the terminal.
 SHOWN = 3
 
 
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
-    """The report. `changes`: True where changes were searched for."""
+    """The report. `changes`: True if changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
     margins = catalogue.figure("check.margins", found, finding=found.statement())
     sections = [
@@ -141,13 +141,17 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
     corners = [o.at for o in found.outcomes]
-    sections.append(Section("Motor and gear", (catalogue.figure("run.chart_of_corners", found.robot, corners),)))
+    robot, figures = found.robot, [catalogue.figure("run.chart_of_corners", found.robot, corners)]
+    if float(robot.gearbox.efficiency_load) < 1 or run_tables.lost_by_load(robot):
+        volts = float(robot.battery.voltage_no_load(0.0))
+        figures.append(catalogue.figure("run.drive_plane", robot, volts, words=(volts,)))
+    sections.append(Section("Motor and gear", tuple(figures)))
     blocks: tuple[Block, ...] = (Note(lead, "lead"), margins, *_postures(found))
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 
 
 def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = True) -> Table:
-    """Requirements with required and reached values, margins and worst corners."""
+    """Table of requirements with required and reached values, margins and worst corners."""
     rows = [
         (
             Cell(*(("met", "good") if o.met else ("missed", "bad"))), requirement_label(o),

@@ -1,4 +1,4 @@
-"""The report of a climb: the answer, silhouettes, what it took on the way, and how sizes that were tried ended."""
+"""Report of a climb: answer, silhouettes, loads on the way, and the outcome of each tried size."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ VERDICTS: dict[str, tuple[str, str]] = {
 }
 
 
-#: Columns of `history.csv` that are the coordinates, and others that a film shows.
+#: Columns of `history.csv` with the coordinates, and further columns that a film shows.
 COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
 FILMED = ("time_s", "traction_current_A")
 
 
 def footing_coordinates(table: Columns) -> np.ndarray:
-    """Coordinates of `mmrjax.climbing.footing` at every sample of a history, (samples, 6)."""
+    """Coordinates of `mmrjax.climbing.footing` at every sample of a history, shape (samples, 6)."""
     x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
     angles = np.radians([-pitch, shaft, front, 180 - rear])
     return np.stack([x / 1000, z / 1000, *angles], axis=1)
@@ -51,12 +51,12 @@ def footing_coordinates(table: Columns) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """Variables of derivatives.
+    """Variables with respect to which derivatives are computed.
 
     Attributes:
         names, units: names and units of the values.
         values, widths: values and widths in these units.
-        given: the run that such values make.
+        given: function that returns the inputs of a run with such values.
     """
 
     names: Names
@@ -67,7 +67,7 @@ class Along:
 
     @property
     def rows(self) -> list[tuple[str, str, float, float]]:
-        """Name, unit, value and width of each."""
+        """Name, unit, value and width of each variable."""
         return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
 
 
@@ -83,10 +83,10 @@ class Seen:
 
     @staticmethod
     def read(folder: Path) -> Seen:
-        """Of a folder of `mmrjax climb`.
+        """Reads a folder of `mmrjax climb`.
 
         Raises:
-            BadConfiguration: it is none.
+            BadConfiguration: it is no such folder.
         """
         try:
             content = json.loads((folder / "result.json").read_text("utf-8"))
@@ -108,14 +108,14 @@ class ClimbResult:
     """Result of `climb`.
 
     Attributes:
-        robot, configuration, obstacle: robot, configuration and obstacle of the run. The last in words.
+        robot, configuration, obstacle: robot, configuration and obstacle of the run. The obstacle is in words.
         terrain: terrain of the run that is shown.
-        climb: climb that run, alone.
+        climb: the simulated climb.
         radius: radius of the pulleys [m].
         tried: sizes [mm] and verdicts of a search.
-        largest: that it got over [mm], None: no search or none.
+        largest: largest climbed size [mm]. None: no search, or none was climbed.
         sought: name of the searched size. Empty: no search.
-        along, derivatives: if requested, else None.
+        along, derivatives: None unless requested.
     """
 
     robot: Robot
@@ -136,12 +136,12 @@ class ClimbResult:
 
     @property
     def over(self) -> bool:
-        """True if it got over."""
+        """True if the robot got over the obstacle."""
         return int(self.climb.verdict[0]) == OVER
 
     @functools.cached_property
     def table(self) -> Columns:
-        """The run over time."""
+        """Table of the run over time."""
         r: Any = self.climb.run(0)
         q, v = r.motion.q, r.motion.v
         energy = {f"{name}_J": r.energy[name] for name in (*SOURCES, *LOSSES)}
@@ -176,7 +176,7 @@ class ClimbResult:
 
     @property
     def margins(self) -> dict[str, float]:
-        """Margins of the run, shares by the names of `OUTPUTS`. None of a run without numbers."""
+        """Margins of the run as shares, by the names of `OUTPUTS`. None for a run without numbers."""
         if self.verdict == "failed":
             return {}
         run_outputs = outputs_of_run(self.robot, self.terrain, self.climb, 0)
@@ -184,7 +184,7 @@ class ClimbResult:
 
     @property
     def slopes(self) -> list[Json] | None:
-        """Derivatives, a row an output and value that it is derived by. None: not asked for."""
+        """Derivatives, one row for each output and variable. None unless requested."""
         along, derivatives = self.along, self.derivatives
         if along is None or derivatives is None:
             return None
@@ -200,7 +200,7 @@ class ClimbResult:
         ]
 
     def statement(self) -> str:
-        """The answer in a sentence."""
+        """The answer in one sentence."""
         if self.sought:
             if self.largest is None:
                 smallest = min(size for size, _ in self.tried)
@@ -255,12 +255,12 @@ class ClimbResult:
         }
 
 
-#: Outputs whose derivatives the terminal shows.
+#: Outputs whose derivatives are shown on the terminal.
 SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_A")
 
 
 def climb_document(found: ClimbResult, file: RobotFile) -> Document:
-    """The report of a climb."""
+    """Report of a climb."""
     lead = f"**{found.configuration}**, {found.obstacle}, approached at a right angle."
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (

@@ -1,4 +1,4 @@
-"""The report of `compare`: errors of a simulation against measured runs or logs."""
+"""Report of `compare`: errors of a simulation against measured runs or logs."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ class Comparison:
         source: name of the table.
         model: fidelity.
         robot_name: robot name of the simulated robot.
-        fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
-        over: further columns of histories for the axes of the errors, with their headings.
+        fit: `these` if the robot was fitted to these rows, `others` if it was fitted to other rows, "" if no fit is
+            recorded.
+        over: further columns of histories, over which errors are drawn, with their headings.
         notes: sentences on the table.
         against: name of a second robot, "" for none. Its readings are the columns `against_<column>` of the table.
         after_steps: rows of histories at or after a step of the command.
@@ -56,7 +57,7 @@ class Comparison:
 
     @property
     def rms_of_both(self) -> dict[str, tuple[int, float, float]]:
-        """For each channel the rows with a number of both robots, and their rms errors [% of the measured rms]."""
+        """For each channel, the rows with values of both robots, and their rms errors [% of the measured rms]."""
         answer = {}
         for channel in self.channels:
             readings_of_both = np.stack(
@@ -70,15 +71,15 @@ class Comparison:
 
 
 def add_second_robot(table: Columns, channels: Sequence[Channel], simulated: Columns) -> Columns:
-    """A table of `compare_readings` with the readings that a second robot gives on its rows."""
+    """Adds the readings of a second robot to a table of `compare_readings`."""
     return table | {f"against_{c.column}": simulated[c.column] for c in channels}
 
 
 def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = None) -> tuple[Columns, Summary]:
     """Measured and simulated readings with their errors, and their summary by group.
 
-    Groups are configurations, or surfaces of `robot`. A missing reading is NaN and counts as `missing`.
-    Percent are of the channel's measured rms over all rows, as in results of fits.
+    Groups are configurations, or surfaces of `robot`. A missing reading is NaN and counts as `missing`. Percentages
+    refer to the channel's measured rms over all rows, as in results of fits.
     """
     table = {
         key: simulated[key] for key in ("configuration", *dict.fromkeys((*measured.layout.axes, *measured.axes)))
@@ -88,6 +89,8 @@ def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = N
     nothing = np.full(len(measured), np.nan)
     for channel in measured.channels:
         table[channel.column] = measured.columns.get(channel.column, nothing)
+        if measured.has(channel.sd_column):
+            table[channel.sd_column] = measured[channel.sd_column]
         table[f"simulated_{channel.column}"] = simulated[channel.column]
         table[f"error_{channel.name}_percent"] = residual.sized_error(
             simulated[channel.column], table[channel.column]
@@ -122,7 +125,7 @@ _FITS = {
 
 
 def comparison_document(found: Comparison) -> Document:
-    """The report of a comparison."""
+    """Report of a comparison."""
     table = found.table, found.channels
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
@@ -139,7 +142,10 @@ def comparison_document(found: Comparison) -> Document:
             if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
         ),
     )
-    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=_strongest_trend(found))
+    known_sd = any(np.isfinite(found.table.get(c.sd_column, [])).any() for c in found.channels)
+    band = " Band: ±2 standard deviations of the readings." * known_sd
+    trend = _strongest_trend(found)
+    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=trend, more=band)
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -164,14 +170,14 @@ def comparison_document(found: Comparison) -> Document:
         (
             *_over_time(found),
             Section("Parity", (parity,)),
-            Section("Errors over conditions", (errors,)),
+            Section("Errors against conditions", (errors,)),
             Section("Rows", (_rows(found),)),
         ),
     )
 
 
 def _over_time(found: Comparison) -> tuple[Section, ...]:
-    """The section with readings over time of a log. None for a table of settled runs."""
+    """Section with the readings of a log over time. None for a table of settled runs."""
     if found.over is None:
         return ()
     lines = {"simulated_": found.robot_name, "against_": found.against}
@@ -190,7 +196,7 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
 
 
 def comparison_answer(found: Comparison) -> str:
-    """The rms errors with their rows, the worst reading, and if this robot was fitted to these rows."""
+    """The rms errors with their numbers of rows, the worst reading, and if the robot was fitted to these rows."""
     error_summary, total = found.summary["all"], len(found.table["status"])
     channel_errors = [(c, error_summary[c.name]) for c in found.channels if error_summary[c.name]["rows"]]
     if not channel_errors:
@@ -205,7 +211,7 @@ def comparison_answer(found: Comparison) -> str:
 
 
 def _second_robot(found: Comparison) -> str:
-    """Errors of both robots on the rows that both reach."""
+    """Errors of both robots on the rows for which both have values."""
     rms_pair = found.rms_of_both
     shared = max(rows for rows, _, _ in rms_pair.values())
     if not shared:
@@ -233,7 +239,7 @@ def _log_duration(found: Comparison) -> float:
 
 def _errors_table(found: Comparison) -> Table:
     rows = []
-    groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one configuration is all
+    groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one equals the total
     for group, by_channel in groups.items():
         for c in found.channels:
             e = by_channel[c.name]
@@ -262,7 +268,7 @@ def _status(status: str) -> Cell:
 
 
 def _strongest_trend(found: Comparison) -> str:
-    """The channel and condition whose errors correlate most."""
+    """Channel and condition with the strongest correlation of errors."""
     best, size = "No error changes with a condition", 0.0
     headings = {column: heading for column, (heading, _) in condition_formats(found.table).items()} | dict(
         found.over or {}

@@ -1,6 +1,6 @@
-"""A report as data: `page_renderer` makes a page of it, `terminal_renderer` the text of the terminal.
+"""A report as data. `page_renderer` turns it into a page, `terminal_renderer` into terminal output.
 
-Texts may hold `**bold**` words and names in backticks. A command builds its document once, in `x_report.py`.
+Texts may contain `**bold**` words and names in backticks. A command builds its document once, in `x_report.py`.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from calibration.data import Names
 from calibration.data.writing import cell_text
 
-#: Most rows of a table on a page, and on a terminal.
+#: Most rows of a table on a page, and on the terminal.
 PAGE_ROWS, TERMINAL_ROWS = 200, 60
-#: Entry of a table for a missing number.
+#: Table entry for a missing number.
 DASH = "–"
 #: Most rows that are shown side by side.
 SIDE_BY_SIDE = 6
@@ -32,7 +32,7 @@ class Note:
 
     Attributes:
         text: the paragraph, or a tuple of items.
-        kind: its look on the page: "", `lead`, `key`, or `warn` for a warning.
+        kind: its style on the page: "", `lead`, `key`, or `warn`.
         name: name of the element on the page.
         terminal: True if the terminal prints it too.
     """
@@ -48,9 +48,9 @@ class Column:
     """One column of a table.
 
     Attributes:
-        heading: its words.
+        heading: text of the heading.
         unit: unit of its numbers.
-        group: heading above it and its neighbours of the same group.
+        group: common heading above columns of the same group.
         form: format of its numbers, "" for a column of text.
         terminal: True if the terminal shows it too.
     """
@@ -72,7 +72,7 @@ class Column:
         return f"{self.group}: {self.title}" if self.group and self.heading else self.group or self.title
 
     def text(self, cell: Any) -> str:
-        """Text of a cell, the same on page and terminal. A missing number is a dash."""
+        """Text of a cell, for page and terminal. A missing number is a dash."""
         value = cell.value if isinstance(cell, Cell) else cell
         if is_missing(value):
             return DASH
@@ -84,7 +84,8 @@ class Column:
 def columns(*titles: str) -> tuple[Column, ...]:
     """Columns from titles such as `speed > error [%] | +.1f`: heading in a group, unit, and format of numbers.
 
-    Without ` | ` a column has text, with nothing behind it texts of numbers. `~` marks a column for the page only.
+    A column without ` |` has text. A column with nothing after ` |` has numbers as text. `~` marks a column that only
+    the page shows.
     """
     columns_so_far = []
     for title in titles:
@@ -101,7 +102,7 @@ def columns(*titles: str) -> tuple[Column, ...]:
 class Cell:
     """A value with a tone, shown as a colour on the page: `good`, `fair`, `bad`, `slides` or `none`.
 
-    A number with the tone `bar` or `over` is a share [%] and has a bar.
+    A number with the tone `bar` or `over` is a share [%], shown as a bar.
     """
 
     value: Any
@@ -117,11 +118,11 @@ class Table:
         columns: its columns.
         rows: values or `Cell`s, one for each column.
         title: title for the terminal.
-        file: file of the run folder with all rows, named where the table is cut.
+        file: file in the run folder with all rows, named if the table is cut.
         wide: True for small print on the page.
         terminal: True if the terminal shows it too.
-        brief: numbers of the rows that the terminal shows, None for all.
-        sideways: True if a few rows are shown side by side, each under the text of its first cell.
+        brief: indices of the rows that the terminal shows. None: all.
+        sideways: True to show a few rows side by side, each under the text of its first cell.
     """
 
     name: str
@@ -136,7 +137,7 @@ class Table:
 
     @property
     def turned(self) -> Table:
-        """The first rows side by side, if the table is `sideways`, else the table itself."""
+        """Table with the first rows side by side if it is `sideways`, otherwise the table itself."""
         if not self.sideways:
             return self
         first, *others = self.columns
@@ -161,7 +162,7 @@ class Table:
 
     @property
     def csv(self) -> str:
-        """The table as CSV with numbers in full. Missing ones are empty cells."""
+        """The table as CSV with all digits. Missing numbers are empty cells."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(cell_text(plain_text(column.full_title)) for column in self.columns)
@@ -178,9 +179,9 @@ class Figure:
 
     Attributes:
         name: name of its element and file.
-        alternative: its finding in words, for who does not see it.
+        alternative: its finding in words, for readers who cannot see it.
         caption: how to read it.
-        draw: returns the matplotlib figure.
+        draw: function that returns the matplotlib figure.
     """
 
     name: str
@@ -194,9 +195,8 @@ Block = Note | Table | Figure
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """Blocks under a heading. `name`: of the heading's element. `level`: of the heading.
-
-    `folded`: words of a line that unfolds them, if they are hidden.
+    """Blocks under a heading. `name`: name of the heading's element. `level`: level of the heading. `folded`: text of
+    the line that unfolds the blocks. Empty: they are not folded.
     """
 
     heading: str
@@ -212,11 +212,11 @@ class Document:
 
     Attributes:
         title: title of the page.
-        answer: the result in a sentence or two.
-        blocks: what follows it before the first heading.
-        sections: the rest, in order.
-        page_sections: makes those that only the page has, before them.
-        brief: lines of a terminal that does not want the rest, none if it always does.
+        answer: the result in one or two sentences.
+        blocks: blocks between the answer and the first heading.
+        sections: sections, in order.
+        page_sections: function that returns the first sections of the page, which the terminal lacks.
+        brief: lines for a brief terminal output. Empty: the output is always complete.
     """
 
     title: str
@@ -243,11 +243,11 @@ def is_missing(value: Any) -> bool:
 
 
 def remarks(texts: Iterable[str], name: str = "notes") -> tuple[Note, ...]:
-    """A list of remarks for page and terminal, if there are any."""
+    """Note with remarks for page and terminal, if there are any."""
     items = tuple(texts)
     return (Note(items, name=name, terminal=True),) if items else ()
 
 
 def plain_text(text: str) -> str:
-    """A text without the marks of bold words and names."""
+    """Text without the marks of bold words and names."""
     return re.sub(r"\*\*(.+?)\*\*|`([^`]+)`", lambda m: m[1] or m[2], text)

@@ -1,4 +1,4 @@
-"""The report of `export`: an exported drive next to the native model, and the losses of the format."""
+"""Report of `export`: comparison of the exported drive with the native model, and what the format omits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TONES = {HELD: "good", APPROXIMATED: "fair", DROPPED: "bad"}
 
 
 def export_document(found: Export) -> Document:
-    """The report of an exported drive."""
+    """Report of an exported drive."""
     compared = found.comparison
     usage = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
     fate_rows = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]

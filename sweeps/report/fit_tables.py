@@ -17,9 +17,9 @@ from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Cell, Column, Figure, Section, Table, remarks
 from sweeps.report.run_tables import condition_formats
 
-#: Least number of rows of a log for a frequency response.
+#: Fewest rows of a log for a frequency response.
 FREQUENCIES = 64
-#: Names of fits that rms errors are of.
+#: Names of the fits in tables of rms errors.
 FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
     "held_out_after": "after, held out",
@@ -27,12 +27,12 @@ FITS = {
 
 
 class Change(NamedTuple):
-    """Change of the readings of the runs by an effect of the robot that is written.
+    """Change of the readings by an effect of the written robot.
 
     Attributes:
         channel: channel with the largest change.
         rms: rms error of the change [% of the channel's measured rms].
-        without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
+        without, with_it: readings simulated without and with the effect [SI], shape (rows,).
     """
 
     channel: Channel
@@ -42,18 +42,18 @@ class Change(NamedTuple):
 
 
 def shift_cell(shift: float) -> Cell:
-    """A shift in prior standard deviations, marked beyond two and three."""
+    """Shift in prior standard deviations, marked beyond two and three."""
     return Cell(shift, "bad" if abs(shift) > 3 else "fair" if abs(shift) > 2 else "")
 
 
 def error_cell(percent: float) -> Cell:
-    """An error in per cent, marked by its size: the paper claims 7 %."""
+    """Error in percent, marked by its size relative to the paper's 7 %."""
     size = abs(percent)
     return Cell(percent, "" if not np.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad")
 
 
 def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterable[Channel]) -> str:
-    """Standard deviation of each channel, as its median share of the reading [%], with its source."""
+    """Standard deviation of each channel with its source, as the median share of the reading [%]."""
     of_channels = ((c.label, *noise[c.name]) for c in shown if c.name in noise)
     parts = (
         f"{label} {'' if share is None else f'{share:.2f} % '}({source})" for label, share, source in of_channels
@@ -64,7 +64,7 @@ def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterabl
 def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
     """rms errors in the units of their channels, by fit."""
     rows = [(FITS[fit], *(rms_by_channel.get(c.name) for c in shown)) for fit, rms_by_channel in rms.items()]
-    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
+    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .4g" for c in shown))
 
 
 def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, str]) -> Table:
@@ -90,7 +90,7 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
 
 
 def frequency_response(runs: Runs, shown: Sequence[Channel], lines: Mapping[str, str]) -> list[Figure]:
-    """Figure of the response of each channel to the drive. None of a short log or a constant drive.
+    """Figure of the response of each channel to the drive. None for a short log or a constant drive.
 
     Args:
         runs: runs with measured and simulated columns.
@@ -101,7 +101,9 @@ def frequency_response(runs: Runs, shown: Sequence[Channel], lines: Mapping[str,
 
 
 def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
-    """Sentence on the fits of `fits_of_runs`: range over the runs of each channel, of the first simulated line."""
+    """Sentence on the values of `fits_of_runs`: their range over the runs for each channel, for the first simulated
+    line.
+    """
     first = [row[2:] for row in fits.rows if row[1] == fits.rows[0][1]]
     ranges = []
     for channel, values in zip(shown, np.array(first, float).T, strict=True):
@@ -112,7 +114,7 @@ def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
-    """Columns without a role that residuals go with, if there are any."""
+    """Section on columns that the model does not use that correlate with residuals, if there are any."""
     if not clusters:
         return ()
     statements = (f"{c.statement}." for c in clusters)
@@ -127,12 +129,12 @@ def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]
 def rows_section(
     table: Columns, shown: Sequence[Channel], kinds: Mapping[str, str], sized: bool, **more: Any
 ) -> Section:
-    """The rows with their conditions, readings, and the error of the last kind of readings.
+    """Section with all rows: conditions, readings, and the error of the last kind of readings.
 
     Args:
-        kinds: words of each kind of readings by the prefix of its columns.
-        more: `first` and `last` columns, by name.
-        sized: True if errors are in the channel's unit, and not in per cent.
+        kinds: description of each kind of readings, by the prefix of its columns.
+        more: lists of `first` and `last` columns.
+        sized: True if errors are in the channel's unit instead of percent.
     """
     conditions = condition_formats(dict(table))
     heads = [Column(word) for word in more.get("first", {})] + [Column("configuration")]

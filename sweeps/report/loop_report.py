@@ -1,4 +1,4 @@
-"""The report of the loop: the answer, what was found and how sure that is, errors, and what to do next."""
+"""Report of the loop: the answer, the effects found and their certainty, errors, and what to do next."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
-from calibration.described import describe
+from calibration.described import as_paragraph, describe
+from calibration.discovery.experiments import NONE
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, blocks
@@ -27,19 +28,19 @@ from sweeps.report import catalogue, fit_tables, run_tables
 from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table, remarks
 from sweeps.report.fit_tables import Change
 
-#: Change of an rms error that is marked [%].
+#: Smallest change of an rms error that is marked [%].
 NOTABLE = 0.05
 #: Distance of a fitted parameter from its stated value that the first screen states [prior sds].
 MOVED = 2.0
-#: Levels that leave something open.
+#: Verdicts that leave something open.
 OPEN = ("open", "class", "undescribed", *WITHOUT_NAME)
 
 
 def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, Change]) -> Document:
-    """The report of a pass of the loop.
+    """Report of a loop.
 
     Args:
-        robot_name: name or file of the robot that it began with.
+        robot_name: name or file of the initial robot.
         changes: changes of settled runs by each effect.
     """
     missing, table = found.verdict not in ("none", "undescribed"), rows_for_figures(found)
@@ -63,7 +64,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
 
 
 def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
-    """The law that was found, on its readings. Without one, and of logs, measured and simulated readings."""
+    """Figure of the law that was found, on its readings. For logs or without a law: measured and simulated values."""
     if isinstance(found.detail, TimeStatistics):
         lines = _simulated_lines(found)
         fits = fit_tables.range_of_fits(fit_tables.fits_of_runs(table, found.channels, lines), found.channels)
@@ -79,12 +80,12 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
 
 
 def _simulated_lines(found: DiscoveryResult) -> dict[str, str]:
-    """Prefixes of the simulated readings that figures over time show, with their names, the proposal's first."""
+    """Prefixes of the simulated readings in figures over time, with their names. The proposal is first."""
     return {"after_": "simulated"} if found.refit_alone else {"after_": "with the effects found", "before_": "before"}
 
 
 def rows_for_figures(found: DiscoveryResult) -> Columns:
-    """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
+    """Rows of the result for figures and page. For a rig, each surface is a separate configuration."""
     table = found.rows_table()
     if Layout.of(found.robot).crosses_zero:
         table["configuration"] = found.runs.configurations_named(found.robot)
@@ -96,7 +97,7 @@ def _rows_are(found: DiscoveryResult) -> str:
 
 
 def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable[str]:
-    """Each effect of the model: what it is, how large, how sure, what else it could be."""
+    """Section on the effects of the model: meaning, size, certainty and alternatives."""
     for e in found.effects:
         size, other = loop_words.effect_amplitude(e), loop_words.indistinguishable_effects(found, e)
         if e.name in changes:
@@ -109,12 +110,12 @@ def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> I
 
 
 def _noise_alone(found: DiscoveryResult) -> str:
-    """Opening of a claim that does not hold at every noise tried, "" for one that does."""
+    """Beginning of a claim that does not hold at every tried noise level, otherwise ""."""
     return "" if found.headline.level == found.verdict else "Only at 1 times the noise: "
 
 
 def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
-    """Parameters of the written robot that moved by more than `MOVED` prior sds, the farthest first."""
+    """Parameters of the written robot that moved by more than `MOVED` prior sds, largest shift first."""
     by_name = {
         name: (p.after, p.shift_after) if found.written else (p.before, p.shift_before)
         for name, p in found.base_shift.items()
@@ -126,16 +127,15 @@ def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
 
 
 def _arrow_cell(text: str, change: float) -> Cell:
-    """A cell of errors with an arrow where they change."""
+    """Cell with errors, and an arrow if they change."""
     if not abs(change) >= NOTABLE:
         return Cell(text)
     return Cell(f"{text} ↓", "good") if change < 0 else Cell(f"{text} ↑", "bad")
 
 
 def _summary(found: DiscoveryResult) -> Table:
-    """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block.
-
-    A change is marked if both lines are over the same number of rows.
+    """Table of errors as stated, refitted, and with the effects found, for fitted rows and for rows held out by the
+    first kind of block. Changes are marked if both lines have the same number of rows.
     """
     kind, unseen = next(iter(found.errors_held_out.items()), ("", ({}, {})))
     total, before = len(found.runs), dict[str, tuple[float, int]]()
@@ -166,7 +166,7 @@ def _summary(found: DiscoveryResult) -> Table:
 
 
 def held_out_table(found: DiscoveryResult) -> Table:
-    """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches."""
+    """Errors of the refit and with the effects found, for each kind of held-out block, with numbers of rows."""
     total, many, rows = len(found.runs), not found.refit_alone, list[tuple[Any, ...]]()
     for kind, error_pair in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
@@ -187,8 +187,10 @@ def held_out_table(found: DiscoveryResult) -> Table:
 
 
 def _next_step(found: DiscoveryResult, more: str) -> str:
-    """What to do next. `more`: what follows the name and description of an experiment."""
+    """What to do next. `more`: text after the name and description of an experiment."""
     after = found.next_experiment
+    if after is not None and after.name == NONE:
+        return f"{after.description}."
     if after is not None:
         return f"**{after.name}**: {after.description}.{more}"
     level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
@@ -206,27 +208,17 @@ def _advice(found: DiscoveryResult) -> Table:
         for note in remarks_with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
     ]
     against = [note for note in found.remarks if isinstance(note, str)]
-    sentences = [
-        loop_words.largest_share(found),
-        *far,
-        *against[:1],
-    ]  # a sentence begins with a capital, a parameter does not
+    to_check = [loop_words.largest_share(found), *far, *against[:1]]
     rows = [
-        ("May I use it?", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
-        (
-            "What to check first",
-            " ".join(
-                [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
-            )
-            or "Nothing unusual.",
-        ),
+        ("May I use it for …", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
+        ("What to check first", as_paragraph(to_check) or "Nothing unusual."),
         ("What to do next", _next_step(found, more)),
     ]
     return catalogue.table("loop.advice", rows)
 
 
 def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
-    """Effects that were found, and a discrepancy without a name."""
+    """Effects that were found, and an unnamed discrepancy, in words."""
     rows = []
     for e in found.to_json()["effects"]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
@@ -251,7 +243,7 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
 
 
 def _certainty(found: DiscoveryResult, missing: bool) -> Table:
-    """Verdict, adequacy, rows and prediction, each with the numbers that it rests on."""
+    """Table of verdict, adequacy, rows and prediction, each with the numbers behind it."""
     (chi_before, chi_after), (before, after) = found.chi2_of_readings, found.chi2
     chi = f"{chi_before:.0f} → {chi_after:.0f}" if missing else f"{chi_before:.0f}"
     priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
@@ -367,7 +359,7 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
         yield fit_tables.fits_of_runs(table, found.channels, lines)
         runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
         yield from fit_tables.frequency_response(runs, found.channels, lines)
-    elif changes or found.unnamed is not None:  # else it is the first figure
+    elif changes or found.unnamed is not None:  # otherwise it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 
 
@@ -385,6 +377,8 @@ def _blocks_of_missing_terms(
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
         yield catalogue.figure("loop.input_correlation", found.runs, table, found.channels, verdict)
     else:
+        if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
+            yield catalogue.figure("run.measured_drive_plane", found.robot, found.runs)
         figure_input = table, verdict, sized
         yield catalogue.figure(
             "loop.defects",
@@ -392,13 +386,13 @@ def _blocks_of_missing_terms(
             words=(_closed(found, table) if sized else catalogue.text("loop.three"),),
         )
     if found.unnamed is not None:
-        if changes or isinstance(detail, TimeStatistics):  # else it is the first figure
+        if changes or isinstance(detail, TimeStatistics):  # otherwise it is the first figure
             yield _curve(found)
         yield Note(loop_words.proposed_formula(found.unnamed), name="proposal")
 
 
 def _curve(found: DiscoveryResult) -> Figure:
-    """The smooth curve of a discrepancy without a name."""
+    """Figure of the smooth curve for an unnamed discrepancy."""
     assert found.unnamed is not None
     key = "tentative" if found.effects else "written" if found.written else "left"
     return catalogue.figure(
@@ -407,7 +401,7 @@ def _curve(found: DiscoveryResult) -> Figure:
 
 
 def _closed(found: DiscoveryResult, table: Columns) -> str:
-    """Equations that the channels close."""
+    """Note on the equations whose errors the channels determine."""
     from sweeps.pages import loop_figures
 
     sides = max(1, len(loop_figures.defects_by_side(table, "before", "track")))
@@ -419,7 +413,7 @@ def _closed(found: DiscoveryResult, table: Columns) -> str:
 
 
 def _candidates(found: DiscoveryResult) -> Iterable[Block]:
-    """Scores of all effects, and what else explains the data."""
+    """Section with the scores of all effects, and alternatives that explain the data."""
     share, allowed = found.settings.shares["single"], found.settings.family_wise_error
     yield catalogue.figure("loop.ladder", found, words=(100 * (1 - share), 100 * (allowed - share)))
     several = [(_named(a.effects), a.rise_chi2) for a in found.alternatives]

@@ -1,4 +1,4 @@
-"""The report of `simulate` over a profile: the mission over time, where its energy goes, its segments, its limits."""
+"""Report of `simulate` with a profile: the mission over time, uses of its energy, segments and limits."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Missions:
     """Runs over one profile, as tables.
 
     Attributes:
-        table: a row a run, `runs.csv`.
-        segments: a row a segment, `segments.csv`.
-        course: a row an accepted step that is kept, `history.csv`.
-        source: the profile that they follow.
-        whole: whether the course of every run reaches its end.
+        table: one row for each run, `runs.csv`.
+        segments: one row for each segment, `segments.csv`.
+        course: one row for each stored step, `history.csv`.
+        source: name of the profile.
+        whole: True if the history of every run reaches its end.
     """
 
     table: Columns
@@ -71,21 +71,21 @@ class Missions:
         }
 
 
-#: Segments of a cycle that a page has room for.
+#: Most segments of a cycle on a page.
 SEGMENTS = 60
-#: Numbers of each run, in the order of the table.
+#: Quantities of each run, in the order of the table.
 _RUNS = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
     *(output.column for output in TABLE["mission of sides"]), "status", "flags",
 )  # fmt: skip
-#: Those of each segment.
+#: Quantities of each segment.
 _OF_SEGMENTS = ("energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C")
 _NO_RETURN = "No energy returned to the source"
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
-    """The report of finished missions. In detail the first run."""
+    """Report of finished missions. The first run is shown in detail."""
     table, source = found.table, found.source
     shown_columns = capabilities.drop_inapplicable_columns(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
@@ -119,7 +119,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
 
 
 def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterable[Section]:
-    """The first run over time, from above, its energy and its segments."""
+    """Sections on the first run: over time, from above, energy and segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
     run_rows = found.course["run_id"] == name
     rows = {
@@ -186,7 +186,7 @@ def mission_answer(run: Json, on_ground: bool = True) -> str:
 
 
 def mission_limits(robot: Robot, run: Json) -> list[Json]:
-    """Use of each limit by a mission."""
+    """Table of the use of each limit by a mission."""
     motor, gearbox, heat = robot.motor, robot.gearbox, robot.knows(WARMING)
     speed, unknown = run["peak_motor_speed_rpm"], 0.0 if heat else np.nan
     limits = [
@@ -206,7 +206,7 @@ def mission_limits(robot: Robot, run: Json) -> list[Json]:
 
 
 def _exceeded_limits(found: Missions) -> Iterable[str]:
-    """Limits that were exceeded, in words, and in how many runs and segments."""
+    """Limits that were exceeded, in words, with the numbers of runs and segments."""
     raised = [str(f).split(";") for f in found.segments["flags"]]
     runs = [str(f).split(";") for f in found.table["flags"]]
     for flag in FLAGS:
@@ -218,7 +218,7 @@ def _exceeded_limits(found: Missions) -> Iterable[str]:
 
 
 def _charge_left(table: Columns) -> Iterable[str]:
-    """Cut-off charge of missions, if any was."""
+    """Sentence on the charge at cut-off, if a mission was cut off."""
     charge_left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
     if len(charge_left):
         span = (
@@ -230,7 +230,7 @@ def _charge_left(table: Columns) -> Iterable[str]:
 
 
 def _segments(found: Missions, name: str, idle: set[str]) -> Table:
-    """Segments of one run: the first cycle, and totals over all cycles."""
+    """Table of the segments of a run: the first cycle, and totals over all cycles."""
     source, many = found.source, found.source.cycles > 1
     shown_columns = [c for c in _OF_SEGMENTS if c not in idle]
     totals = [c for c in shown_columns if c != "rms_current_A"] if many else []

@@ -1,4 +1,4 @@
-"""The report of a resonance map: which speeds to avoid, the figure, natural frequencies, every confirmed peak."""
+"""Report of a resonance map: speeds to avoid, the map, natural frequencies and all confirmed peaks."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Cell, Document, Section, Table, remarks
 
-SAID = 3  # ranges to avoid in a sentence
+SAID = 3  # most ranges to avoid in a sentence
 
 
-#: Status of a run that is too slow for its ripple to be read.
+#: Status of a run that is too slow for its ripple to be evaluated.
 SLOW = "too_slow"
 
 
@@ -46,8 +46,8 @@ class ResonanceResult:
         configuration, slope_deg, surface: configuration, slope and surface of the map.
         passing: source of the excitation.
         robot: robot that was simulated.
-        table: a row a run, as in `points.csv`. The grid's first, then further points of Table 8.
-        modes: by payload [kg].
+        table: one row for each run, as in `points.csv`: the grid, then further points of Table 8.
+        modes: modes by payload [kg].
         peaks, crossings: peaks and crossings at every payload.
     """
 
@@ -63,7 +63,7 @@ class ResonanceResult:
 
     @property
     def resonances(self) -> list[Resonance]:
-        """Peaks over the payloads. Those without a mode are confirmed by none."""
+        """Peaks over the payloads. Peaks without a mode are not confirmed by one."""
         return group_resonances(self.peaks)
 
     @property
@@ -74,23 +74,23 @@ class ResonanceResult:
 
     @property
     def read(self) -> np.ndarray:
-        """Rows whose ripple is read."""
+        """True for rows whose ripple is evaluated."""
         return np.isfinite(self.table["reaction_ripple_percent"])
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """Least and greatest speed read [m/s], NaN without a reading."""
+        """Smallest and largest evaluated speed [m/s], NaN without one."""
         speed = self.table["speed_mean_mm_s"][self.read] * MM
         return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
 
     @property
     def statuses(self) -> dict[str, int]:
-        """Number of runs by status. Every status is included."""
+        """Number of runs with each status, zeros included."""
         return {s: int(np.sum(self.table["status"] == s)) for s in (*STATUSES, SLOW)}
 
     @property
     def avoid(self) -> list[tuple[float, float, list[Resonance]]]:
-        """Ranges of speed to avoid [m/s], lowest first, each of one mode and order, with what shows it."""
+        """Ranges of speed to avoid [m/s], lowest first, each for one mode and order, with its resonances."""
         by_mode: dict[tuple[str, int], list[Resonance]] = {}
         for r in strongest_resonances(self.resonances):
             by_mode.setdefault((r.mode, r.order), []).append(r)
@@ -102,7 +102,7 @@ class ResonanceResult:
 
     @property
     def restless(self) -> list[tuple[float, float]]:
-        """Ranges of speed in which some run did not settle [m/s], each half way to the next run that did."""
+        """Ranges of speed in which a run did not settle [m/s], each up to half way to the neighbouring runs."""
         ranges = []
         speed = self.travel * MM
         for payload in self.modes:
@@ -116,7 +116,9 @@ class ResonanceResult:
 
     @property
     def travel(self) -> np.ndarray:
-        """Speed of every run [mm/s]. Where it has none, as its voltage has it in the others (NaN: in none)."""
+        """Speed of every run [mm/s]. Missing ones follow from the voltage by a line through the others, NaN if there
+        are too few.
+        """
         speed, voltage = self.table["speed_mean_mm_s"], self.table["supply_voltage_V"]
         if self.read.sum() < 2:
             return speed
@@ -125,7 +127,7 @@ class ResonanceResult:
 
     @property
     def quiet(self) -> list[tuple[float, float]]:
-        """Ranges of speed without peaks to avoid, at any payload, where every run settles [m/s]."""
+        """Ranges of speed [m/s] without peaks to avoid at any payload, in which every run settles."""
         low, high = self.speeds
         gaps = []
         for begin, end in _merge_ranges([*((a, b) for a, b, _ in self.avoid), *self.restless]):
@@ -186,7 +188,7 @@ class ResonanceResult:
         return float(np.nanmax(self.table[f"{signal}_ripple_percent"]))
 
     def _spread(self) -> list[tuple[str, float, float]]:
-        """Modes that amplify but change by an octave with the position of the belt, with their range [Hz]."""
+        """Modes that amplify but vary by an octave over the position of the belt, with their range [Hz]."""
         amplifying_modes = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
         names = dict.fromkeys(m.name for m in amplifying_modes)
         return [
@@ -199,7 +201,7 @@ class ResonanceResult:
         ]
 
     def _table8(self) -> str:
-        """Sentence on the points of Table 8 in a range to avoid, by payload."""
+        """Sentence on the points of Table 8 within ranges to avoid, by payload."""
         rows = np.flatnonzero(self.table["table8"] & self.read)
         inside = []
         for voltage in np.unique(self.table["supply_voltage_V"][rows]):
@@ -269,7 +271,7 @@ class ResonanceResult:
 
 
 def _merge_ranges(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Ranges as few that do not overlap, lowest first."""
+    """Merges overlapping ranges, lowest first."""
     merged: list[tuple[float, float]] = []
     for low, high in sorted(ranges):
         if merged and low <= merged[-1][1]:
@@ -280,7 +282,7 @@ def _merge_ranges(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, fl
 
 
 def ripple_percent(value: float) -> str:
-    """A ripple [%] as a sentence has it."""
+    """Ripple [%] as text for a sentence."""
     return "under 0.01 %" if value < 0.01 else f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
 
@@ -305,12 +307,12 @@ def span_text(low: float, high: float, unit: float = MM) -> str:
 
 
 _FEW = "travels, but fewer than {} {} passed while ripple was measured. Use a longer --duration"
-#: Most peaks that are shown unfolded.
+#: Most peaks that are not folded.
 UNFOLDED = 30
 
 
 def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
-    """The report of a map."""
+    """Report of a resonance map."""
     first, *others = found.sentences
     passing = found.passing
     lead = f"**{found.configuration}**, slope {found.slope_deg:g}°, {found.surface}; {found.read.size} runs."
@@ -340,7 +342,7 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
                 "modes",
             ),
             Section(
-                "Peaks of ripple over speed",
+                "Peaks of ripple against speed",
                 (catalogue.note("resonance.peaks", passing.name, 100 * MATTERS),),
                 "peaks",
             ),
@@ -365,7 +367,7 @@ def _peaks(found: ResonanceResult) -> Table:
 
 
 def _points(found: ResonanceResult) -> Table:
-    """Operating points of Table 8."""
+    """Table of the operating points of Table 8."""
     table = found.table
     rows = [
         (

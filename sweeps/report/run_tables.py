@@ -1,4 +1,4 @@
-"""Blocks that reports of simulated runs share: how runs ended, limits, and quantities in words of the registries."""
+"""Blocks that reports of simulated runs share: statuses, limits, and quantities with names from the registries."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from sweeps.points.imposed import UNLIMITED
 from sweeps.report import catalogue
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
-#: Units of what may be imposed on a run, by column.
+#: Units of quantities that may be imposed on a run, by column.
 UNITS = {column: column.rpartition("_")[2] for column, _ in IMPOSED.values()}
 
 
 def imposed_column(runs: Iterable[str]) -> str:
-    """Column of what is imposed in runs: conditions come before readings."""
+    """Column of the imposed quantity of runs: conditions precede readings."""
     return next(column for column in runs if column in UNITS)
 
 
 def _column(condition: Condition) -> str:
-    """Column of a condition. That of its channel for an imposed speed or current."""
+    """Column of a condition. For an imposed speed or current, that of its channel."""
     return next((c.column for c in channels.EVERY if c.name == condition.name), condition.column)
 
 
@@ -53,7 +53,7 @@ def condition_formats(table: Columns, *, mass: bool = False) -> dict[str, tuple[
     return {c: about for c, about in formats.items() if mass or c != "total_mass_kg"}
 
 
-#: Quantities by column, of several of one column that of runs.
+#: Quantities by column. If several have the same column, that of runs.
 _REGISTERED = {
     q.column: q
     for place in ("derived", "mission of sides", "mission", "run", "channel of a turn", "channel")
@@ -67,13 +67,13 @@ _OTHERS = {
     "time_end_s": ("time at the end", "s", "{:.6g}"),
     "permissible_time_s": ("permissible time at this current", "s", "{:.3g}"),
 }
-#: What a number that is infinite, or missing, means in some columns.
+#: Text for infinite or missing numbers in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
 _MISSING = {"supply_voltage_V": "battery", "flags": "none"}
 
 
 def quantity_column(name: str, **options: Any) -> Column:
-    """The column of a quantity in a report, from the name of its column in a table of runs."""
+    """Column of a quantity in a report, from the name of its column in a table of runs."""
     if name in _REGISTERED:
         q = _REGISTERED[name]
         return Column(q.label, q.unit_shown.replace("-", ""), f"{{:.{q.resolution}f}}", **options)
@@ -86,7 +86,7 @@ def quantity_column(name: str, **options: Any) -> Column:
 
 
 def quantity_cells(table: Columns, name: str) -> list[Any]:
-    """Cells of a column, each with its standard deviation if the table has one. Infinite numbers in words."""
+    """Cells of a column, each with its standard deviation if the table has one. Infinite numbers are in words."""
     values, spread = table[name], table.get(name + uncertainty.SD)
     if spread is not None:
         digits = _REGISTERED[name].resolution
@@ -102,11 +102,11 @@ def quantity_cells(table: Columns, name: str) -> list[Any]:
 
 
 def quantity_table(name: str, table: Columns, names: Iterable[str], **options: Any) -> Table:
-    """The quantities `names` that a table of runs has numbers of, a row for each run.
+    """Table with one row for each run, of those quantities `names` that the table of runs has.
 
     Args:
         name: name of the table.
-        options: further fields of it, and its `first` columns with their cells.
+        options: further fields of the table, and its `first` columns with their cells.
     """
     first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
     shown_names = [
@@ -122,7 +122,7 @@ def _is_empty(values: np.ndarray) -> bool:
 
 
 def reading_text(value: Any, channel: Channel) -> str:
-    """A reading with one digit less than its channel's resolution. A dash for a missing one."""
+    """Reading with one digit less than its channel's resolution. A dash if it is missing."""
     return Column("", form=f"{{:.{max(channel.resolution - 1, 0)}f}}").text(value)
 
 
@@ -140,13 +140,18 @@ def reading_columns(shown: Iterable[Channel], kinds: Mapping[str, str]) -> list[
 
 
 def note_on_robot(file: RobotFile, model: str = "", more: str = "") -> Note:
-    """The line below the answer: robot, fidelity and a further sentence."""
+    """Line below the answer: robot, fidelity and a further sentence."""
     parts = [f"Robot: **{capabilities.displayed_name(file)}**.", f"Fidelity: **{model}**." * bool(model), more]
     return Note(" ".join(filter(None, parts)), "lead")
 
 
+def lost_by_load(robot: Robot) -> bool:
+    """True if an effect of the robot loses a share of the load in the gearbox."""
+    return any(e.balance == "gearbox" and e.driver == "load" for e in robot.effects)
+
+
 def curve_warning(robot: Robot) -> tuple[Note, ...]:
-    """A warning of curves of a robot that nobody has named, if it has any."""
+    """Warning if the robot has curves for unexplained discrepancies."""
     names = " and ".join(f"`{e.name}`" for e in robot.effects if e.name in effects.UNNAMED)
     return (catalogue.note("run.curves", names),) if names else ()
 
@@ -158,12 +163,12 @@ def endings_table(
     meanings: Mapping[str, str] = MappingProxyType({}),
     **more: Json,
 ) -> Table:
-    """How runs or points ended: statuses that occurred, in words, with their number.
+    """Table of the statuses of runs or points that occurred, in words, with their number.
 
     Args:
-        counts: by status.
-        meanings: meanings of statuses that are no fidelity's.
-        more: further columns, each by status.
+        counts: number by status.
+        meanings: meanings of statuses that do not come from a fidelity.
+        more: further columns, with values by status.
     """
     total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
     further = (f"~{name.replace('_', ' ')}" for name in more)
@@ -180,18 +185,17 @@ def endings_table(
 
 
 def limits_table(limits: Sequence[Json], what: str) -> Table:
-    """Use of each limit: its value, the limit and the share of it that is used."""
+    """Table of the use of each limit: value, limit, and share that is used."""
     rows = [(limit["words"], limit["value"], limit["limit"], _used(limit)) for limit in limits]
     return catalogue.table("run.limits", rows, f"{what} |")
 
 
 def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) -> list[Json]:
-    """Use of each known limit: words, its value, the limit, and the share of it [%].
-
-    A winding has the share of its permissible temperature rise.
+    """Use of each known limit: name, value, limit, and share of the limit [%]. For windings it is the share of the
+    permissible temperature rise.
 
     Args:
-        asked: words, value, limit, and format with the unit. NaN: unknown.
+        asked: name, value, limit, and format with unit. NaN: unknown.
         ambient: temperature [°C].
     """
     return [
@@ -206,7 +210,7 @@ def use_of_limits(asked: Iterable[tuple[str, Any, Any, str]], ambient: float) ->
 
 
 def warming_share(value: float, limit: float, ambient: float) -> float:
-    """Share of what a winding may warm up by above the surroundings [%]."""
+    """Share of a winding's permissible temperature rise [%]."""
     return 100 * (value - ambient) / max(limit - ambient, 1.0)
 
 

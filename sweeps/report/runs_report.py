@@ -1,4 +1,4 @@
-"""The report of `simulate`: each run's readings, its limits, its history from standstill, where its power goes."""
+"""Report of `simulate`: readings, limits, history from standstill and power balance of each run."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from sweeps.report.run_tables import imposed_column
 from sweeps.report.words import posture_words
 from sweeps.report.words.posture_words import Postures
 
-#: Column of the largest current of all motors together in a run over time.
+#: Column of the largest total motor current in a run over time.
 PEAK = "peak_current_A"
-#: Quantities of a run before and after its readings, in the order of the table.
+#: Quantities before and after the readings of a run, in the order of the table.
 _CONDITIONS = ("total_mass_kg", "slope_deg", "load_torque_Nm", "duty_left", "duty_right", "heading_deg")
 _FURTHER = (
     PEAK, "displacement_m", "time_end_s", "voltage_cell_V", "slip", "power_supply_W", "power_motor_W", "power_gear_W",
     "power_ground_W", "power_lift_W", "winding_settled_C", "permissible_time_s", "adhesion_used", "status", "flags",
 )  # fmt: skip
-HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
+HISTORIES, CHAINS, GEARS = 4, 12, 2  # most runs in a figure
 
 
 def runs_document(
@@ -42,12 +42,12 @@ def runs_document(
     stands: Postures | None = None,
     notes: Sequence[str] = (),
 ) -> Document:
-    """The report of a few finished runs.
+    """Report of a few finished runs.
 
     Args:
-        runs: the finished table of runs.
-        histories: the same as a batch with its history, if it is kept.
-        stands: in which posture, where the runs state levers.
+        runs: table of the finished runs.
+        histories: the runs as a batch with histories, if these are kept.
+        stands: postures, if the runs state lever angles.
         notes: remarks on the runs.
     """
     robot, names = file.robot, run_headings(runs)
@@ -81,10 +81,10 @@ def runs_document(
 
 
 def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]) -> str:
-    """One sentence: readings of a single run and its most used limit, or how many of several runs settle.
+    """One sentence: readings of a single run and its most used limit, or the number of runs that settle.
 
     Args:
-        used: limits of a single run, as `limits_used` returns them.
+        used: limits of a single run, from `limits_used`.
     """
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
@@ -105,13 +105,13 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
 
 
 def run_headings(runs: Columns) -> list[str]:
-    """A heading for each run: its name where it has one, and its conditions."""
+    """Heading for each run: its name if it has one, and its conditions."""
     headings = [conditions_in_words(runs, k) for k in range(len(runs["status"]))]
     return [f"{runs['run_id'][k]}: {heading}" for k, heading in enumerate(headings)] if "run_id" in runs else headings
 
 
 def conditions_in_words(table: Columns, row: int) -> str:
-    """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
+    """Conditions of a row in words: the imposed quantity, and for vehicles payload, slope and a rig's surface."""
     parts = [str(table["configuration"][row])]
     if "supply_voltage_V" in table:
         parts.append("battery" if math.isnan(volts := float(table["supply_voltage_V"][row])) else f"{volts:g} V")
@@ -129,7 +129,7 @@ def conditions_in_words(table: Columns, row: int) -> str:
 
 
 def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatch) -> Iterable[Section]:
-    """Runs over time: as instruments show them, or from standstill on a ground, with what the running gear does."""
+    """Section on runs over time: readings of instruments, or starts on a ground, with effects of the running gear."""
     from sweeps.pages import gear_figures, history_figures
 
     configuration_indices = [robot.configurations.index(str(c)) for c in runs["configuration"]]
@@ -159,14 +159,14 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
         return
     share = np.asarray(histories.columns["guide_share"])
     gears = gear_figures.gear_runs(robot, history, status, share, configuration_indices, names[:GEARS])
-    # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
+    # Ripple is evaluated in steady travel: contacts stop sliding before the evaluated part.
     ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
     if ripples:
         yield Section("Inside the running gear", tuple(_gear(ripples)), "gear")
 
 
 def starts_table(starts: Sequence[Any]) -> Table:
-    """Stages, currents and slip of each start, without stages where a run does not get under way."""
+    """Table of stages, currents and slip of each start. Runs that do not get under way have no stages."""
     rows = []
     for s in starts:
         numbers: list[float | None] = [None] * 10
@@ -180,14 +180,14 @@ def starts_table(starts: Sequence[Any]) -> Table:
 
 
 def ripple_table(ripples: Sequence[Any]) -> Table:
-    """Ripple of each run at its end."""
+    """Table of the ripple at the end of each run."""
     from sweeps.pages import gear_figures
 
     return catalogue.table("runs.ripple-table", [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
 
 
 def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
-    """Ripple of currents, speeds and reactions at the end of runs."""
+    """Section on the ripple of currents, speeds and reactions at the end of runs."""
     yield catalogue.figure("runs.ripple", ripples)
     yield ripple_table(ripples)
     for gear in [g for g in ripples if g.on_tracks][:1]:
@@ -218,7 +218,7 @@ def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[
 
 
 def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:
-    """Chart of motor and gear with the settled runs that a supply feeds, forward."""
+    """Chart of motor and gear with the settled forward runs on a supply."""
     from sweeps.pages import power_figures
 
     supply = runs.get("supply_voltage_V", np.full(len(runs["status"]), np.nan))
@@ -230,7 +230,7 @@ def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:
 
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:
-    """Use of each limit by a run. The inrush current has no share of a limit that is not stated."""
+    """Use of each limit by a run. The inrush current has no share if its limit is not stated."""
     idle = capabilities.inapplicable_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / RPM
@@ -240,7 +240,7 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
         if turning
         else math.nan
     )
-    cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
+    cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: no supply
     gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
     limits = [
         ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}"),
@@ -263,7 +263,9 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
 
 
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
-    """Largest current of the driver, or of the battery less other consumers, for all motors [A]. None: not stated."""
+    """Largest current for all motors [A]: that of the driver, or of the battery minus other consumers. None: not
+    stated.
+    """
     most, battery = float(robot.driver.current_limit), robot.battery
     limits = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:

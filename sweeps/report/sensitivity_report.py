@@ -1,4 +1,4 @@
-"""The report of a sensitivity study: the answer first, then every output, interactions, convergence, next runs."""
+"""Report of a sensitivity study: the answer, then each output, interactions, convergence and next runs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sweeps.pages.words import short_name
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
 
-#: Pairs of a table of interactions, and outputs that are shown unfolded.
+#: Most pairs in a table of interactions, and most outputs that are not folded.
 PAIRS, UNFOLDED = 5, 3
 #: Measure of the shares of the overview, by method.
 _OF = {"local": " to first order", "morris": ", by squared effects"}
 
 
 def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
-    """The report of a finished study."""
+    """Report of a finished study."""
     method = f"Method: {sensitivity_words.METHODS[found.method]} (`{found.method}`)"
     ran = f", {found.evaluations:,} model evaluations in {found.seconds:.1f} s." if found.evaluations else "."
     overview = catalogue.figure(
@@ -30,7 +30,7 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
     )  # fmt: skip
     idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
     said = [*([idle] if found.negligible else []), *_next_runs_in_words(found), *found.notes]
-    # The inputs that decide each output
+    # the most important inputs for each output
     rows = []
     for study in found.outputs.values():
         share = study.overall_share
@@ -71,7 +71,7 @@ def _any_influence(study: OutputStudy) -> bool:
 
 
 def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable[Block]:
-    """Tornado and indices of an output, and interactions that are sure, the strongest first."""
+    """Section on an output: tornado, indices, and certain interactions, the strongest first."""
     label = study.row.label
     for kind in ("tornado", "indices"):
         figure = catalogue.figure(
@@ -88,7 +88,7 @@ def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable
 
 
 def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
-    """Sentence on the inputs that decide an output, with its spread."""
+    """Sentence on the most important inputs for an output, with its spread."""
     share, row = study.overall_share, study.row
     if not _any_influence(study):
         return "No value at any of these operating points, or no input changes it."
@@ -106,7 +106,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
 
 
 def _inputs(found: SensitivityResult) -> Table:
-    """Every input with its distribution, the most important first."""
+    """Table of all inputs with their distributions, the most important first."""
     importance, rows = found.importance(), []
     for k in np.argsort(-importance, kind="stable"):
         name, share = found.names[k], importance[k]
@@ -125,7 +125,7 @@ def _next_runs_in_words(found: SensitivityResult) -> Iterable[str]:
 
 
 def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
-    """Runs that tell most of the inputs, and what they leave uncertain."""
+    """Section on the most informative runs, and the uncertainty that remains after them."""
     yield catalogue.note("sensitivity.optimal", n.candidates, n.source, n.noise)
     points = n.points
     imposed = "supply [V] | g" if points.motor_speed is None else "motor speed [rpm] | g"
@@ -148,12 +148,12 @@ def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
 
 
 def _two_digits(sd: float) -> str:
-    """Two digits of an sd, without an exponent."""
+    """Sd as text with two digits, without an exponent."""
     return f"{sd:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))}f}"
 
 
 def _ranges(found: SensitivityResult) -> str:
-    """Values of the operating points with a studied output."""
+    """Values of the operating points at which an output was studied, in words."""
     p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     _, own_values, symbol = p.imposed

@@ -1,4 +1,4 @@
-"""The report of `settle`: the settled runs of a log, and why other samples are left out."""
+"""Report of `settle`: the settled runs of a log, and the reasons for omitting other samples."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _settled(found: Settled) -> Table:
 
 
 def _levels(found: Settled) -> Iterator[tuple[Stretch, int]]:
-    """Each settled run with the number of samples since the stretch before it in the same recording."""
+    """Settled runs, each with the number of samples since the previous stretch of the same recording."""
     names, before = found.runs.run_names, -1
     for s in found.stretches:
         first, last = int(s.rows[0]), int(s.rows[-1])

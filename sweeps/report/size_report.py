@@ -1,4 +1,4 @@
-"""The report of `size`: the best design, the limits over its use, the front, and every motor's best."""
+"""Report of `size`: the best design, its limits, the Pareto front, and the best design of each motor."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class SizeResult:
 
     Attributes:
         asked: the requirements.
-        robot: where the search started.
-        sizing: its result.
+        robot: initial robot of the search.
+        sizing: result of the search.
         objectives: minimised numbers.
         outcomes: results of `check` for the best design, empty without one.
-        charts: limits over payload and slope of the best design, if any, and of `robot`, empty without a page.
+        charts: limits over payload and slope, for the best design (if any) and for `robot`. Empty without a page.
     """
 
     asked: Requirements
@@ -42,7 +42,7 @@ class SizeResult:
     charts: tuple[MarginChart, ...] = ()
 
     def statement(self) -> str:
-        """The answer: the best design and its binding limits, or the nearest one and its misses."""
+        """The answer: the best design and its binding limits, or the nearest design and the limits that it misses."""
         s = self.sizing
         left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)} (dropped)." if s.unmeetable else ""
         if s.best is None:
@@ -72,7 +72,7 @@ class SizeResult:
 
 
 def design_verdict(found: SizedDesign, unmeetable: Names) -> str:
-    """Verdict on a design. `unmeetable`: requirements that no choice of parts meets, which were dropped."""
+    """Verdict on a design. `unmeetable`: requirements that no choice of parts meets, which were ignored."""
     return "misses" if not found.feasible else "meets the others" if unmeetable else "meets"
 
 
@@ -96,7 +96,7 @@ def describe_design(found: SizedDesign) -> str:
 
 
 def objective_text(found: SizedDesign, name: str) -> str:
-    """An objective with its unit, or `not stated` if no sheet states it."""
+    """Objective with its unit, or `not stated` if no data sheet states it."""
     unit, words = OBJECTIVES[name]
     return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"
 
@@ -108,13 +108,13 @@ COLUMNS = columns(
 )  # fmt: skip
 
 
-#: Motors that the terminal shows.
-SHOWN = 5
+#: Number of motors in the table of a terminal, and of further designs in its few lines.
+SHOWN, NEXT = 5, 2
 _DESIGNS = "The best design, and the best designs with other parts, with the makers' gear ratios and whole cells."
 
 
 def size_document(found: SizeResult, robot_name: str) -> Document:
-    """The report of a sizing that started from a robot of that name."""
+    """Report of a search that started from the named robot."""
     s, objective_words = found.sizing, ", ".join(OBJECTIVES[name][1] for name in found.objectives)
     lead = (
         f"Requirements: **{found.asked.source}**. Starting from: **{robot_name}**. Minimised: **{objective_words}**. "
@@ -133,11 +133,20 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
             *_chart(found),
         ),
+        brief=(lead, *_next_best(found), *_front_in_words(found)),
     )
 
 
+def _next_best(found: SizeResult) -> Names:
+    """A line on the best designs with other parts, none without a design."""
+    designs = [
+        f"{describe_design(f)} ({objective_text(f, found.sizing.objective)})" for f in found.sizing.alternatives
+    ]
+    return (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
+
+
 def _chart(found: SizeResult) -> tuple[Section, ...]:
-    """Chart of motor and gear of the best design, if there is one."""
+    """Chart of motor and gear for the best design, if there is one."""
     best = found.sizing.best
     if best is None:
         return ()
@@ -173,22 +182,25 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
 
 
 def _share_within_limits(c: MarginChart) -> str:
-    """The share of a chart within all limits, and the limit that is most often nearest."""
+    """Share of a chart within all limits, and the most frequent nearest limit."""
     (most, _), *_ = Counter(c.nearest.ravel().tolist()).most_common(1)
     within = f"{100 * np.mean(c.margin >= 0):.0f} % of payloads up to {c.payload[-1]:.3g} kg and slopes up to "
     return f"{within}{c.slope[-1]:.3g}° are within all limits, the nearest is mostly {LIMITS[most]}"
 
 
-def _front(found: SizeResult) -> tuple[Figure | Note, ...]:
+def _front_in_words(found: SizeResult) -> Names:
+    """A sentence on the Pareto front, none without one."""
     front = found.sizing.front
     if not front:
         return ()
     first, second = found.objectives
-    text = (
-        f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
-        f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}"
-    )
     return (
-        Note(f"{text}.", terminal=True),
-        catalogue.figure("size.front", found, finding=text),
+        f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
+        f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}.",
     )
+
+
+def _front(found: SizeResult) -> Iterable[Figure | Note]:
+    for text in _front_in_words(found):
+        yield Note(text, terminal=True)
+        yield catalogue.figure("size.front", found, finding=text)

@@ -1,4 +1,4 @@
-"""The report of a sweep: how its runs ended, which limits they exceed, and every channel over the grid."""
+"""Report of a sweep: statuses of the runs, exceeded limits, and every channel over the grid."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sweeps.report.run_tables import imposed_column, quantity_column
 
 
 def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:
-    """The report of a finished sweep of any grid."""
+    """Report of a finished sweep."""
     shown_runs = capabilities.drop_inapplicable_columns(file.robot, runs)
     statuses = Counter(map(str, runs["status"]))
     statuses_known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
@@ -51,7 +51,7 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
 
 
 def sweep_answer(runs: Columns) -> str:
-    """One sentence: runs that have an operating point, and how many of them stay within every limit."""
+    """One sentence: number of runs with an operating point, and of those within all limits."""
     total = len(runs["status"])
     settled = np.isin(runs["status"], words.SETTLED)
     is_flagged = settled & (runs["flags"] != "")
@@ -68,7 +68,7 @@ def sweep_answer(runs: Columns) -> str:
 
 
 def _limits(runs: Columns) -> Table:
-    """Limits that some runs exceed, with the number of runs and their places."""
+    """Table of limits that some runs exceed, with the number of runs and where they are."""
     kinds, flag_index = np.unique(runs["flags"], return_inverse=True)
     rows = []
     for flag, meaning in words.FLAGS.items():
@@ -79,13 +79,13 @@ def _limits(runs: Columns) -> Table:
 
 
 def _axes(runs: Columns) -> list[str]:
-    """Columns of the axes that runs have: on the battery no voltage, and no readings."""
+    """Columns of the grid's axes: on the battery without voltage, and without readings."""
     axes = ("configuration", imposed_column(runs), "payload_kg", "slope_deg", "load_torque_Nm")
     return [c for c in axes if c in runs and (runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all())]
 
 
 def _levels(runs: Columns, name: str, pick: np.ndarray | slice = slice(None), most: int = 8) -> str:
-    """Levels of an axis at the picked runs, in words: `slope 0, 10°`."""
+    """Values of an axis for the selected runs, in words: `slope 0, 10°`."""
     values, column = runs[name][pick], quantity_column(name)
     levels = np.unique(values)
     if levels.dtype.kind not in "fiu":
@@ -97,7 +97,7 @@ def _levels(runs: Columns, name: str, pick: np.ndarray | slice = slice(None), mo
 
 
 def _ranges_of_runs(runs: Columns, pick: np.ndarray) -> str:
-    """Ranges of slope and imposed quantity of the picked runs, by configuration, in words."""
+    """Ranges of slope and imposed quantity for the selected runs, by configuration, in words."""
     parts = []
     for kind in dict.fromkeys(map(str, runs["configuration"][pick])):
         of_kind = pick & (runs["configuration"] == kind)
@@ -108,7 +108,7 @@ def _ranges_of_runs(runs: Columns, pick: np.ndarray) -> str:
 
 
 def _extremes(runs: Columns, names: Iterable[str]) -> Table:
-    """The settled runs with the largest readings, slip and winding temperature."""
+    """Table of the settled runs with the largest readings, slip and winding temperature."""
     settled = np.nonzero(np.isin(runs["status"], words.SETTLED))[0]
     reached = [c for c in names if c in runs and not np.isnan(runs[c][settled]).all()]
     rows = []

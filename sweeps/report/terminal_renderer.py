@@ -1,4 +1,4 @@
-"""A document as text for a terminal: its answer, tables and notes."""
+"""Renderer for the terminal: answer, tables and notes of a document."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rich.text import Text
 from sweeps.console import print_output
 from sweeps.report.document import SIDE_BY_SIDE, TERMINAL_ROWS, Document, Note, Table, cell_tone, plain_text
 
-#: Longest text of a column that is never broken into lines.
+#: Longest text in columns that are never wrapped.
 SHORT = 12
 #: Styles of cells by tone.
 TONES = {"bad": "red"}
 
 
 def print_document(document: Document, brief: bool = False) -> None:
-    """Print a document: the answer first, then what its blocks show on a terminal, or its `brief` lines."""
+    """Prints a document: the answer, then its blocks for the terminal or its `brief` lines."""
     print_output(plain_text(document.answer))
     if brief:
         print_output("\n".join(map(plain_text, document.brief)))
@@ -32,7 +32,7 @@ def print_document(document: Document, brief: bool = False) -> None:
 
 
 def print_table(table: Table) -> None:
-    """Print a table for a person, without the columns and rows that only the page has room for."""
+    """Prints a table without the columns and rows that only the page shows."""
     turned_table = table.turned
     rows = turned_table.rows if turned_table.brief is None else [turned_table.rows[k] for k in turned_table.brief]
     if table.file and len(rows) > TERMINAL_ROWS:

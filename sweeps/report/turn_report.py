@@ -1,4 +1,4 @@
-"""The report of a turn: what either side takes, the path from above, and what other turns take."""
+"""Report of a turn: demands of each side, path from above, and demands of other turns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sweeps.report.document import Document, Section, Table, remarks
 from sweeps.report.runs_report import run_headings
 from sweeps.report.words import turn_words
 
-#: What either side does: words, column, format.
+#: Quantities of each side: name, column, format.
 _ROWS = (
     ("voltage [V]", "motor_voltage_{}_V", "z.2f"),
     ("current [A]", "motor_current_{}_A", "z.3f"),
@@ -36,13 +36,13 @@ def turn_document(
     turns: Columns | None,
     notes: Sequence[str] = (),
 ) -> Document:
-    """The report of one turn.
+    """Report of a turn.
 
     Args:
-        run: its row of `runs.csv`.
-        ended: its time, distance and angle at the end, of a run over time.
-        history: history over time, of a fidelity that keeps it.
-        turns: settled ones of other duties of the slower side.
+        run: row of the turn in `runs.csv`.
+        ended: time, distance and angle at the end of a run over time.
+        history: history over time, if the fidelity keeps it.
+        turns: settled turns at other duties of the slower side.
         notes: further remarks.
     """
     robot, row = file.robot, {name: values[0] for name, values in run.items()}
@@ -70,7 +70,7 @@ def turn_document(
 
 
 def sides_table(robot: Robot, row: Columns) -> Table:
-    """What the left and the right side do, without rows if no motion is known."""
+    """Table of both sides, without rows if no motion is known."""
     idle, yaw_known = capabilities.inapplicable_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
     rows = []
     for label, column, form in _ROWS if yaw_known else ():

@@ -27,7 +27,9 @@ GOAL = "goal_angle"
 LIMIT = 0.9
 RUNS, ROWS = 4, 200
 EVERY = (0.005, 0.01, 0.02)  # [s]
-STEP = 1e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
+#: Time constant of a winding [s], and of a servo's, which its file states. Steps are half as long: the method is stable
+#: to 2.7 of them.
+WINDING, SERVO_WINDING = 2e-4, 1e-3
 REST = 0.01  # of the output, within which friction at an imposed speed is smoothed [rad/s]
 RELATIVE = {
     "resistance": 0.05, "torque_constant": 0.03, "friction": 0.3, "viscous": 0.3, "efficiency": 0.04,
@@ -50,6 +52,10 @@ CHANNELS = {
 ENCODER, COARSE = 360 / 1024, 2.5
 
 
+#: Amplitudes that are simulated to find the one that leaves a wanted strength [ordinary sizes].
+LADDER = np.geomspace(0.003, 3.0, 13)
+#: Change of a torque [of the rig's] at which the rounds that find the torque at the output end.
+SETTLED = 1e-10
 LAWS = laws.LOGS | laws.OUTSIDE_LOGS
 #: Turn over which the contacts of `presliding` yield [rad], the library's own.
 YIELDS = 0.02
@@ -109,6 +115,11 @@ class Rig:
         return tuple(n for n in RELATIVE if n in self.p and (n != "resistance" or of_voltage))
 
     @property
+    def winding(self) -> float:
+        """Time constant of the winding [s]."""
+        return SERVO_WINDING if self.imposed == GOAL else WINDING
+
+    @property
     def scale(self) -> SimpleNamespace:
         return SimpleNamespace(rated=self.rated, torque=self.torque, w_k=self.w_k, supply=self.supply, **self.p)
 
@@ -148,7 +159,8 @@ def rig(
     inputs = np.stack([_inputs(rng, imposed, every, supply, rated, fast) for _ in range(RUNS)])
     late = float(rng.choice([0.0, rng.uniform(0.0, 2.0)]))
     # The current of an imposed speed jumps from row to row with its slope: late by whole rows it is not read in between.
-    delay = every * (round(late) if imposed == "motor_speed" else late)
+    step = (SERVO_WINDING if imposed == GOAL else WINDING) / 2  # readings are those of a step
+    delay = every * round(late) if imposed == "motor_speed" else step * round(late * every / step)
     made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, delay, {})
     made = dataclasses.replace(made, alone=alone and imposed != "motor_speed")
     shown = histories(made, [p])[0]
@@ -182,7 +194,7 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
         members: constants of each.
         terms: of each.
     """
-    count, per = len(members), round(r.every / STEP)
+    count, per = len(members), round(2 * r.every / r.winding)
     p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
     inputs = np.tile(r.inputs, (count, 1))
     every = _side_by_side(terms or ())
@@ -214,18 +226,26 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
             s.rate = turn
         else:
             A = C * s.I - idle - extra("motor")
+            earlier, last, share = s.B, None, 1.0
             for _ in range(1 + ROUNDS * any(t.law.balance == "gearbox" for t in every)):
-                B = load + extra("gearbox")
+                before, B = s.B, load + extra("gearbox")
                 eta = teeth(A * J_w + i * J_d * B, s.d, p["efficiency"])
                 s.rate = (i * eta * A - B) / (J_w + J_d * i**2 * eta)
-                s.B = load + J_w * s.rate  # transmitted to the output, which effects of the gearbox see
+                change = load + J_w * s.rate - before  # to what is transmitted to the output
+                if last is not None:  # a secant
+                    bend = last - change
+                    share = np.where(bend == 0, 1.0, (before - earlier) / np.where(bend == 0, 1.0, bend))
+                s.B = before + share * change
+                if not (np.abs(change) > SETTLED * r.torque).any():  # NaN: no such run
+                    break
+                earlier, last = before, change
         if r.imposed == GOAL:
             duty = np.clip(p["kp"] * (given - s.turn) - p["kd"] * s.w_k, -LIMIT, LIMIT)
-            s.dI = (duty * r.supply - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
+            s.dI = (duty * r.supply - C * s.w - R * s.I - extra("electrical")) / (r.winding * R)
         elif r.imposed == "voltage":
-            s.dI = (given - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
+            s.dI = (given - C * s.w - R * s.I - extra("electrical")) / (r.winding * R)
         else:
-            s.dI = (given - s.I) / 2e-4
+            s.dI = (given - s.I) / r.winding
         return s
 
     def rates(time, y, given, slope, brake, way=None):
@@ -339,21 +359,19 @@ def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence
     return every[0], [(x - every[0]) / 1e-2 for x in every[1 : 1 + n]], [x - every[0] for x in every[1 + n :]]
 
 
-def oracle(r: Rig, term: Term, y: np.ndarray, columns: np.ndarray) -> dict[str, Any]:
+def rivals(r: Rig) -> list[Term]:
+    """Library effects that a log of a rig may have, each with the shapes of its grid."""
+    able = {n: law.at(r.scale) for n, law in LAWS.items() if law.cls and law.needs(r.imposed)}
+    return [Term(n, 0.02 * law.size, shapes, law) for n, law in able.items() for shapes in law.grid(9)]
+
+
+def oracle(term: Term, left: np.ndarray, tried: Sequence[Term], units: Sequence[np.ndarray]) -> dict[str, Any]:
     """Library effects that readings without noise could not tell from a term, and what the best other one would leave
     [σ], each with the amplitude and, of a few, the shapes that explain most of it.
 
     Args:
-        y: whitened readings without it.
-        columns: slopes by the constants, shape (readings, constants).
+        left, units: what a refit of the constants leaves of the term, and of each one `tried` [σ].
     """
-    tried = []
-    for name, law in LAWS.items():
-        if law.cls and law.needs(r.imposed):
-            at = law.at(r.scale)
-            tried += [Term(name, 0.02 * at.size, shapes, at) for shapes in at.grid(9)]
-    shown = [whitened(r, x) for x in histories(r, [r.p] * (1 + len(tried)), [[term], *([t] for t in tried)])]
-    left, *units = (remainder(np.nan_to_num(x - y, nan=1e3).ravel(), columns) for x in shown)
     size, apart = float(np.linalg.norm(left)), {}
     for t, unit in zip(tried, units, strict=True):
         along = float(left @ unit) / max(float(np.linalg.norm(unit)), 1e-9)
@@ -373,19 +391,23 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
     terms: tuple[Term, ...] = ()
     effects = []
     if name:
-        term = shaped(name, rng, LAWS[name].at(r.scale))
-        term = dataclasses.replace(term, amplitude=0.05 * term.law.size)
-        y, base, (change,) = slopes(r, r.p, (), [[term]])
+        term, tried = shaped(name, rng, LAWS[name].at(r.scale)), rivals(r)
+        rungs = [dataclasses.replace(term, amplitude=x * term.law.size) for x in LADDER]
+        y, base, changes = slopes(r, r.p, (), [[t] for t in (*rungs, *tried)])
         columns = np.stack([b.ravel() for b in base], 1)
-        left = float(np.linalg.norm(remainder(change.ravel(), columns)))
-        for _ in range(4):  # what is left does not quite grow as the amplitude
-            larger = float(np.clip(sigmas / max(left, 1e-9), 0.1, 30.0))
-            term = dataclasses.replace(term, amplitude=term.amplitude * larger)
-            change = whitened(r, histories(r, [r.p], [[term]])[0]) - y
-            left = float(np.linalg.norm(remainder(np.nan_to_num(change, nan=1e3).ravel(), columns)))
-        terms = (term,)
-        effects.append(term.label | {"sigmas": left_over(r, term), **oracle(r, term, y, columns)})
+
+        def left_of(change: np.ndarray) -> np.ndarray:
+            return remainder(np.nan_to_num(change, nan=1e3).ravel(), columns)
+
+        left = [left_of(x) for x in changes]
+        sizes = np.maximum.accumulate([np.linalg.norm(x) for x in left[: len(rungs)]])
+        share = np.exp(np.interp(np.log(sigmas), np.log(sizes), np.log(LADDER)))
+        terms = (dataclasses.replace(term, amplitude=float(share) * term.law.size),)
     shown = histories(r, [r.p], [terms])[0]
+    if name:
+        change = whitened(r, shown) - y
+        apart = oracle(terms[0], left_of(change), tried, left[len(rungs) :])
+        effects.append(terms[0].label | {"sigmas": left_over(r, y + change)} | apart)
     measured = {n: _read(r, n, x, rng) for n, x in shown.items()}
     column = {
         "voltage": "supply_voltage_V",
@@ -422,12 +444,12 @@ def _read(r: Rig, name: str, shown: np.ndarray, rng: np.random.Generator) -> np.
     return step * np.round(noisy / step) if step else noisy
 
 
-def left_over(r: Rig, term: Term) -> float:
-    """How many sigmas of a term a refit of the constants leaves, with their tolerances as priors. What a constant takes
-    up that moves the readings in the same way, as a winding does a resistor, is taken up however large it is."""
-    shown = np.nan_to_num(whitened(r, histories(r, [r.p], [[term]])[0]), nan=1e3)
+def left_over(r: Rig, shown: np.ndarray) -> float:
+    """How many sigmas of whitened readings a refit of the constants leaves, with their tolerances as priors. What a
+    constant takes up that moves the readings in the same way, as a winding does a resistor, is taken up however large
+    it is."""
     everything = np.ones(RUNS, bool)
-    (fit,) = _fits(r, r.p, shown, {(): (everything, ())}).values()
+    (fit,) = _fits(r, r.p, np.nan_to_num(shown, nan=1e3), {(): (everything, ())}).values()
     return float(np.sqrt(fit.cost))
 
 
@@ -533,6 +555,7 @@ def toml(r: Rig) -> str:
     }  # fmt: skip
     if r.imposed == GOAL:
         tables["controller"] = {"limit": LIMIT, "supply_voltage": r.supply}
+        tables["motor"] = {"inductance": f"{r.winding * r.p['resistance']!r} ± 0"}
     for name in r.names:
         table, _, key = PUBLIC[name].partition(".")
         tables[table][key] = f"{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"

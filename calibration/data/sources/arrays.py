@@ -16,7 +16,7 @@ from calibration.data import Columns, input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Load, Signal, signals_of_arrays, values_in_memory
 
-#: Arrays by path: shape, type, and a function that returns the array.
+#: Arrays by path: shape, type, and a function that loads the array.
 Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Load]]
 #: Name of the type of an array of objects.
 _OBJECTS = np.dtype(object)
@@ -31,7 +31,7 @@ def signals_of_npz(path: Path, name: str) -> tuple[Signal, ...]:
         BadData: a member whose path leads out of the archive.
     """
     arrays: Arrays = {}
-    archive = zipfile.ZipFile(path)  # stays open with its directory until no signal needs it
+    archive = zipfile.ZipFile(path)  # stays open until no signal needs it
     input_files.check_declared(name, len(archive.namelist()))
     for member in archive.namelist():
         member_path = PurePosixPath(member.replace("\\", "/"))
@@ -92,10 +92,10 @@ def signals_of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _check_matlab(path: Path, name: str) -> None:
-    """Rejects a file whose variables need more memory than is free. Reading one of them loads all.
+    """Rejects a file whose variables need more memory than is free, because reading one of them loads all.
 
     Raises:
-        BadData: they do.
+        BadData: they need more.
     """
     content = input_files.file_bytes(path, name)
     order: Literal["little", "big"] = "big" if content[126:128] == b"MI" else "little"
@@ -103,7 +103,7 @@ def _check_matlab(path: Path, name: str) -> None:
     while offset + 8 <= len(content):
         kind, length = (int.from_bytes(content[k : k + 4], order) for k in (offset, offset + 4))
         offset += 8
-        # of a compressed variable, the size after decompression follows its kind
+        # in a compressed variable, the decompressed size follows its type
         begin = zlib.decompressobj().decompress(content[offset : offset + 256], 8) if kind == COMPRESSED else b""
         size += int.from_bytes(begin[4:8], order) if begin else length
         offset += length
@@ -116,7 +116,7 @@ def _variable(loaded: Callable[[], Columns], name: str) -> Load:
 
 
 def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Arrays of a structure by path. Of an array of structures each has its index."""
+    """Arrays of a structure by path. In an array of structures the path has an index."""
     if value.dtype.names is None:
         return [(path, value)]
     fields: list[tuple[str, np.ndarray]] = []
@@ -131,7 +131,7 @@ def signals_of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an HDF5 file, or of a MATLAB file of version 7.3, by their path.
 
     Raises:
-        BadData: a link, or storage of a dataset, in another file.
+        BadData: a link or the storage of a dataset leads to another file.
     """
     import h5py
 
@@ -166,7 +166,7 @@ def _add_group(
     h5py: Any,
     seen: set[int],
 ) -> None:
-    """Adds the arrays and units of a group. A group with several paths is read under its first."""
+    """Adds the arrays and units of a group. A group with several paths is read only under the first one."""
     place = h5py.h5o.get_info(group.id).addr
     if place in seen:
         return

@@ -13,11 +13,11 @@ from calibration.data import Columns
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Clock, Load, Signal
 
-#: Most elements of an array in a message that become separate signals; larger arrays are pictures and clouds.
+#: Longest array in a message whose elements become signals. Longer arrays are images and point clouds.
 ELEMENTS = 64
-#: Field with the time of a message, and its largest difference from the time of recording [ns].
+#: Field with the time of a message, and its largest plausible difference from the time of recording [ns].
 _STAMP, _APART = "header.stamp", 60_000_000_000
-#: Units of fields by the type of message, as its definition states them.
+#: Units of fields by message type, as stated in its definition.
 UNITS = {
     "sensor_msgs/msg/JointState": {"position": "rad", "velocity": "rad/s", "effort": "Nm"},
     "sensor_msgs/msg/BatteryState": {"voltage": "V", "current": "A", "temperature": "C"},
@@ -35,7 +35,7 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
     The time is the stamp of a message's header, or the time of recording if it has none.
 
     Raises:
-        BadData: a bag without definitions of its messages.
+        BadData: the bag lacks the definitions of its messages.
     """
     signals: list[Signal] = []
     with _opened(path) as reader:
@@ -84,7 +84,7 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _field_unit(kind: str, field: str) -> str:
-    """Unit of a field by its type of message, empty if the type states none."""
+    """Unit of a field by message type, empty if the type states none."""
     units = UNITS.get(kind, {})
     return next((unit for start, unit in units.items() if field.startswith(start)), "")
 
@@ -137,12 +137,12 @@ def _topic_values(path: Path, topic: str) -> Columns:
     stamps = columns.pop(_STAMP, None)
     received = np.array(recorded, np.int64)
     if stamps is None or not (stamps > 0).all() or np.median(np.abs(stamps - received)) > _APART:
-        return columns | {"": received}  # stamps of a simulator, or none
+        return columns | {"": received}  # simulated stamps, or none
     return columns | {"": stamps}
 
 
 def _message_fields(message: Any, at: str) -> Iterator[tuple[str, bool, str]]:
-    """Path of each field, True for words, and the reason if it cannot be read."""
+    """Path of each field, True if it has words, and the reason if it cannot be read."""
     for field, value in _values(message, at):
         yield field, isinstance(value, str), ""
 

@@ -11,7 +11,7 @@ import numpy as np
 from calibration.data import input_files
 from calibration.data.sources.recorded_signals import Load, Signal
 
-#: Most elements of a list that become separate signals.
+#: Longest list whose elements become signals.
 MOST = 64
 #: Keys of a column's metadata that hold its unit.
 _UNITS = (b"unit", b"units", b"Unit")
@@ -35,7 +35,7 @@ def signals_of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
 def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a Feather or Arrow file, or an Arrow stream, read column by column.
 
-    The file is not mapped into memory, since a file that is cut off while it is mapped ends the program.
+    The file is not mapped into memory: if it were truncated meanwhile, the program would crash.
     """
     import pyarrow as pa
 
@@ -74,7 +74,7 @@ def signals_of_arrow_table(table: Any) -> tuple[Signal, ...]:
 
 
 def _signals(field: Any, rows: int, load: Load, read: Callable[[list[str]], Any]) -> list[Signal]:
-    """Signals of a column. Of a column of lists, one signal for each element, `name[0]`."""
+    """Signals of a column. A column of lists has one signal for each element, `name[0]`."""
     import pyarrow.types as kinds
 
     kind = field.type

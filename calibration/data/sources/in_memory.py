@@ -29,7 +29,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     """Kind of an object in memory, and its signals.
 
     Raises:
-        BadData: something else.
+        BadData: the object is of another kind.
     """
     library = type(source).__module__.partition(".")[0]
     kind = type(source).__name__
@@ -52,7 +52,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
         try:
             frame = source.collect() if kind == "LazyFrame" else source
-        except Exception as error:  # polars has errors of its own
+        except Exception as error:  # polars has its own errors
             raise BadData(f"the LazyFrame: polars cannot evaluate it ({' '.join(str(error).split())})") from error
         return "the DataFrame", columnar.signals_of_arrow_table(frame.to_arrow())
     if library == "pyarrow" and kind in ("Table", "RecordBatch"):
@@ -86,7 +86,7 @@ def _of_series(name: str, series: Any, rows: int) -> Signal:
     kind = getattr(dtype, "kind", "O")
     if refused := "" if kind == "O" else refused_type(dtype):
         return Signal(name, rows, lambda: np.empty(0), refused=refused)
-    if kind in "mM":  # also with a time zone, which does not change elapsed times
+    if kind in "mM":  # a time zone does not change elapsed times
         return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=f"{kind}8[ns]")))
     words = str(dtype) in ("str", "string", "category") or str(dtype).startswith("string")
     if kind == "O" and not words:

@@ -1,4 +1,4 @@
-"""JSON: records, arrays by name, and both nested by path."""
+"""JSON: records, named arrays, and both within nested objects."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from calibration.data.sources.recorded_signals import (
     values_in_memory,
 )
 
-#: Largest JSON file [bytes]: its objects take some ten times as much memory; most levels within one another.
+#: Largest JSON file [bytes], because its objects take about ten times as much memory. Deepest nesting.
 LARGEST, DEEPEST = 2**28, 16
-#: Keys that state the sampling of episodes: rates [Hz] and steps [s], with the power that makes a step of them.
+#: Keys for the sampling of episodes: rates [Hz] and steps [s], with the exponent that converts them to steps.
 RATES = {
     **dict.fromkeys(("rate_hz", "sample_rate_hz", "sampling_rate_hz", "frequency_hz", "fps", "fs"), -1),
     **dict.fromkeys(("dt", "dt_s", "step_s", "time_step_s", "sample_time_s"), 1),
@@ -33,10 +33,10 @@ RATES = {
 
 
 def signals_of_json(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of a JSON file, or of one with an object in each line.
+    """Signals of a JSON file, or of a file with one object per line.
 
     Raises:
-        BadData: text that is no JSON, or nested too deep.
+        BadData: the text is no JSON, or nested too deeply.
     """
     content = input_files.file_bytes(path, name, largest=LARGEST)
     try:
@@ -58,7 +58,7 @@ def _object(pairs: list[tuple[str, Any]]) -> Json:
     """An object of JSON.
 
     Raises:
-        ValueError: a key is there twice.
+        ValueError: a key occurs twice.
     """
     by_key = dict(pairs)
     if len(by_key) < len(pairs):
@@ -105,7 +105,7 @@ def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> Non
 
 
 def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
-    """Adds the time of episodes without a clock, if a rate or a step is stated next to them."""
+    """Adds the time of episodes without a clock, if the file states a rate or a step."""
     steps = [
         value[key] ** power
         for key, power in RATES.items()
@@ -121,7 +121,7 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
 
 
 def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
-    """A dict as pandas writes it, as arrays by name: a column by the numbers of its rows, or names next to rows."""
+    """A dict from pandas as named arrays: each column by row number, or names and rows apart."""
     cells = [inner for inner in value.values() if isinstance(inner, str) or not isinstance(inner, Mapping | Sequence)]
     if value and len(cells) == len(value) and all(isinstance(key, str) and key.isdigit() for key in value):
         return cells
@@ -151,9 +151,10 @@ def _columns_of_records(records: Sequence[Mapping[str, Any]], at: str, arrays: C
 
 
 def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
-    """Columns of records that each hold lists of numbers of one length, a run each, None for other records.
+    """Columns of records whose values are equally long lists of numbers. Each record is a run. None for other
+    records.
 
-    A text that differs in every record names the runs, else their number does.
+    A text that differs in every record is the name of the run, otherwise its number is.
     """
     lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
     lengths = [{len(v) for v in episode.values()} for episode in lists]
@@ -184,7 +185,7 @@ def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterab
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:
-    """An array of numbers, NaN for a missing number, or of words, otherwise of objects."""
+    """Array of numbers (NaN if missing), of words, or of objects."""
     kinds = {type(value) for value in values}
     if kinds <= {int, float, bool, type(None)}:
         return np.array([np.nan if value is None else value for value in values], dtype=float)
@@ -192,15 +193,15 @@ def _array(values: Sequence[Any]) -> np.ndarray:
         return np.array(["" if value is None else value for value in values])
     try:
         array = np.array([[np.nan if x is None else x for x in v] if isinstance(v, list) else v for v in values])
-    except (ValueError, TypeError):  # lists of several lengths
+    except (ValueError, TypeError):  # lists of different lengths
         array = np.empty(len(values), object)
     return array if array.dtype.kind in "biufUS" else array.astype(object)
 
 
 def _join_tables(arrays: Columns) -> Columns:
-    """Joins tables with the same columns, one under each key, into one table with the key as `RUN`.
+    """Joins tables with the same columns into one table, with the key of each table as `RUN`.
 
-    A file of WPILib SysId has such tables: «slow-forward», «fast-backward», ... are lists of rows.
+    Files of WPILib SysId have such tables: «slow-forward», «fast-backward», ... are lists of rows.
     """
     shaped = {path: v for path, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
     widths = {v.shape[1] for v in shaped.values()}

@@ -14,7 +14,7 @@ from calibration.data.sources.recorded_signals import Clock, Load, Signal
 
 
 def signals_of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of an MDF file by channel. Where groups have channels of one name, `group/channel`."""
+    """Signals of an MDF file by channel, or `group/channel` if groups share a channel name."""
     signals: list[Signal] = []
     with _opened(path) as file:
         count = collections.Counter(c.name for g in file.groups for c in g.channels)
@@ -44,7 +44,7 @@ def _opened(path: Path) -> Any:
     from asammdf import MDF
 
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # this program reports its errors
-    with path.open("rb") as stream:  # with a path it may create and remove further files
+    with path.open("rb") as stream:  # if given a path, it may create and remove other files
         try:
             file = MDF(stream)
         except Exception as error:
@@ -55,7 +55,7 @@ def _opened(path: Path) -> Any:
 
 
 def _close_half_made(error: BaseException) -> None:
-    """Marks the object of a file that could not be opened as closed. Closing it would print an error on stderr."""
+    """Marks the object of a file that could not be opened as closed, because closing it would print an error."""
     frame = error.__traceback__
     while frame is not None:
         for local_value in frame.tb_frame.f_locals.values():
@@ -77,7 +77,7 @@ def _time(path: Path, group: int) -> Load:
 def _column(path: Path, group: int, index: int) -> Load:
     def load() -> np.ndarray:
         with _opened(path) as file:
-            samples = file.get(group=group, index=index, ignore_invalidation_bits=True)  # else they are left out
+            samples = file.get(group=group, index=index, ignore_invalidation_bits=True)  # otherwise they are omitted
         invalid = samples.invalidation_bits
         values = np.asarray(samples.samples)
         return values if invalid is None else np.ma.masked_array(values, np.asarray(invalid, bool))

@@ -1,4 +1,4 @@
-"""Signals with separate clocks, resampled to one grid of time: commands are held, states follow straight lines."""
+"""Signals with separate clocks, resampled to one time grid: commands are held, states are interpolated linearly."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
 
-#: Seconds since 1970 between which a clock may count from there: 1990 and 2100.
+#: Clocks that read between these seconds since 1970 (1990 and 2100) count from 1970.
 EPOCH = (6.3e8, 4.2e9)
 #: Largest delay of a recorded sample, in usual steps.
 LATE = 20.0
-#: Largest difference of equal stamps, as a share of a step of the grid.
+#: Stamps that differ by less are equal, as a share of the grid step.
 SAME = 1e-3
-#: Largest step of whole numbers that are ms, µs and ns: rates of 10 Hz to 10 kHz, and below.
+#: Largest step of whole numbers that are ms, µs and ns, for rates down to 10 Hz.
 _STEPS = {"ms": 1e2, "us": 1e5, "ns": 1e8}
 
 
@@ -28,9 +28,9 @@ class Elapsed(NamedTuple):
 
     Attributes:
         time: time since its first sample [s], shape (n,).
-        first: that sample by the clock [s].
+        first: clock reading of the first sample [s].
         unit: unit of its numbers, empty for dates.
-        period: period of a counter that wraps, else 0.
+        period: period of a counter that wraps, otherwise 0.
     """
 
     time: np.ndarray
@@ -42,11 +42,11 @@ class Elapsed(NamedTuple):
 def clock_seconds(clock: Clock) -> Elapsed:
     """Returns the times of a clock.
 
-    A clock that does not state its unit is read by its numbers: since 1970 by their size, else by their steps.
-    Numbers that are not whole are seconds. A counter that wraps goes on.
+    If a clock does not state its unit, the size of its numbers since 1970 or their steps determine it. Numbers that
+    are not whole are seconds. Wraps of a counter are removed.
 
     Raises:
-        BadData: a time stamp that is missing or infinite.
+        BadData: a time stamp is missing or infinite.
     """
     raw = np.asarray(clock.load())
     if (missing_rows := np.flatnonzero(~np.isfinite(raw))).size:
@@ -67,7 +67,7 @@ def clock_seconds(clock: Clock) -> Elapsed:
 
 
 def guessed_unit(raw: np.ndarray) -> str:
-    """Unit of a clock by its numbers, a key of `recorded_signals.UNITS`."""
+    """Unit of a clock, inferred from its numbers: a key of `recorded_signals.UNITS`."""
     stamps = np.asarray(raw, float)
     stamps = stamps[np.isfinite(stamps)]
     if not len(stamps):
@@ -82,7 +82,7 @@ def guessed_unit(raw: np.ndarray) -> str:
         return "s"
     usual = float(np.median(steps))
     if usual % 100 == 0 and 1e2 < usual <= 1e5 and 1e6 % usual and not (steps % 100).any():
-        return "ms"  # rates in µs are whole numbers of Hz, and a count of µs has other last digits
+        return "ms"  # a count of µs has varying last digits
     return next((unit for unit, largest in _STEPS.items() if usual <= largest), "s")
 
 
@@ -93,22 +93,23 @@ def signals_on_one_grid(
     is_measured: Callable[[str], bool],
     grid: str,
 ) -> tuple[np.ndarray, Columns, Names]:
-    """Returns time [s] from the first row, values of each signal at these times, and notes on the resampling.
+    """Returns the time since the first row [s], the values of each signal at these times, and notes on the
+    resampling.
 
-    The grid is the time stamps of the densest measured signal, or of the stated clock. Signals on its clock stay as
-    they are. A command has the value of its last sample. Rows before the first sample of a command are left out. A
-    reading is used once: in the row nearest to each of its samples, at the value of the straight line between samples
-    there. Other rows have none.
+    The grid consists of the time stamps of the densest measured signal, or of the stated clock. Signals with this
+    clock are unchanged. A command keeps the value of its last sample. Rows before the first sample of a command are
+    omitted. Each sample of a reading is used once, in the nearest row, interpolated linearly to its time. Other rows
+    have no reading.
 
     Args:
         name: name of the source.
         chosen: signals by the name of their column, each with a clock.
         is_held: True for a column whose values are held.
         is_measured: True for a column of readings.
-        grid: name of a clock that is the grid. Empty: the densest.
+        grid: name of the clock to use as grid. Empty: the densest.
 
     Raises:
-        BadData: a clock that goes back, or clocks that have no time in common.
+        BadData: a clock goes back, or the clocks have no time in common.
     """
     clocks = {id(s.clock): s.clock for s in chosen.values() if s.clock is not None}
     try:
@@ -174,7 +175,7 @@ def signals_on_one_grid(
                 "stamp"
             )
         if period:
-            notes.append(f"{name}: {clock.name} wraps at {period:.10g}. The time is counted on from there")
+            notes.append(f"{name}: {clock.name} wraps at {period:.10g}. The wraps are removed")
         if not clock.unit and unit not in ("", "s"):
             notes.append(f"{name}: {clock.name} has no unit. Its numbers are read as {unit} ({_rate(times[key])})")
     on = rows[is_covered]
@@ -182,7 +183,7 @@ def signals_on_one_grid(
 
 
 def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Readings in the rows nearest to their samples, on the straight line between these, NaN in other rows.
+    """Readings in the rows nearest to their samples, interpolated linearly. NaN in other rows.
 
     Args:
         rows: time of the rows [s], shape (rows,).
@@ -205,8 +206,9 @@ def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -
 
 
 def _sample_order(time: np.ndarray) -> np.ndarray | None:
-    """Order of samples by their stamps if some were recorded slightly late, None if they are in order, or if the
-    clock was set back."""
+    """Order of samples by their stamps if some were recorded slightly late. None if they are in order, or if the
+    clock was set back.
+    """
     step = np.diff(time)
     if not (step < 0).any() or step.min() < -LATE * float(np.median(np.abs(step))):
         return None

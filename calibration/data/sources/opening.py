@@ -1,4 +1,4 @@
-"""Opening of any source of data: its format is found from its first bytes, its signals are listed."""
+"""Opening of data sources: their format follows from the first bytes, and their signals are listed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Format:
         """Signals of a file.
 
         Raises:
-            BadData: a library that is not installed, or a file that it cannot read.
+            BadData: a library is not installed, or it cannot read the file.
         """
         try:
             module = importlib.import_module(f"calibration.data.sources.{self.module}")
@@ -60,7 +60,7 @@ class Format:
                 f"{name}: is {self.kind}; reading it needs {self.library}, which is not installed: pip install "
                 "mmrjax[logs]"
             ) from error
-        except Exception as error:  # each library has errors of its own
+        except Exception as error:  # each library has its own errors
             raise unreadable_file(name, self.kind, error) from error
 
 
@@ -85,7 +85,7 @@ BEGINNINGS = {
     b"ULog": ULOG, b"MDF     ": MDF, b"UnFinMF ": MDF, b"WPILOG": WPILOG,
     b"\xd0\xcf\x11\xe0": WORKBOOK,
 }  # fmt: skip
-#: Formats whose files begin with anything, by suffix.
+#: Formats without fixed first bytes, by suffix.
 SUFFIXES = {".mat": MATLAB, ".db3": BAG, ".jsonl": JSON, ".ndjson": JSON}
 #: File of a ROS 2 bag's folder that lists its contents.
 _METADATA = "metadata.yaml"
@@ -93,13 +93,13 @@ _RECORDINGS = (".db3", ".mcap")
 
 
 def unreadable_file(name: str, kind: str, error: BaseException) -> BadData:
-    """The error of a file that its library refuses."""
+    """Error for a file that its library rejects."""
     why = " ".join(str(error).split()) or type(error).__name__
     return BadData(f"{name}: cannot be read as {kind} ({why}); it may be cut off or damaged; export or copy it again")
 
 
 def split_source(source: str) -> tuple[Path, str]:
-    """Path of a file, and path of signals in it, empty if it is not stated."""
+    """Path of a file, and path of signals in it (empty if not stated)."""
     if Path(source).exists():
         return Path(source), ""
     file, _, within = source.partition(WITHIN)
@@ -107,7 +107,7 @@ def split_source(source: str) -> tuple[Path, str]:
 
 
 def files_of_group(source: str) -> list[Path]:
-    """Files that match a pattern such as `runs/*.csv`, in order, empty if it is a file's name, or none matches."""
+    """Files that match a pattern such as `runs/*.csv`, in order. Empty if it is a file name, or none matches."""
     path = Path(source)
     if not set("*?[") & {*source} or path.exists():
         return []
@@ -116,10 +116,10 @@ def files_of_group(source: str) -> list[Path]:
 
 
 def format_of(path: Path, name: str) -> Format | None:
-    """Format of a file or of a bag's folder. None: text in columns.
+    """Format of a file or of a bag folder. None: text in columns.
 
     Raises:
-        BadData: a pipe, a device, a folder that is no bag, or a file that the system does not open.
+        BadData: the path is a pipe, a device or a folder that is no bag, or the file cannot be opened.
     """
     if path.is_dir():
         if (path / _METADATA).exists():
@@ -141,7 +141,7 @@ def format_of(path: Path, name: str) -> Format | None:
 
 
 def _kind_of_zip(path: Path) -> Format | None:
-    """Format of a zip file by the names in it, by its suffix if it is damaged."""
+    """Format of a zip file by the names in it, or by its suffix if it is damaged."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
@@ -160,7 +160,7 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
         name: name of the file, for messages.
 
     Raises:
-        BadData: for the same reasons as `Format.signals`. No signal, or none below `within`.
+        BadData: for the same reasons as `Format.signals`, or there is no signal below `within`.
     """
     if path.is_dir():
         for item in path.iterdir():
@@ -189,15 +189,15 @@ def open_object(source: Any) -> Source:
 def checked_source(
     name: str, kind: str, signals: Sequence[Signal], held: float = math.inf, digest: str = ""
 ) -> Source:
-    """A source of signals whose sizes are checked before values are read, and whose values are plain.
+    """Source whose sizes are checked before its values are read, and whose values are plain arrays.
 
-    Signals with a path in common are refused.
+    Signals with the same path are rejected.
 
     Args:
         held: size of the file [bytes].
 
     Raises:
-        BadData: sizes that cannot be right (`input_files.check_declared`).
+        BadData: a size is implausible (`input_files.check_declared`).
     """
     size = input_files.VALUE * sum(signal.length for signal in signals)
     input_files.check_declared(name, len(signals), size, held)
@@ -208,8 +208,9 @@ def checked_source(
 
 
 def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
-    """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
-    their values. Shared clocks stay shared."""
+    """Signals that raise `BadData` if they are rejected or too large for the memory, or if their library cannot read
+    their values. Shared clocks stay shared.
+    """
 
     def guarded(load: Load, path: str, signal: Signal, refused: str = "") -> Load:
         signal_place = f"{name}, {path}"
@@ -224,7 +225,7 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
                 values = values if why else plain_values(values)
             except InputError:
                 raise
-            except Exception as error:  # each library has errors of its own
+            except Exception as error:  # each library has its own errors
                 raise unreadable_file(signal_place, kind, error) from error
             if why or len(values) != signal.length:
                 why = why or f"has {len(values)} of the {signal.length} values that it declares; it may be damaged"
@@ -249,7 +250,7 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
 
 
 def source_digest(path: Path) -> str:
-    """SHA-256 of a file, or of the files of a folder in the order of their names."""
+    """SHA-256 of a file, or of the files in a folder in order of their names."""
     digest = hashlib.sha256()
     for file in _files_of_folder(path):
         with file.open("rb") as stream:
@@ -259,5 +260,5 @@ def source_digest(path: Path) -> str:
 
 
 def _files_of_folder(path: Path) -> list[Path]:
-    """Files of a folder in the order of their names, or the file itself."""
+    """Files in a folder in order of their names, or the file itself."""
     return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]

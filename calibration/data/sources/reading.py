@@ -30,9 +30,9 @@ from mmrjax.model import channels, quantities
 
 #: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
 Mapped = tuple[tuple[str, str, float], ...]
-#: Most values of columns without a role; they are read to find correlations with residuals.
+#: Most values of columns that the model does not use, which are read to find correlations with residuals.
 EXTRA_VALUES = 20_000_000
-#: Ratio of the rms currents along d and q above which the field is weakened [-].
+#: Ratio of the rms currents along d and q above which the field counts as weakened [-].
 WEAKENED = 0.3
 
 
@@ -42,7 +42,7 @@ class Reading:
 
     Attributes:
         arrays: the columns.
-        mapped: columns that have other names in the source.
+        mapped: columns with other names in the source.
     """
 
     arrays: NamedArrays
@@ -56,12 +56,13 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
             (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
         layout: layout of the table's robot.
-        columns: names of the source's columns, in addition to the robot's. They win over these.
-        between: `linear` if the imposed quantity follows straight lines between samples, as in `Rig.between_rows`.
+        columns: names of the source's columns, in addition to those in the robot file, over which they take
+            precedence.
+        between: `linear` if the imposed quantity is linear between samples, as in `Rig.between_rows`.
 
     Raises:
-        BadData: no such file, a format that is not read, a damaged file, a signal that is missing or of another kind,
-            or signals of several lengths.
+        BadData: the file is missing, damaged or in a format that is not read, a signal is missing or of another kind,
+            or signals differ in length.
     """
     if not isinstance(source, str | Path):
         return _of_signals(opening.open_object(source), layout, columns, between)
@@ -79,10 +80,10 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
 
 
 def _of_group(readings: Sequence[Reading], name: str) -> Reading:
-    """Tables of several files as one. Each file is a run, named after it.
+    """Tables of several files joined into one. Each file is a run, named after the file.
 
     Raises:
-        BadData: files with different columns or units.
+        BadData: the files have different columns or units.
     """
     first = readings[0].arrays
     for other in readings[1:]:
@@ -112,7 +113,7 @@ def _of_group(readings: Sequence[Reading], name: str) -> Reading:
 
 
 def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
-    """Returns every column of a table in a file, unchanged, None for text, whose comments have a meaning.
+    """All columns of a table in a file, unchanged. None for text, in which comments have a meaning.
 
     Raises:
         BadData: for the same reasons as `read_columns`. Signals with separate clocks, which do not form one table.
@@ -125,7 +126,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     signals = {s.path if len(matching_signals(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
     for signal in signals.values():
         if signal.refused or signal.clock is not None:
-            raise BadData(f"{name}, {signal.path}: {signal.refused or 'has a clock of its own; expected one table'}")
+            raise BadData(f"{name}, {signal.path}: {signal.refused or 'has its own clock; expected one table'}")
     input_files.check_memory(name, input_files.VALUE * sum(s.length for s in signals.values()))
     values = _in_rows(source, signals)
     units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
@@ -135,7 +136,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
 
 
 def _with_header(arrays: NamedArrays, columns: Preset) -> NamedArrays:
-    """A table whose first row is a row of numbers, with the names of a preset."""
+    """Table without a header, with column names from a preset."""
     if len(arrays.header) != len(columns.header) or not np.isfinite(column_numbers(list(arrays.header))).all():
         return arrays
     values = tuple([first, *rest] for first, rest in zip(arrays.header, arrays.values, strict=True))
@@ -164,7 +165,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
 
 
 def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
-    """Returns a note on each current of a preset whose part along d is large, so that no DC motor is equivalent.
+    """A note on each current of a preset with a large d component, so that no DC motor is equivalent.
 
     Args:
         values: cells of the file's columns, by name.
@@ -194,7 +195,7 @@ def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
 
 
 def _of_signals(source: Source, layout: Layout, columns: Preset | None, between: str) -> Reading:
-    """Columns of the signals with a meaning, and of few others."""
+    """Columns of the signals with a meaning, and of some others."""
     signals = source.signals
 
     def found(name: str) -> str | None:
@@ -248,14 +249,14 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
 def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
     """Signals by the name of their column, the clock stated as the grid, and notes on missing signals.
 
-    A signal has a column if a table of columns names it, or if the last part of its path is a column's name.
+    A signal has a column if a table of columns names it, or if the last part of its path is a column name.
     """
     signals_by_column: dict[str, Signal] = {}
     clock, missing = "", []
     clocks = {s.clock.name for s in source.signals if s.clock is not None}
     for own_column, pattern, _ in mapped:
         meant = {s.path for s in matching_signals(source.signals, pattern)}
-        if pattern in clocks or (meant and meant <= clocks):  # several: each signal has its own
+        if pattern in clocks or (meant and meant <= clocks):  # several clocks: each signal has its own
             clock = pattern if pattern in clocks else meant.pop() if len(meant) == 1 else ""
         elif meant:
             signals_by_column[pattern] = find_signal(source.signals, pattern, source.name)
@@ -266,14 +267,14 @@ def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dic
     spelled = {name.casefold() for name in spellings}
     used_signals = {id(signal) for signal in signals_by_column.values()}
     for signal in source.signals:
-        vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)  # a topic's mode is something else
+        vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)  # the mode in a topic has another meaning
         if signal.name.casefold() in spelled and id(signal) not in used_signals and not vague:
             signals_by_column.setdefault(signal.name, signal)
     return signals_by_column, clock, tuple(missing)
 
 
 def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
-    """Raw numbers as signed numbers that count from zero. Cells without a number stay as they are."""
+    """Raw numbers converted to signed numbers around zero. Cells without a number are unchanged."""
     if not (column.sign_bit or column.zero):
         return raw
     numbers, sign = column_numbers(raw), 2.0**column.sign_bit
@@ -284,12 +285,12 @@ def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
 
 
 def _decoded_signal(column: PresetColumn, signal: Signal) -> Signal:
-    """A signal whose values are decoded before they are interpolated."""
+    """Signal whose values are decoded before they are interpolated."""
     return dataclasses.replace(signal, load=lambda: np.asarray(_decode_raw_numbers(column, signal.load())))
 
 
 def _extra_columns(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
-    """Further columns of a table, as long as the chosen ones, if there are few values."""
+    """Further columns of a table with the length of the chosen ones, unless they have too many values."""
     used_signals = {id(signal) for signal in chosen.values()}
     longest = max((s.length for s in source.signals), default=0)
     lengths = {s.length for s in chosen.values() if s.length > 1} or {longest}
@@ -300,7 +301,7 @@ def _extra_columns(source: Source, chosen: Mapping[str, Signal], own: Sequence[S
 
 
 def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Columns:
-    """Values of the columns of a table. A single value applies to every row."""
+    """Values of a table's columns. A single value applies to every row."""
     lengths = {column: s.length for column, s in signals.items()}
     rows = rows or max(lengths.values(), default=0)
     for column, length in lengths.items():
@@ -308,7 +309,7 @@ def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Co
             other = next((signals[c].path for c, n in lengths.items() if n == rows), "the time of the others")
             raise BadData(
                 f"{source.name}, {signals[column].path}: has {length} values, and {other} has {rows}; "
-                "expected equal lengths, or time stamps of its own in the same group, an array named time"
+                "expected equal lengths, or its own time stamps, as an array named time in the same group"
             )
     columns = {}
     for column, signal in signals.items():
@@ -335,7 +336,7 @@ def _on_a_grid(
         return not is_measured(column) and column_of[column] not in lines
 
     if not over_time:
-        raise BadData(f"{source.name}: no signal has a column's name; {_how_to_name(source)}")
+        raise BadData(f"{source.name}: no signal has the name of a column; {_how_to_name(source)}")
     time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
     return {"time_s": time, **values, **_in_rows(source, others, len(time))}, notes
 
@@ -349,10 +350,10 @@ def _how_to_name(source: Source) -> str:
 
 
 def _raw_values(values: np.ndarray) -> Raw:
-    """Values in the form for the checks of a table: numbers as an array, words and dates as a list."""
+    """Values as the checks of a table expect them: numbers as an array, words and dates as a list."""
     if values.dtype.kind in "US":
         return [str(value).strip() for value in values.tolist()]
-    if values.dtype.kind == "M":  # dates are read as text; the clock counts from the first
+    if values.dtype.kind == "M":  # dates are read as text, times count from the first one
         ticks, is_missing = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
         first = ticks[~is_missing].min() if not is_missing.all() else 0
         return np.where(is_missing, np.nan, (ticks - first) * 1e-9)

@@ -1,4 +1,4 @@
-"""Signals of a recording: each has a path, values that are read when needed, and perhaps a clock of its own."""
+"""Signals of a recording: each has a path, values that are read when needed, and possibly its own clock."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from mmrjax.errors import similar_words
 
 #: Function that reads the values of a signal from its source.
 Load: TypeAlias = Callable[[], np.ndarray]
-#: Last parts of the paths of signals that are time stamps, without a unit behind them.
+#: Last parts of paths that mark time stamps, without unit.
 CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
-#: Units that the name of a clock may end with, and the seconds of one.
+#: Units that the name of a clock may end with, and their value in seconds.
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-#: Column with the run of each row, where a source has several.
+#: Column with the run of each row, if a source has several runs.
 RUN = "run_id"
 #: Most paths that a message lists.
 LISTED = 12
@@ -37,7 +37,7 @@ class Clock:
 
     Attributes:
         name: path of the time stamps, for messages.
-        load: returns them, shape (n,), numbers or `datetime64`.
+        load: function that returns the time stamps, shape (n,), numbers or `datetime64`.
         unit: unit of the numbers, a key of `UNITS`, empty if the recording does not state it.
     """
 
@@ -53,12 +53,12 @@ class Signal:
     Attributes:
         path: its name in the recording.
         length: number of its samples.
-        load: returns the values, shape (length,): numbers, words or `datetime64`.
-        unit: as stated by the recording, empty if it states none.
-        clock: its own. None: its samples are rows of a table.
+        load: function that returns the values, shape (length,): numbers, words or `datetime64`.
+        unit: unit that the recording states, empty if it states none.
+        clock: its clock. None: its samples are rows of a table.
         words: True if the values are text.
         refused: reason why it cannot be read, empty if it can.
-        size: memory that `load` takes [bytes]. 0: that of `length` numbers.
+        size: memory that `load` needs [bytes]. 0: memory of `length` numbers.
     """
 
     path: str
@@ -71,7 +71,7 @@ class Signal:
     size: float = 0.0
 
     def __post_init__(self) -> None:
-        """Replaces code points of its path and unit that no text file can hold."""
+        """Replaces code points in path and unit that text files cannot hold."""
         for field in ("path", "unit"):
             object.__setattr__(self, field, encodable_text(getattr(self, field)))
 
@@ -120,9 +120,9 @@ def path_parts(path: str) -> list[str]:
 
 
 def matching_signals(signals: Iterable[Signal], name: str) -> list[Signal]:
-    """Signals that match a name: the signal with this path, else signals whose path ends with its parts.
+    """Signals that match a name: the signal with this path, otherwise signals whose path ends with its parts.
 
-    A `*` in the name stands for any text of the path.
+    A `*` in the name matches any text.
     """
     pool = list(signals)
     if "*" in name:
@@ -145,7 +145,7 @@ def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
     if matches:
         paths_text = ", ".join(s.path for s in matches[:8])
         raise BadData(
-            f"{where}, {name}: got a name of {len(matches)} signals, {paths_text}; expected the path of one of them"
+            f"{where}, {name}: the name fits {len(matches)} signals, {paths_text}; give the path of one of them"
         )
     raise BadData(f"{where}, {name}: no such signal; {suggested_paths(name, [s.path for s in signals])}")
 
@@ -159,7 +159,7 @@ def suggested_paths(name: str, paths: Sequence[str]) -> str:
 
 
 def unit_of_clock(name: str) -> str | None:
-    """Unit that the name of a clock states, empty if it states none, None if it is not a name of a clock."""
+    """Unit in the name of a clock, empty if it states none, None if it is no name of a clock."""
     bare = name.strip().casefold()
     if bare in CLOCKS:
         return ""
@@ -179,9 +179,9 @@ def signals_of_arrays(
 ) -> tuple[Signal, ...]:
     """Signals of named arrays. Each column of an array of two dimensions is a separate signal, `name[0]`.
 
-    An array takes its time stamps from the clock of equal length in its group, or else from the only other clock of
-    that length. A clock is an array that is named like one (`unit_of_clock`). Arrays without a clock form a table, as
-    do all arrays if they are equally long.
+    The clock of an array is the equally long clock in its group, otherwise the only other clock of that length. A
+    clock is an array that is named like one (`unit_of_clock`). Arrays without a clock form a table, as do all arrays
+    if they are equally long.
 
     Args:
         source: name of the recording, for messages.
@@ -220,7 +220,7 @@ def parent_path(path: str) -> str:
 
 
 def sample_count(shape: tuple[int, ...]) -> int:
-    """Number of samples of an array: its first dimension, or the second one of a single row."""
+    """Number of samples of an array: its first dimension, or the second if it is a single row."""
     if not shape:
         return 1
     return shape[1] if len(shape) == 2 and shape[0] == 1 else shape[0]
@@ -264,14 +264,14 @@ def _field(load: Load, name: str) -> Load:
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """A recording or a table: its signals, and notes on its reading.
+    """Recording or table: its signals, and notes on how it was read.
 
     Attributes:
         name: name for messages.
-        kind: kind of file, `a Parquet file` say.
+        kind: kind of file, such as `a Parquet file`.
         signals: signals in the order of the recording.
-        digest: SHA-256 of the file, empty of data in memory.
-        notes: sentences on its reading.
+        digest: SHA-256 of the file, empty for data in memory.
+        notes: sentences on how it was read.
     """
 
     name: str
@@ -281,7 +281,7 @@ class Source:
     notes: Names = ()
 
     def below(self, prefix: str) -> Source:
-        """The signals below a path.
+        """Signals below a path.
 
         Raises:
             BadData: there are none.

@@ -21,10 +21,10 @@ _FIELD = re.compile(r"([^;\[\] ]+)(?:\[(\d+)\])? [^;]+")
 
 
 def signals_of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
-    """Signals of a ULog file, `topic.field`, of a second instance `topic[1].field`. Time counts from the boot.
+    """Signals of a ULog file: `topic.field`, for a second instance `topic[1].field`. Time counts from boot.
 
     Raises:
-        BadData: a damaged file.
+        BadData: the file is damaged.
     """
     from pyulog import ULog
 
@@ -33,7 +33,7 @@ def signals_of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
     sizes: dict[str, int] = {}
     for topic in formats:
         input_files.check_declared(name, _field_count(topic, formats, sizes))
-    # the library reports damage to stdout, and leaves a file open that it opened and cannot parse
+    # the library prints damage to stdout, and leaves a file open that it cannot parse
     with path.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()):
         log = ULog(stream)
     if log.file_corruption or not log.data_list:
@@ -85,7 +85,7 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
 
 
 def _field_count(topic: str, formats: dict[str, list[tuple[str, int]]], sizes: dict[str, int]) -> int:
-    """Number of the fields of a topic, each element of an array and of a nested topic separately."""
+    """Number of fields in a topic, counting each element of an array and of a nested topic."""
     if topic not in sizes:
         inner = formats.get(topic)
         sizes[topic] = 1 if inner is None else sum(n * _field_count(kind, formats, sizes) for kind, n in inner)

@@ -21,11 +21,11 @@ CELL = 100
 
 
 def signals_of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
-    """Columns of a workbook: by their names if one sheet has data, else `sheet/name`.
+    """Columns of a workbook: by name if only one sheet has data, otherwise `sheet/name`.
 
     The first row with a cell is the header. A row of units may follow.
 
-    Columns of numbers with a cell of words raise `BadData` when they are loaded.
+    Loading a column of numbers raises `BadData` if a cell has words.
     """
     import pandas as pd
 
@@ -60,7 +60,7 @@ def signals_of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _cell_count(content: bytes) -> int:
-    """Number of cells of the rectangle that a sheet's XML declares. Calamine allocates it whole."""
+    """Number of cells in the rectangle that a sheet's XML declares. Calamine allocates all of it."""
     places = [(_column_no(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
     wide, tall = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
     if b"number-columns-repeated" in content or b"number-rows-repeated" in content:  # of .ods
@@ -74,7 +74,7 @@ def _cell_count(content: bytes) -> int:
 
 
 def _column_no(column: bytes) -> int:
-    """Number of a column of a sheet from 1, by its letters."""
+    """Number of a sheet's column, from 1, by its letters."""
     number = 0
     for letter in column:
         number = 26 * number + letter - ord("A") + 1

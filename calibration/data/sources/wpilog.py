@@ -11,11 +11,11 @@ from calibration.data import input_files
 from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import Clock, Signal, values_in_memory
 
-#: Bytes before the extra header; control records, of entry 0, that start an entry.
+#: Bytes before the extra header. Type of the control records (of entry 0) that start an entry.
 HEADER, START = 12, 0
 #: Memory of the records, as a multiple of the file.
 OBJECTS = 10
-#: Types of entries with one number in a record; other types are listed and refused.
+#: Entry types with one number per record. Other types are listed but cannot be read.
 NUMBERS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "?"}
 WORDS = ("string", "json")
 #: State of a SysId routine between its tests.
@@ -43,7 +43,7 @@ class _Entry:
                 refused=f"has the type {self.kind}, which is not supported",
             )
         stamps = np.array(self.stamps)
-        if self.name.startswith("sysid-test-state-"):  # the end of a test carries the stamp of its last sample
+        if self.name.startswith("sysid-test-state-"):  # the end of a test has the stamp of its last sample
             in_test = values != BETWEEN_TESTS
             values, stamps = values[in_test], stamps[in_test]
         clock = clocks.setdefault(stamps.tobytes(), Clock(f"{self.name} (time)", values_in_memory(stamps), "us"))
@@ -56,7 +56,7 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
     Source: wpiutil/doc/datalog.adoc of github.com/wpilibsuite/allwpilib.
 
     Raises:
-        BadData: another version, or a record that does not end within the file.
+        BadData: the version is another, or a record does not end within the file.
     """
     content = input_files.file_bytes(path, name)
     input_files.check_memory(name, OBJECTS * len(content))
@@ -89,7 +89,7 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _name_and_type(payload: bytes) -> tuple[str, str]:
-    """Name and type at the beginning of a payload, each after its length."""
+    """Name and type at the beginning of a payload, each preceded by its length."""
     texts = []
     for _ in range(2):
         length = int.from_bytes(payload[:4], "little")

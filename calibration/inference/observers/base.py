@@ -337,7 +337,7 @@ class Observer(eqx.Module):
         """
         raise NotImplementedError
 
-    def places(self, problem: Problem) -> int:
+    def searches_per_core(self, problem: Problem) -> int:
         """Number of searches of a problem that run together on a core, see `searches_refilled`."""
         raise NotImplementedError
 

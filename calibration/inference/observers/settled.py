@@ -29,7 +29,7 @@ from calibration.inference.optimizers import (
     Numbers,
     Optimum,
     SearchMember,
-    penalty_slice,
+    adhesion_penalty_slice,
     search_refilling,
     zero_inactive_residuals,
 )
@@ -284,7 +284,7 @@ class SettledRuns(Observer):
 
         wide = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
         r, slopes, _, signals = problem.linearised(probed, wide, data)
-        r, slopes = zero_inactive_residuals(r, slopes, penalty_slice(data))
+        r, slopes = zero_inactive_residuals(r, slopes, adhesion_penalty_slice(data))
         jacobian = jnp.concatenate([slopes, jnp.eye(size, wide.size)])
         residual = jnp.concatenate([r, z - data.centre])
         rows, count = data.measured.shape
@@ -327,7 +327,7 @@ class SettledRuns(Observer):
         measured, centre = jax.device_get(_draw_tables(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
         members = SearchMember(start, weight, measured, centre)
-        refits, _ = search_refilling(problem, members, self.policy.steps, self.places(problem))
+        refits, _ = search_refilling(problem, members, self.policy.steps, self.searches_per_core(problem))
         return measured, centre, refits.z
 
     def fit_replicate(
@@ -358,9 +358,9 @@ class SettledRuns(Observer):
         search_inputs = np.asarray(starts), np.asarray(weights), measured, centre
         members = SearchMember(*search_inputs, active=None if active is None else np.asarray(active))
         steps = self.policy.steps if most is None else most
-        return search_refilling(problem, members, steps, self.places(problem))
+        return search_refilling(problem, members, steps, self.searches_per_core(problem))
 
-    def places(self, problem: Problem) -> int:
+    def searches_per_core(self, problem: Problem) -> int:
         """Number of searches that run together on a core.
 
         Fewer if effects make the model costly, so that few searches wait for the slowest.

@@ -57,9 +57,9 @@ from calibration.inference.optimizers import (
     Evaluate,
     Numbers,
     Optimum,
+    adhesion_penalty_slice,
     linearise,
     linearise_rollout,
-    penalty_slice,
     search_rollouts,
     zero_inactive_residuals,
 )
@@ -128,6 +128,8 @@ LASTING = 0.25
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
 SLOW |= dict.fromkeys(GOALS, SLOW["motor_current"])
+#: Time before a row from which a sample of a controller reads its goal, as a share of the controller's period.
+EARLIEST = 1e-3
 #: Longest step elsewhere, in usual longest steps.
 FAST = 2
 #: Longest step of a load on an elastic joint, as a share of its swing's time per radian: readings within 0.1 %.
@@ -301,11 +303,15 @@ class Histories(Observer):
             whole_log = _average_imposed_current(whole_log, rows_of_whole, noted)
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
+        jumps, early = _drive_jumps(whole_log, rows_of_whole, robot.rig), 0.0
+        if robot.controller is not None and robot.controller.rate:
+            period = 1 / robot.controller.rate
+            instants = [np.arange(0.0, whole_log["time_s"][rows[-1]], period) for rows in rows_of_whole]
+            all_jumps = [np.union1d(at, x) for (at, _), x in zip(jumps, instants, strict=True)]
+            jumps, early = [(x, np.ones(len(x))) for x in all_jumps], EARLIEST * period
         grids = [
             time_grid(whole_log["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
-            for rows, n, c, h in zip(
-                rows_of_whole, noted, _drive_jumps(whole_log, rows_of_whole, robot.rig), steps, strict=True
-            )
+            for rows, n, c, h in zip(rows_of_whole, noted, jumps, steps, strict=True)
         ]
         # The last instant begins a step too, of length zero.
         longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, own_rows))
@@ -315,7 +321,7 @@ class Histories(Observer):
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_choose_knots(m, most) for m in own_rows])
         conditions = _conditions_over_time(
-            whole_log.conditions(robot), rows_of_whole, whole_log["time_s"], times, ON_LINES if linear else ()
+            whole_log.conditions(robot), rows_of_whole, whole_log["time_s"], times + early, ON_LINES if linear else ()
         )
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]
@@ -651,7 +657,7 @@ class Histories(Observer):
         twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
         members = twice(z), twice(data.weight), None if active_set is None else twice(active_set)
         r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
-        residual, jacobian = zero_inactive_residuals(r, jacobian, penalty_slice(data))
+        residual, jacobian = zero_inactive_residuals(r, jacobian, adhesion_penalty_slice(data))
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
         signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
         return HistoriesLinearization(
@@ -760,16 +766,16 @@ class Histories(Observer):
         of_same_readings = bool(np.all(weights == np.asarray(weights)[:1]))
         within = SAME if rivals else NEAR if of_same_readings else np.inf
 
-        def searched(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
+        def search_from(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
             weight = np.asarray(weights)[members]
             evaluate = _parallel_evaluator(problem, weight, None if active is None else np.asarray(active)[members])
             return search_rollouts(evaluate, starts, data, weight, steps, self.policy.batch, within=within)
 
-        optima = searched(starts)
+        optima = search_from(starts)
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
         unended = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
         if most is None and np.any(near & unended):  # a proposal has to be an optimum
-            optima = searched(np.asarray(optima[0].z))
+            optima = search_from(np.asarray(optima[0].z))
         bare = problem if scanned is None else scanned
         if not rivals or not scans.scanned_coordinates(bare):
             return optima
@@ -782,7 +788,7 @@ class Histories(Observer):
             return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), observation
 
         def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
-            return result_of_member(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
+            return result_of_member(search_from(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
 
         scan_data = dataclasses.replace(bare.data, weight=weights[k])
         best, seen_observation = scans.search_lower_minima(
@@ -801,7 +807,7 @@ class Histories(Observer):
         evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], active_sets)
         r, jacobian, observation = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
         return *zero_inactive_residuals(
-            jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)
+            jnp.asarray(r), jnp.asarray(jacobian), adhesion_penalty_slice(problem.data)
         ), observation
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
@@ -1445,15 +1451,15 @@ def _memory_along_run(
         state_there, run_step = step
         conditions, spans, passes = run_step.held(constant), jnp.diff(state_there.clock), state_there.passes
 
-        def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
+        def solve_next_stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
             law = lambda m: memory_rates(y, conditions, way, m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             return memory + span * speed / (1 - span * slope)
 
-        first = stage(memory, spans[0], state_there.places[0], state_there.sides[0])
+        first = solve_next_stage(memory, spans[0], state_there.places[0], state_there.sides[0])
         ahead = jnp.where(passes, 1.0, spans[1] / jnp.where(spans[0] > 0, spans[0], 1.0))
         span = jnp.where(passes, spans[1], spans[0])
-        last = stage(memory + ahead * (first - memory), span, state_there.places[1], state_there.sides[1])
+        last = solve_next_stage(memory + ahead * (first - memory), span, state_there.places[1], state_there.sides[1])
         return last, jnp.stack([first, last])
 
     begin = first_conditions_and_state(robot, conditions)[1]

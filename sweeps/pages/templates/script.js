@@ -1,14 +1,17 @@
-// Tables are sorted by a click on a heading; figures say what is under the pointer. Nothing is fetched.
+// Tables are sorted by a click on a heading, and stacked on a phone; figures say what is under the pointer. Nothing is fetched.
 document.querySelectorAll("table").forEach(table => {
   const heads = [...table.rows].filter(row => row.cells.length && [...row.cells].every(cell => cell.tagName === "TH"));
   const body = [...table.rows].filter(row => !heads.includes(row));
-  if (body.length < 3 || body.some(row => row.className === "sub" || [...row.cells].some(cell => cell.rowSpan > 1))) return;
-  const taken = heads.map(() => []);
+  if (body.some(row => row.className === "sub" || [...row.cells].some(cell => cell.rowSpan > 1))) return;
+  const taken = heads.map(() => []), above = [];
   heads.forEach((row, r) => [...row.cells].forEach(head => {
     let column = 0;
     while (taken[r][column]) column++;
     for (let i = 0; i < head.rowSpan && r + i < heads.length; i++) for (let j = 0; j < head.colSpan; j++) taken[r + i][column + j] = true;
+    if (head.colSpan > 1) for (let j = 0; j < head.colSpan; j++) above[column + j] = head.textContent + ", ";
     if (head.colSpan > 1 || r + head.rowSpan < heads.length || !head.textContent.trim()) return;
+    body.forEach(row => { if (row.cells[column]) row.cells[column].dataset.head = (above[column] || "") + head.textContent; });
+    if (body.length < 3) return;
     head.tabIndex = 0;
     head.title = "sort by this";
     const sort = () => {
@@ -26,6 +29,13 @@ document.querySelectorAll("table").forEach(table => {
     head.addEventListener("keydown", e => { if (e.key === "Enter" || e.key === " ") { e.preventDefault(); sort(); } });
   }));
 });
+const stack = () => document.querySelectorAll(".scroll > table").forEach(table => {  // rows as lists where a phone would scroll
+  table.classList.remove("stacked");
+  table.classList.toggle("stacked", innerWidth < 600 && table.rows.length < 60 && table.scrollWidth > table.parentElement.clientWidth);
+});
+stack();
+addEventListener("resize", stack);
+addEventListener("toggle", stack, true);
 document.querySelectorAll("table").forEach((table, number) => {  // every table as CSV
   const next = (table.closest(".scroll") || table).nextElementSibling;
   if (table.rows.length < 3 || table.closest(".overlay") || next && next.querySelector("a.csv")) return;

@@ -1,1 +1,1 @@
-"""English of what was computed, made here once for terminal, JSON and page: rooms that compute return data."""
+"""English sentences on results, built once for terminal, JSON and page. Modules that compute return data."""

@@ -1,4 +1,4 @@
-"""The English of an export: its statement, its remarks, and the page LAW.md."""
+"""Texts of an export: statement, remarks, and the file LAW.md."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ USE = {
         "writes it. `actuator/…` are keys of `PARAMS`."
     ),
 }
-#: Readings that a controller compares with its goal, their units, and the last term of its duty.
+#: Readings that a controller compares with its setpoint, their units, and the last term of its duty.
 GOALS = {
     "goal_angle": ("angle", "rad", "- K_d ω"),
     "goal_speed": ("ω", "rad/s", "+ K_f goal"),
@@ -65,7 +65,7 @@ BACKWARD = "Runs in which the load drives the motor, because none is among the r
 
 
 def export_statement(found: Export) -> str:
-    """One sentence: what was exported, and its error compared with the native model."""
+    """One sentence: the exported drive, and its error compared with the native model."""
     compared = found.comparison
     exported, native = compared.of(EXPORTED), compared.of(NATIVE)
     channels_shown = ", ".join(
@@ -82,7 +82,7 @@ def export_statement(found: Export) -> str:
 
 
 def share_kept(fate: EffectFate) -> str:
-    """Share of an effect that is kept, in percent, empty where none was computed."""
+    """Share of an effect that is kept, in percent, empty if it was not computed."""
     return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
 
 
@@ -113,7 +113,7 @@ def export_remarks(found: Export) -> list[str]:
 
 
 def conditions_seen(found: Export) -> list[str]:
-    """Ranges of the compared runs, a line each."""
+    """Ranges of the compared runs, one line for each."""
     runs = found.comparison.situation
     lines = [
         f"{count_noun(len(runs.command), 'settled run')} of {runs.source}",
@@ -134,14 +134,14 @@ def _span(values: np.ndarray) -> str:
 
 
 def not_tested(found: Export) -> list[str]:
-    """Limits of the comparison, a sentence each."""
+    """Limits of the comparison, one sentence for each."""
     runs = found.comparison.situation
     backward = bool(np.any(runs.load * runs.inside.speed < 0))
     return [*NOT_TESTED, *([] if backward else [BACKWARD])]
 
 
 def rotor_inertia(found: Export) -> float:
-    """Inertia of the rotor at the joint [kg·m²]: of a motor that drives, or the armature of an exported law."""
+    """Inertia of the rotor at the joint [kg·m²], or armature of an exported law."""
     robot = found.joint.robot
     if found.format == "onnx":
         law = module_from_source(jax_source(found.joint, found.constants))
@@ -151,7 +151,7 @@ def rotor_inertia(found: Export) -> float:
 
 
 def law_equations(found: Export) -> list[str]:
-    """The law's equations in words, in the order in which they are computed, with the symbols of the constants."""
+    """Equations of the law in words, in the order of computation, with the symbols of the constants."""
     robot = found.joint.robot
     sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
              "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
@@ -188,14 +188,16 @@ def law_equations(found: Export) -> list[str]:
 
 
 def _further_equations(joint: DriveJoint) -> list[str]:
-    """Equations of a controller, and of a load that turns apart from the motor."""
+    """Equations of a controller, and of a load that turns separately from the motor."""
     lines = []
     if joint.controller is not None:
         goal, unit, rate = GOALS[joint.robot.rig.imposed]
+        own = joint.controller
+        sampled = f" It acts at {own.rate:g} Hz, {own.samples_late:g} samples late, and holds D." * (own.rate > 0)
         lines.append(
             f"Controller: e = goal - {goal} [{unit}], D = K_p e + K_i ∫ e dt {rate} within ± limit, U = D times the "
             "supply. At the limit, an error that drives D further is not integrated. With a lag T, the duty follows: "
-            "T dD'/dt = D - D'. [-]"
+            f"T dD'/dt = D - D'.{sampled} [-]"
         )
     if joint.loose:
         lines.append(
@@ -208,7 +210,7 @@ def _further_equations(joint: DriveJoint) -> list[str]:
 
 
 def command_sentence(found: Export) -> str:
-    """Sentence for the command of an exported controller, empty where the command is a voltage."""
+    """Sentence on the command of an exported controller, empty if the command is a voltage."""
     imposed = found.joint.robot.rig.imposed
     if found.joint.controller is None or found.format == "table":
         return ""
@@ -223,7 +225,7 @@ def command_sentence(found: Export) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """A name of a user's in Markdown: it ends no line, cell or code, and begins no HTML."""
+    """User's name escaped for Markdown, so that it ends no line, cell or code, and begins no HTML."""
     words = " ".join(printable(text).split())
     return words.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
 

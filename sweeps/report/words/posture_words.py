@@ -1,4 +1,4 @@
-"""Sentences on a posture, on the console and on the page."""
+"""Sentences on a posture, for terminal and page."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from sweeps.report.document import Column, Table
 
-#: Angles at which the map of highest steps looks at front and rear levers [deg].
+#: Angles of front and rear levers in the map of highest steps [deg].
 ANGLES = np.arange(-180.0, 181.0, 6.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """A robot from the side on the ground: lower, and from its centre of mass on higher by a step.
+    """Robot from the side on a ground with a step below its centre of mass.
 
     Attributes:
         side: side in a frame along the ground.
-        base: height of its middle of the wheelbase [m].
-        step: [m].
-        slope: [rad].
+        base: height of the middle of the wheelbase [m].
+        step: height of the step [m].
+        slope: slope of the ground [rad].
     """
 
     side: SideOutline
@@ -46,10 +46,11 @@ class StepMap:
     """Highest steps and margins of tipping over angles of the levers.
 
     Attributes:
-        angles_deg: of front and rear levers. step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
-        best: the highest, drawn.
-        front_deg, rear_deg: there.
-        own_deg: the run's own angles, front and rear.
+        angles_deg: angles of front and rear levers [deg].
+        step_mm, margin_mm: highest step, and margin at rest on the run's slope [mm], shape (front, rear).
+        best: posture with the highest step.
+        front_deg, rear_deg: angles of its levers.
+        own_deg: angles of the run, front and rear.
     """
 
     angles_deg: np.ndarray
@@ -63,12 +64,12 @@ class StepMap:
 
 @dataclasses.dataclass(frozen=True)
 class Postures:
-    """Of the runs of a table.
+    """Postures of the runs of a table.
 
     Attributes:
-        table: by column.
-        rest, step: the first run's, drawn, at rest and on its highest step.
-        over: of the first run.
+        table: columns of the postures.
+        rest, step: posture of the first run at rest and on its highest step.
+        over: map of the first run.
     """
 
     table: Columns
@@ -78,7 +79,7 @@ class Postures:
 
 
 def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
-    """Postures of the runs of a table, None if it states no levers."""
+    """Postures of the runs of a table. None if it states no lever angles."""
     if not conditions.states_levers:
         return None
     rests, limits, lies, steps = jax.device_get(static_limits.postures_of_runs(robot, conditions))
@@ -119,9 +120,9 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
 
 
 def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dict[str, tuple[Drawn, float, float]]:
-    """A robot as requirements of its geometry ask about it, by their names: drawn, and angles of its levers [deg].
+    """Robot in the posture of each geometric requirement, by name, with the angles of its levers [deg].
 
-    The best posture on a step, levers flush with the belt over a gap, folded for its size.
+    On a step it is the best posture, over a gap the levers are flush with the belt, and for the size they are folded.
     """
     found: dict[str, tuple[Drawn, float, float]] = {}
     for outcome in outcomes:
@@ -159,12 +160,12 @@ COLUMNS = {
     "tip_rear_mm": ("rear tip up to [mm]", "{:.0f}"), "overall_length_mm": ("length [mm]", "{:.0f}"),
     "overall_height_mm": ("height [mm]", "{:.0f}"),
 }  # fmt: skip
-#: Rows of that table at most.
+#: Most rows of that table.
 ROWS = 20
 
 
 def posture_table(found: Postures, names: Sequence[str]) -> Table:
-    """Postures of the first runs, a row each."""
+    """Postures of the first runs, one row for each."""
     shown = {c: about for c, about in COLUMNS.items() if c in found.table}
     rows = zip(names[:ROWS], *(found.table[c][:ROWS] for c in shown), strict=True)
     columns = (Column("run"), *(Column(heading, form=form) for heading, form in shown.values()))
@@ -184,7 +185,7 @@ def posture_sentences(found: Postures) -> str:
 
 
 def tipping_remarks(found: Postures) -> list[str]:
-    """Remarks on runs that would tip over, which the numbers of straight travel do not show."""
+    """Remarks on runs that would tip over, because the numbers of straight travel do not show it."""
     tipping_runs = np.flatnonzero(found.table["margin_mm"] < 0)
     if not tipping_runs.size:
         return []

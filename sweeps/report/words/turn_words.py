@@ -17,18 +17,18 @@ from mmrjax.model.signals import NOT_SETTLED, STATUSES, Result
 from mmrjax.turning.two_sides import BETWEEN, OVER
 from sweeps.pages import words
 
-FULL = 2 * math.pi  # rad a turn
-#: Motor speed below which a motor stands [rpm], speed below which a robot turns on the spot [mm/s].
+FULL = 2 * math.pi  # rad per turn
+#: Speed below which a motor stands [rpm], and below which a robot turns on the spot [mm/s].
 STANDS, SPOT = 1.0, 1.0
 
 
 def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
-    """Remark on effects that differ between the sides and that runs without a turn do not show."""
+    """Remark on effects that differ between the sides, which runs without a turn do not show."""
     return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
 
 
 def turn_under_equal_commands(robot: Robot, found: Result, value: float) -> str:
-    """Turn of a robot with both sides driven the same, by configuration, in words, empty if it travels straight.
+    """Turn of a robot whose sides are driven equally, by configuration, in words. Empty if it travels straight.
 
     Args:
         value: imposed voltage or motor speed [V, rpm].
@@ -52,7 +52,7 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     """Reason for a missing turn: the limit at full voltage, or no steady turn under friction.
 
     Args:
-        speed: demanded [m/s].
+        speed: demanded speed [m/s].
         rate: demanded yaw rate [rad/s].
         speeds, rates: speeds and rates of settled turns at full voltage, from straight travel to the spot. NaN: no
             steady turn.
@@ -80,11 +80,11 @@ def has_motion(row: Json) -> bool:
 
 
 def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
-    """A turn in a sentence.
+    """One sentence on a turn.
 
     Args:
         row: row of the table of runs.
-        ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end. None: a settled turn.
+        ended: `time_s`, `displacement_m` and `turned_deg` at the end of a run over time. None: a settled turn.
     """
     status = str(row["status"])
     if not has_motion(row):
@@ -107,7 +107,7 @@ def _way(row: Json) -> str:
 
 
 def _now(row: Json) -> str:
-    """A motion that still changes."""
+    """Motion that still changes, in words."""
     rate, speed = float(row["yaw_rate_rad_s"]), float(row["speed_mm_s"])
     return f"Not settled: it then moves at {speed:.0f} mm/s and turns to the {_way(row)} at {abs(rate):.2f} rad/s."
 
@@ -132,7 +132,7 @@ def _moves(row: Json) -> str:
 
 
 def turn_notes(robot: Robot, row: Json) -> list[str]:
-    """Remarks on a turn: effective width, motors that stand or are driven, limits that are exceeded."""
+    """Remarks on a turn: effective width, motors that stand or are driven, and exceeded limits."""
     notes = []
     own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
     width = float(row["effective_width_mm"])
