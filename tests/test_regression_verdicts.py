@@ -65,7 +65,9 @@ def answered(tmp_path_factory):
 
     def input_of(**faults):
         runs = Runs("log.csv", log(**faults)).of(robot)
-        noise = f"motor_speed={SD[0] / RPM}rpm,{next(c.name for c in runs.channels if c.name != 'motor_speed')}={SD[1]}A"
+        noise = (
+            f"motor_speed={SD[0] / RPM}rpm,{next(c.name for c in runs.channels if c.name != 'motor_speed')}={SD[1]}A"
+        )
         return discover.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
 
     def space_of(**faults):
@@ -109,12 +111,16 @@ def test_windows_fit_effects_as_least_squares_do(answered):
     fit = weak_form.fit_weak_form(space.bare, space.library.scored)
     posed, rows = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
     observe, names = posed.observe, space.library.names
-    table = active_set.candidate_space(posed, space.library.effects, {n: BY_NAME[n] for n in NAMES}, 4, SETTINGS.width)
+    table = active_set.candidate_space(
+        posed, space.library.effects, {n: BY_NAME[n] for n in NAMES}, 4, SETTINGS.width
+    )
     slots = ("directional_friction", "supply_sag", "", "")
     (found,) = candidates.fit_candidates(table, [(slots, np.zeros(table.free + 8))], SETTINGS)
     linear, size = observe.linear, table.free
     counts = np.asarray(posed.data.weight).ravel() > 0
-    e, j, g = (np.asarray(x)[: linear.readings][counts] for x in (linear.residual, linear.jacobian, linear.signatures))
+    e, j, g = (
+        np.asarray(x)[: linear.readings][counts] for x in (linear.residual, linear.jacobian, linear.signatures)
+    )
     chosen = [list(space.library.of).index(names.index(n)) for n in slots[:2]]  # without a shape
     columns = np.concatenate([j, SETTINGS.width * g[:, chosen]], 1)
     prior = np.concatenate([np.asarray(fit.origin) - fit.centre, np.zeros(2)])
@@ -131,7 +137,9 @@ def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered
     linear = posed.observe.linear
     way = np.asarray(linear.signals.direction)
     column = np.asarray(linear.columns(linear.probed.index("track"), way[:, None] ** 2))[:, 0]
-    offset = np.asarray(linear.signatures)[:, list(space.library.of).index(space.library.names.index("torque_offset"))]
+    offset = np.asarray(linear.signatures)[
+        :, list(space.library.of).index(space.library.names.index("torque_offset"))
+    ]
     assert abs(column @ offset) > 0.999 * np.linalg.norm(column) * np.linalg.norm(offset) > 0
 
 

@@ -22,7 +22,7 @@ from calibration.data import Columns, Names
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite_or_zero
-from calibration.inference.observers.base import SearchPolicy
+from calibration.inference.observers.base import SearchPolicy, linear_replicate
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
 from calibration.inference.problem import Data, Observation, Problem, data_from_readings
@@ -39,7 +39,6 @@ from mmrjax.model import channels
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
-from mmrjax.numerics.linear_equations import solve
 
 #: Number of windows whose noise is known together.
 TOGETHER = 128
@@ -209,10 +208,7 @@ class Windows(SettledRuns):
     def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
-        jacobian = linear.jacobian
-        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
-        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
-        return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
+        return linear_replicate(data, linear, drawn)
 
     def search(
         self,
