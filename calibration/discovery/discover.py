@@ -770,11 +770,11 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     level.
     """
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
-    if searched is None or beside is None or given.shows_unmodelled_backlash:
-        return None
     if given.known is not None:  # only the noise differs
         refuted = given.known.run is not None and given.known.run.contradicts
-        return dataclasses.replace(traced, verdict="place") if refuted else traced
+        return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
+    if searched is None or beside is None or given.shows_unmodelled_backlash:
+        return None
     given.progress(progress_remark("confirm"))
     base, best = screened.base.candidate, traced.best
     if best is base:
