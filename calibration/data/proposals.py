@@ -142,8 +142,8 @@ def propose_columns(
         best, *others = sorted(group, key=lambda c: (c.signal.clock is None, bool(c.question)))
         question = best.question
         if others:
-            rest = ", ".join(c.signal.path for c in others[:3])
-            question = f"or {rest}: which one is the {quantity.replace('_', ' ')}?"
+            other_paths = ", ".join(c.signal.path for c in others[:3])
+            question = f"or {other_paths}: which one is the {quantity.replace('_', ' ')}?"
         if joint := _joint_name(best.signal, signals):
             question = f"joint {joint}{'; ' * bool(question)}{question}"
         yield best.signal.path, best.line(question)
@@ -322,17 +322,17 @@ def _units_of_position_and_rate(
 def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
     """Ratio of a position to the integral of a rate, NaN if the position is not that integral."""
     step = np.diff(time)
-    sound = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
-    if sound.sum() < 3:
+    is_usable = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
+    if is_usable.sum() < 3:
         return math.nan
-    sound &= step <= 5 * np.median(step[sound])
-    distance = np.cumsum(np.where(sound, np.diff(place), 0.0))
-    integral = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
+    is_usable &= step <= 5 * np.median(step[is_usable])
+    distance = np.cumsum(np.where(is_usable, np.diff(place), 0.0))
+    integral = np.cumsum(np.where(is_usable, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
     if not np.any(integral):
         return math.nan
     factor = float(distance @ integral / (integral @ integral))
-    rest = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
-    return factor if rest < INTEGRAL else math.nan
+    relative_error = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
+    return factor if relative_error < INTEGRAL else math.nan
 
 
 def _currents_by_duty(pool: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:

@@ -423,7 +423,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             "duty", "", "share of the supply's voltage that the driver gives the motors", _SHARE, percent=True,
             in_tables=True, imposed=_BY_VOLTAGE, in_profiles=True,
         ),
-        Condition("open", "", "1 where the motors' circuit is open", _SHARE),
+        Condition("open", "", "1 if the motors' circuit is open", _SHARE),
         Condition("motor_acceleration", "rad/s^2", "acceleration of an imposed motor speed", (-1e7, 1e7)),
         *(
             Condition(
