@@ -222,7 +222,7 @@ def test_report_tells_the_story_in_order(done):
     order = [
         'id="answer"', 'id="law"', 'id="summary"', 'id="advice"', 'id="found"', 'id="contents"', 'id="before_after"',
         'id="defects"', '<figure id="errors-figure"', 'id="effects"', 'id="notes"', 'id="ladder"',
-        'id="look_alikes"', 'id="unseen"', 'id="base_shift"', '<table id="words"', 'id="files"',
+        'id="look_alikes"', 'id="unseen"', '<table id="base"', '<table id="words"', 'id="files"',
     ]  # fmt: skip
     at = [text.find(mark) for mark in order]
     assert -1 not in at and at == sorted(at)
