@@ -5,7 +5,6 @@ import json
 import math
 import re
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +32,10 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
 from sweeps.report import calibration_report
 from sweeps.report.terminal_renderer import print_document
-from tests.commands import read_json
+from tests.commands import read_json, schema_of
 from tests.commands import rows as rows_of
 
-ROOT = Path(__file__).resolve().parents[1]
-SCHEMA = read_json(ROOT / "docs" / "schemas" / "calibrate.schema.json")
+SCHEMA = schema_of("calibrate")
 
 
 @pytest.fixture(scope="module")

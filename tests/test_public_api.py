@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +26,7 @@ from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.signals import Result
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests.commands import ROOT
 
 
 def python(code, **environment):

@@ -2,7 +2,6 @@
 
 import re
 import tomllib
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -27,12 +26,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
 from sweeps.report.document import Figure
-from tests.commands import ends, read_json
+from tests.commands import ends, read_json, schema_of
 from tests.commands import rows as table
 from tests.pages import Tables
 
-ROOT = Path(__file__).parents[1]
-SCHEMA = read_json(ROOT / "docs" / "schemas" / "sensitivity.schema.json")
+SCHEMA = schema_of("sensitivity")
 NAMES = ("motor.torque_constant", "6T2A.track.guide_share", "4W2T.track.loss_coulomb", "motor.inductance")
 SMALL = (
     "sensitivity --parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",

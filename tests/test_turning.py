@@ -35,11 +35,6 @@ def of_world(robot, configuration, payload=0.0, **changes):
 
 
 @pytest.fixture(scope="module")
-def robot():
-    return paper_robots.nominal()
-
-
-@pytest.fixture(scope="module")
 def turns(robot):
     """Settled turns at 33 V: as `DUTIES` say, mirrored, backward, and straight, of either configuration."""
     left = [a for a, _ in DUTIES] + [b for _, b in DUTIES] + [-a for a, _ in DUTIES] + [0.7]
