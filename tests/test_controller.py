@@ -35,7 +35,7 @@ def actuator(tmp_path):
 def angles(robot, goal, times, parts=1):
     """Simulated angles of the output [rad] for a goal held from each of its instants."""
     grid = histories.time_grid(times, goal[0], parts=parts)
-    held = goal[1][np.searchsorted(goal[0], grid, side="right") - 1]
+    held = goal[1][np.searchsorted(goal[0], grid + 1e-9, side="right") - 1]
     conditions = mm.Conditions(voltage=servo.TRUE["supply"], goal=0.0)
     conditions = eqx.tree_at(lambda c: c.goal, conditions, jnp.asarray(held))
     shown = jax.jit(lambda r: histories.history_signals(r, conditions, jnp.asarray(grid)).angle)
@@ -54,20 +54,42 @@ def test_a_servo_follows_as_an_own_simulation(actuator, lag):
     assert_allclose(np.asarray(shown)[rows], own, atol=1e-6)
 
 
+SAMPLED = "rate = 50\nkp = ", "rate = 50\nsamples_late = 1\nkp = "
+PERIOD = 0.02
+#: Goals at the samples of a controller.
+WAVES = np.arange(0, 0.4, PERIOD), 0.4 * np.sin(8 * np.pi * np.arange(0, 0.4, PERIOD)) ** 2
+#: Gains with which a controller of 50 Hz is stable.
+SLOWER = {**servo.TRUE, "kp": 2.0, "ki": 3.0}
+
+
 @pytest.mark.parametrize("late", [False, True])
-def test_a_sampled_controller_is_nearly_one_with_a_lag(actuator, late):
-    period, times = 0.002, np.linspace(0.0, 0.6, 13)
-    instants = np.arange(0, 0.6, period)
-    goal = 0.4 * np.sin(4 * np.pi * instants) ** 2
-    own = servo.simulate((instants, goal), times, servo.TRUE, 1e-7, period, late)[0]
+def test_a_sampled_controller_follows_as_an_own_simulation(actuator, late):
+    times = np.linspace(0.0, 0.4, 17)  # between samples too
+    own = servo.simulate(WAVES, times, SLOWER, period=PERIOD, late=late)[0]
+    robot = actuator(SLOWER, "kp = ", SAMPLED[late])
+    shown, rows = angles(robot, WAVES, times, parts=12)
+    assert_allclose(np.asarray(shown)[rows], own, atol=1e-6)
+    held, other = (angles(actuator(SLOWER, "kp = ", x), WAVES, times)[0] for x in ("kp = ", SAMPLED[not late]))
+    assert min(np.abs(np.asarray(x)[rows // 12] - own).max() for x in (held, other)) > 0.01
 
-    def error(lag):
-        earlier = np.maximum(instants - period / 2 * (lag > 0), 0.0)
-        earlier[1:] += 1e-9  # the first two goals have one instant
-        shown, rows = angles(actuator(old="kp = ", new=f"lag = {lag}\nkp = "), (earlier, goal), times)
-        return np.abs(np.asarray(shown)[rows] - own).max()
 
-    assert error(1.5 * period if late else 0.5 * period) < 3e-4 < 3e-3 < error(0.0)
+def test_runs_of_drive_and_steps_follow_a_sampled_controller(actuator):
+    times = np.array([0.0, 0.015, 0.1, 0.13, 0.4])
+    values = {**SLOWER, "coulomb": 0.0}
+    robot = actuator(values, "kp = ", SAMPLED[True])
+    own = servo.simulate((np.zeros(1), np.full(1, 0.5)), times, values, period=PERIOD, late=True)[0]
+    conditions = mm.Conditions(voltage=7.4, goal=0.5)
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], conditions)
+    assert_allclose(drive.drive_batch(robot, batch, jnp.asarray(times), 1e-9).signals.angle[0], own, atol=1e-6)
+    state = mm.initial_state(robot, conditions)
+    step = jax.jit(lambda s: mm.step(robot, s, {"goal": 0.5}, 0.005, conditions))
+    for _ in range(80):
+        state = step(state)
+    assert float(state.distance) == pytest.approx(own[-1], abs=1e-4)
+    with pytest.raises(
+        mm.UsageError, match=r"dt: got 0\.015; expected a whole part of the controller's period, 0\.02 s"
+    ):
+        mm.step(robot, state, {"goal": 0.5}, 0.015, conditions)
 
 
 def test_a_run_of_drive_follows_as_an_own_simulation(actuator):
@@ -79,10 +101,14 @@ def test_a_run_of_drive_follows_as_an_own_simulation(actuator):
     assert 50 * np.abs(states[:, 3]).max() > 0.1, "the integral acts"
 
 
+@pytest.mark.parametrize("rate", [0, 50])
 @pytest.mark.parametrize("name", ["controller.kp", "controller.kd", "controller.limit", "motor.torque_constant"])
-def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, name):
+def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, name, rate):
     robot, times = actuator(), np.linspace(0.0, 0.4, 9)
     onward = STEPS[0], np.array([0.8, 1.2])  # a reversal within a step has an error of its own
+    if rate:
+        values = {**SLOWER, "coulomb": 0.0}  # the moment at which friction yields is one of a step
+        robot, onward = actuator(values, "kp = ", SAMPLED[True]), (WAVES[0], 0.8 + WAVES[0])
     value = next(float(p.value) for p in params.walk_parameters(robot) if p.name == name)
 
     def shown(x):
@@ -166,6 +192,12 @@ REFUSED = {
         r"controller: cannot be combined with imposed = .voltage.*goal_angle",
     ),
     "no such gain": ("kd = 0.1", "kq = 0.1", r"controller\.kq: no such parameter.*controller\.k"),
+    "a lag of a held duty": ("kp = ", "rate = 50\nlag = 0.01\nkp = ", r"controller\.lag: got 0\.01 s with rate = 50"),
+    "half a sample": (
+        "kp = ",
+        "rate = 50\nsamples_late = 0.5\nkp = ",
+        r"controller\.samples_late: got 0\.5 with rate = 50; expected 0, or with a rate 1",
+    ),
     "a limit beyond the supply": ("limit = 0.9", "limit = 1.5", r"controller\.limit: got 1\.5; expected 0\.01 to 1"),
 }
 
@@ -191,11 +223,11 @@ SLOW_GOAL = 0.3 * np.sin(np.pi * SLOW) * np.minimum(SLOW, 1)
 WIDE = {"kp = 8.0": 'kp = "7.0 ± 100 %"', "torque_constant = 0.006": 'torque_constant = "0.0065 ± 100 %"'}
 
 
-def servo_log(goal, seed=1):
-    """Goal and angle of 12 bits at 100 Hz, and the states."""
+def servo_log(goal, seed=1, every=0.01, values=servo.TRUE, **sampled):
+    """Goal and angle of 12 bits, and the states."""
     rng, step = np.random.default_rng(seed), 2 * np.pi / 4096
-    times, goal = np.arange(len(goal)) * 0.01, np.round(goal / step) * step
-    angle, states = servo.simulate((times, goal), times, servo.TRUE, 1e-8)
+    times, goal = np.arange(len(goal)) * every, np.round(goal / step) * step
+    angle, states = servo.simulate((times, goal), times, values, 1e-8, **sampled)
     shown = np.round((angle + rng.normal(0, 0.5 * step, len(times))) / step) * step
     return {"time_s": times, "goal_angle_deg": np.degrees(goal), "output_angle_deg": np.degrees(shown)}, states
 
@@ -226,6 +258,28 @@ PRIOR = {
     "torque_constant = 0.006": 'torque_constant = "0.0065 ± 20 %"', "loss_coulomb = 0.02": 'loss_coulomb = "0.03 ± 50 %"',
     "loss_viscous = 0.005": 'loss_viscous = "0.004 ± 50 %"', "resistance = 4.0": 'resistance = "4.0 ± 0"',
 }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [False, True])
+def test_a_log_at_the_rate_of_its_controller_gives_the_gain(tmp_path, late):
+    """A continuous controller with a lag left 5 times the noise and a gain off by 39 %."""
+    slower = {**servo.TRUE, "kp": 2.5, "kd": 0.05}
+    prior = PRIOR | {"kp = 8.0": 'kp = "3.0 ± 30 %"', "kd = 0.1": 'kd = "0.04 ± 50 %"'}
+    text = servo.RIG.format(**servo.TRUE)
+    for old, new in prior.items():
+        text = text.replace(old, new)
+    text = text.replace("kp = ", SAMPLED[late]) + f"[instruments.output_angle]\nquantum = {360 / 4096}\n"
+    t = np.arange(0, 6, PERIOD)
+    goal = np.where(t < 3, 0.8 * (-1.0) ** (t // 0.75), np.sin(5 * t) * np.minimum(t - 3, 1))
+    log = servo_log(goal, every=PERIOD, values=slower, period=PERIOD, late=late)[0]
+    robot = read_rig(tmp_path, text)
+    found = calibrate(records.read_runs(log, robot), robot, starts=2, profiles=False, blocks=False)
+    kp = found.parameters["controller.kp"]
+    assert abs(kp.value - slower["kp"]) < 2 * kp.sd < 0.2
+    shown = np.asarray(Histories.of(records.read_runs(log, robot), found.robot)(found.robot).reading)[:, 0]
+    error = np.sqrt(np.mean((shown - np.radians(log["output_angle_deg"])) ** 2))
+    assert error < 1.2 * 2 * np.pi / 4096 * np.sqrt(0.5**2 + 1 / 12)
 
 
 @pytest.mark.slow

@@ -721,6 +721,8 @@ APART = {
     "servo": (servo.RIG.format(**servo.TRUE), 5e-4, 4e-4),
     "servo with an integral and a lag": (
         servo.RIG.format(**servo.TRUE | {"ki": 20.0}).replace("kp =", "lag = 0.005\nkp ="), None, 3e-4),
+    "servo at 50 Hz": (
+        servo.RIG.format(**servo.TRUE | {"kp": 2.0, "ki": 3.0}).replace("kp =", "rate = 50\nsamples_late = 1\nkp ="), None, 5e-4),
     **{
         f"servo with a lossy gear, {load} load": (
             servo.RIG.format(**servo.TRUE | {"load": inertia}).replace("efficiency_load = 1.0", f"efficiency_load = {share}")
@@ -773,6 +775,10 @@ def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     assert [v[mujoco.PLAY].verdict for v in verdicts] == [held, held, lost]
     assert [v[mujoco.CONTROLLER].verdict for v in verdicts] == [near, held, lost]
     assert "lag of 0.005 s is dropped" in verdicts[0][mujoco.CONTROLLER].how
+    rig.write_text(APART["servo at 50 Hz"][0])
+    sampled = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    fates = {f.name: f for f in mujoco.fates_in_mujoco(sampled, 0.0)}
+    assert "acts at each step, not at 50 Hz" in fates[mujoco.CONTROLLER].how
     assert "0.03 rad of play" in verdicts[2][mujoco.PLAY].how
     rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
     with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; the exported controller"):

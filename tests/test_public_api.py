@@ -96,6 +96,7 @@ def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
 
 def test_package_states_its_names_version_and_types():
     assert set(mm.__all__) <= set(dir(mm))
+    assert {"motor", "gearbox", "battery"} <= set(dir(mm.nominal())) and "within" not in dir(mm.nominal())
     for name in mm.__all__:
         assert getattr(mm, name) is not None
     with pytest.raises(AttributeError, match="module 'mmrjax' has no attribute 'simulat'"):

@@ -62,6 +62,13 @@ RATINGS = {
     ),
     "battery.current_limit": (1e-3, 1e4, "A", "largest discharge current of a cell; not stated: no limit"),
     "battery.current_charge": (0.0, 1e4, "A", "largest charging current of a cell; not stated: no limit"),
+    "controller.rate": (
+        0.0,
+        1e5,
+        "Hz",
+        "rate of the controller's samples, the first in a run's first row; 0: continuous",
+    ),
+    "controller.samples_late": (0.0, 1.0, "-", "number of samples, 0 or 1, after which its duty acts"),
     "controller.supply_voltage": (
         0.0,
         1000.0,
@@ -384,7 +391,18 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
                 f"{name}.inertia must be above 0"
             )
     controller = robot.controller
-    controller = None if controller is None else dataclasses.replace(controller, lags=float(controller.lag) > 0)
+    if controller is not None:
+        controller = dataclasses.replace(controller, lags=float(controller.lag) > 0)
+        if controller.rate and controller.lags:
+            raise BadConfiguration(
+                f"{where}, controller.lag: got {float(controller.lag):g} s with rate = {controller.rate:g}; a held "
+                "duty has no lag: leave one of them out"
+            )
+        if controller.samples_late not in (0, bool(controller.rate)):
+            raise BadConfiguration(
+                f"{where}, controller.samples_late: got {controller.samples_late:g} with rate = "
+                f"{controller.rate:g}; expected 0, or with a rate 1"
+            )
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=controller)
 
 

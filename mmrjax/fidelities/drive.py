@@ -67,7 +67,7 @@ class DriveTrajectory(eqx.Module):
 def drive_units(robot: Robot) -> tuple[float, ...]:
     """Units of the unknowns."""
     memory = tuple(effect.memory_size or 1.0 for effect in robot.remembering)
-    return _UNITS + memory + (1.0,) * robot.controller_size + (_GAP,) * robot.loose
+    return _UNITS + memory + (1.0,) * len(robot.controller_states) + (_GAP,) * robot.loose
 
 
 def state_of_unknowns(robot: Robot, y: Unknowns) -> State:
@@ -75,8 +75,25 @@ def state_of_unknowns(robot: Robot, y: Unknowns) -> State:
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     first = len(_UNITS) + len(memory)
-    own = dict(zip(("integral", "command"), y[first : first + robot.controller_size], strict=False))
+    own = dict(zip(robot.controller_states, y[first : first + len(robot.controller_states)], strict=True))
     return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None, **own)
+
+
+def unknowns_of_state(robot: Robot, state: State) -> Unknowns:
+    """The inverse of `state_of_unknowns`."""
+    memory = [state.memory[effect.name] for effect in robot.remembering]
+    values = [state.current, state.speed_motor, state.speed, state.distance, state.discharge, *memory]
+    values += [getattr(state, name) for name in robot.controller_states]
+    values += [] if state.gap is None else [state.gap]
+    return jnp.stack([jnp.asarray(x, float) for x in values]) / jnp.asarray(drive_units(robot))
+
+
+def sampled_unknowns(robot: Robot, conditions: Conditions, y: Unknowns) -> Unknowns:
+    """Unknowns after a controller with a rate has read them, if a sample is due. Of other robots the same."""
+    if robot.controller is None or not robot.controller.rate:
+        return y
+    state = balances.sampled_controller(robot, conditions, state_of_unknowns(robot, y))
+    return unknowns_of_state(robot, state)
 
 
 #: The signals of an instant, traced once for each kind of robot and shared within a program.
@@ -144,7 +161,7 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
-    state += [jnp.zeros(())] * robot.controller_size
+    state += [jnp.zeros(())] * len(robot.controller_states)
     if robot.loose:
         state += [load.twist(settled.torque_output)]
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
@@ -210,7 +227,9 @@ def drive(
     driven = rolling or imposed or robot.controller is not None  # a controller may turn it later
     parked = jnp.asarray(False) if driven else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    ys, went = _integrate_unknowns(drive_rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    run = robot, conditions, moves, y0, times, tolerance, max_steps
+    sampled = robot.controller is not None and robot.controller.rate
+    ys, went = _integrate_samples(*run) if sampled else _integrate_unknowns(drive_rates, _norm, *run)
     signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
     if not imposed:
         static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
@@ -287,6 +306,29 @@ def _integrate_unknowns(
     )
     assert solution.ys is not None
     return solution.ys, solution.result == diffrax.RESULTS.successful
+
+
+def _integrate_samples(
+    robot: Robot, conditions: Conditions, moves: Array, y0: Array, times: Array, tolerance: float, max_steps: int
+) -> tuple[Float[Array, "times unknowns"], Array]:
+    """`_integrate_unknowns` for a controller with a rate: from one sample or requested time to the next."""
+
+    def onward(carry: tuple[Array, Array, Array], end: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        def part(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            time, y, went = carry
+            y = sampled_unknowns(robot, conditions, y)
+            until = jnp.minimum(end, time + jnp.asarray(state_of_unknowns(robot, y).clock))
+            span = jnp.stack([time, until])
+            ys, reached = _integrate_unknowns(
+                drive_rates, _norm, robot, conditions, moves, y, span, tolerance, max_steps
+            )
+            return until, ys[-1], went & reached
+
+        carry = jax.lax.while_loop(lambda carry: carry[0] < end, part, carry)
+        return carry, sampled_unknowns(robot, conditions, carry[1])
+
+    (_, _, went), ys = jax.lax.scan(onward, (times[0], y0, jnp.asarray(True)), times)
+    return ys, went
 
 
 def _drive_turning(

@@ -34,6 +34,7 @@ from mmrjax.fidelities.drive import (
     drive_start,
     drive_units,
     moving,
+    sampled_unknowns,
     state_of_unknowns,
     winding_rate,
 )
@@ -148,6 +149,8 @@ class LinearisedRun(eqx.Module):
         sides: see `RunStates`.
         passes: True for steps in which a shaft stops or leaves rest.
         clock: start of a step, and the times of its stages [s], shape (steps, 3).
+        sampled: for a controller with a rate, unknowns before each step, which a sample changes, and the factor of
+            that change in the one at the step's end. None: no rate.
     """
 
     begins: Float[Array, "steps unknowns"]
@@ -159,6 +162,7 @@ class LinearisedRun(eqx.Module):
     carries: Float[Array, "steps unknowns unknowns"]
     gains: Float[Array, "steps 2 unknowns unknowns"]
     lags: Float[Array, "steps rates unknowns"]
+    sampled: tuple[Float[Array, "steps unknowns"], Float[Array, "steps unknowns unknowns"]] | None = None
 
 
 def _stopped_by_clamp(conditions: Conditions, y: Array) -> Array:
@@ -166,6 +170,14 @@ def _stopped_by_clamp(conditions: Conditions, y: Array) -> Array:
     if conditions.held is None:
         return y
     return jnp.where(conditions.held > 0.5, y.at[np.array([MOTOR, GROUND])].set(0.0), y)
+
+
+def _at_start_of_step(robot: Robot, conditions: Conditions, length: Scalar, y: Unknowns) -> Unknowns:
+    """Unknowns with which a step begins: stopped by a clamp, or read by a controller with a rate."""
+    if robot.controller is None or not robot.controller.rate:
+        return _stopped_by_clamp(conditions, y)
+    y = _stopped_by_clamp(conditions, y)
+    return jnp.where(length > 0, sampled_unknowns(robot, conditions, y), y)
 
 
 def _unit_vector_of_current(y: Unknowns) -> Unknowns:
@@ -386,7 +398,8 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
     along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
     def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
-        conditions, y = step.held(constant), _stopped_by_clamp(step.held(constant), y)
+        conditions = step.held(constant)
+        y = _at_start_of_step(robot, conditions, step.length, y)
         lag = _lag_of_robot(robot, constant, step, y)
         law = functools.partial(drive_rates, robot, conditions)
 
@@ -460,8 +473,10 @@ def linearise_run(
     run = solve_states(robot, conditions, times) if known is None else known
     steps, constant = run_steps(conditions, times)
     first_state = first_conditions_and_state(robot, conditions)[1]
-    begins = jnp.concatenate([first_state[None], run.ends[:-1]])
-    begins = jax.vmap(lambda step, y: _stopped_by_clamp(step.held(constant), y))(steps, begins)
+    before = jnp.concatenate([first_state[None], run.ends[:-1]])
+    start = lambda step, y: _at_start_of_step(robot, step.held(constant), step.length, y)  # noqa: E731
+    begins = jax.vmap(start)(steps, before)
+    sampled = robot.controller is not None and robot.controller.rate > 0
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
     passes = (run.sides[:, 0] != run.sides[:, 1]) | (run.since > 0)
@@ -471,8 +486,8 @@ def linearise_run(
     middle = times[:-1] + spans[:, 0]
     clock = jnp.stack([times[:-1], middle, times[1:]], 1)
 
-    def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
-        begin, end, stages, (rest, wait), sides, spans, passes, step = given
+    def linear(given: tuple) -> tuple[Array, Array, Array, Array, Array | None]:
+        before, begin, end, stages, (rest, wait), sides, spans, passes, step = given
         conditions = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _unit_vector_of_current(end)
@@ -501,13 +516,17 @@ def linearise_run(
         by_decay = lag.means @ gains[:, :, CURRENT]
         lags = jnp.outer(by_rate.begin, -carries[:, CURRENT]) + by_rate.means.T @ by_means
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
-        return places, _stopped_by_clamp(conditions, (carries + lags.T @ by_begin).T).T, gains, lags
+        carries = carries + lags.T @ by_begin
+        if not sampled:
+            return places, _stopped_by_clamp(conditions, carries.T).T, gains, lags, None
+        return places, carries @ jax.jacfwd(functools.partial(start, step))(before), gains, lags, carries
 
-    scan_inputs = begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
-    places, carries, gains, lags = _steps_of_blocks(
+    scan_inputs = before, begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
+    places, carries, gains, lags, by_start = _steps_of_blocks(
         jax.lax.map(jax.vmap(linear), _arrange_in_blocks(scan_inputs)), len(h)
     )
-    return LinearisedRun(begins, run.ends, places, run.sides, passes, clock, carries, gains, lags)
+    samples = (before, by_start) if sampled else None
+    return LinearisedRun(begins, run.ends, places, run.sides, passes, clock, carries, gains, lags, samples)
 
 
 @eqx.filter_custom_jvp
@@ -534,8 +553,11 @@ def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     def source(_: Array, y: Array, held: Conditions, way: Array) -> Array:
         return change(lambda r: drive_rates(r, held, y, way))
 
+    def sample(y: Array, held: Conditions, length: Array) -> Array:
+        return change(lambda r: _at_start_of_step(r, held, length, y))
+
     begin = change(lambda r: first_conditions_and_state(r, conditions)[1])
-    return states.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin)
+    return states.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin, sample)
 
 
 def run_response(
@@ -544,6 +566,7 @@ def run_response(
     source: Callable[[Array, Array, Conditions, Array], Array],
     seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array,
+    sample: Callable[[Array, Conditions, Array], Array] | None = None,
 ) -> Array:
     """Response of a run to small changes of its rates of change.
 
@@ -554,6 +577,7 @@ def run_response(
             (unknowns, ...).
         seen: (time, state, its change, conditions) → quantity to return at the end of every step.
         begin: change of the state at the first instant.
+        sample: (state, conditions, length of a step) → change of the state with which the step begins.
 
     Sources within a block of steps are computed together. The sequential part is one product per step.
     """
@@ -568,7 +592,11 @@ def run_response(
         tangents = jnp.tensordot(along.gains, source_terms, ((0, 2), (0, 1)))
         at_start = lambda y, held: source(along.clock[0], y, held, along.sides[0])[CURRENT]  # noqa: E731
         of_lag = step.rates_at_start(constant, at_start, along.begins)
-        return tangents + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
+        tangents = tangents + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
+        if along.sampled is None or sample is None:
+            return tangents
+        before, factor = along.sampled
+        return tangents + factor @ sample(before, conditions, step.length)
 
     def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         dy = jnp.tensordot(step[0], dy, 1) + step[1]
@@ -637,7 +665,12 @@ def history_signals(
     states = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
     if at is not None:
         states = jax.tree.map(lambda x: x[at], states)
-    return jax.vmap(lambda y, way, now: signals_of_instant(robot, eqx.combine(now, constant), y, way))(*states)
+
+    def seen(y: Array, way: Array, now: Conditions) -> Signals:
+        held = eqx.combine(now, constant)
+        return signals_of_instant(robot, held, sampled_unknowns(robot, held, y), way)
+
+    return jax.vmap(seen)(*states)
 
 
 def _unknowns_of_run(
@@ -709,6 +742,7 @@ def course_between_instants(
 
     def one(y: Array, after: Array, step: RunStep, then: Conditions, sides: Array) -> StepCourse:
         conditions = step.held(constant)
+        y = sampled_unknowns(robot, conditions, y)
         if step.before is None:  # the imposed quantity is itself linear
             first = signals_of_instant(robot, conditions, y, sides[0])
             return StepCourse(

@@ -95,7 +95,7 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
     """
     robot, conditions = as_floats((robot, _commanded_conditions(robot, command, conditions)))
     y = _unknowns_of_state(robot, state)
-    return drive.state_of_unknowns(robot, _unknowns_after_step(robot, conditions, y, _step_length(dt)))
+    return drive.state_of_unknowns(robot, _unknowns_after_step(robot, conditions, y, _step_length(robot, dt)))
 
 
 @compiled
@@ -108,7 +108,8 @@ def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: 
     """Unknowns of `drive` after a step. A robot that has stopped is held if friction can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     last = len(y) - robot.loose
-    drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - robot.controller_size, last)))
+    drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - len(robot.controller_states), last)))
+    y = drive.sampled_unknowns(robot, conditions, y)
     is_standing = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
     stands = is_standing & jnp.all(jnp.where(speeds, y, 0.0) == 0)
     moves = jnp.where(stands, jnp.asarray(drawn, y.dtype), 1.0)
@@ -169,10 +170,13 @@ def _text_of_value(value: Any) -> str:
     return f"{value!r:.40}" if isinstance(value, str | float | int) else type(value).__name__
 
 
-def _step_length(dt: Scalar) -> Scalar:
+def _step_length(robot: Robot, dt: Scalar) -> Scalar:
     """The length of a step, checked unless it is a tracer."""
+    rate = 0.0 if robot.controller is None else robot.controller.rate
     if _shape_of_numbers(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
         raise UsageError(f"dt: got {_text_of_value(dt)}; expected a number of seconds above 0")
+    if rate and not has_tracer(dt) and abs((parts := 1 / rate / float(dt)) - round(parts)) > 1e-6 * parts:
+        raise UsageError(f"dt: got {float(dt):g}; expected a whole part of the controller's period, {1 / rate:g} s")
     return jnp.asarray(dt, float)
 
 
@@ -181,14 +185,10 @@ def _unknowns_of_state(robot: Robot, state: State) -> Unknowns:
     if not isinstance(state, State):
         raise UsageError(f"state: got {type(state).__name__}; expected one from mmrjax.initial_state or a step")
     remembered = {effect.name for effect in robot.remembering}
-    controlled = (state.integral is not None) + (state.command is not None)
-    others = (state.gap is not None) != bool(robot.loose) or controlled != robot.controller_size
+    controlled = {name for name in ("integral", "command", "pending", "clock") if getattr(state, name) is not None}
+    others = (state.gap is not None) != bool(robot.loose) or controlled != {*robot.controller_states}
     if remembered != state.memory.keys() or others:
         raise UsageError("state: got one of another robot; expected one from mmrjax.initial_state(robot)")
     if shape := next((np.shape(x) for x in jax.tree.leaves(state) if np.shape(x)), ()):
         raise UsageError(f"state: got numbers of shape {shape}; expected one state, or jax.vmap over several")
-    memory = [state.memory[effect.name] for effect in robot.remembering]
-    values = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
-    last = [x for x in (state.integral, state.command, state.gap) if x is not None]
-    units = jnp.asarray(drive.drive_units(robot))
-    return jnp.stack([jnp.asarray(x, float) for x in (*values, *memory, *last)]) / units
+    return drive.unknowns_of_state(robot, state)

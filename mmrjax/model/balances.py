@@ -133,13 +133,40 @@ def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list
     """Rates of change of the controller's states: its integral (the error, or 0 while it would drive the duty beyond
     its limit), and the lagged duty.
     """
+    none = jnp.zeros_like(state.speed)
     if conditions.goal is None or robot.controller is None:
-        return [jnp.zeros_like(state.speed)] * robot.controller_size
+        return [none] * len(robot.controller_states)
+    if state.clock is not None:
+        return [*[none] * (len(robot.controller_states) - 1), none - 1.0]
+    duty, integrated = _controller_actions(robot, conditions, state)
+    return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
+
+
+def _controller_actions(robot: Robot, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
+    """Duty that a controller wants [-], and the error that it integrates."""
+    assert robot.controller is not None and conditions.goal is not None
     duty = _controller_duty(robot, conditions, state)
     error = conditions.goal - controller_reading(robot, conditions, state)[0]
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
-    integrated = jnp.where(limited | (conditions.open > 0.5), 0.0, error)
-    return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
+    return duty, jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+
+
+#: Share of a controller's period that may be left when a sample is due, for rounding.
+DUE = 1e-6
+
+
+def sampled_controller(robot: Robot, conditions: Conditions, state: State) -> State:
+    """State after a controller with a rate has read it, if a sample is due. Of other controllers the same state."""
+    own = robot.controller
+    if own is None or conditions.goal is None or state.clock is None or state.integral is None:
+        return state
+    duty, error = _controller_actions(robot, conditions, state)
+    command = duty if state.pending is None else state.pending
+    values = {"integral": state.integral + error / own.rate, "command": command, "clock": state.clock + 1 / own.rate}
+    values |= {} if state.pending is None else {"pending": duty}
+    due = state.clock <= DUE / own.rate
+    changed: Any = {name: jnp.where(due, value, getattr(state, name)) for name, value in values.items()}
+    return dataclasses.replace(state, **changed)
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:

@@ -16,12 +16,13 @@ class Controller(eqx.Module):
 
     D = K_p e + K_i ∫ e dt - K_d dx/dt + K_f g, with e = g - x, |D| <= D_max. While D is at the limit, an error that
     drives it further is not integrated. x is the angle or the speed of the output, or the current of the motor. dx/dt
-    acts where x is an angle, K_f g where it is not. The duty follows D with a lag. A controller that samples with a
-    period T and holds its duty is approximated by a lag of T / 2. Its goal is then T / 2 earlier (`Rig.delay`). If it
-    acts one sample late, the lag is 3 T / 2.
+    acts where x is an angle, K_f g where it is not. The duty follows D with a lag. With a `rate`, the controller
+    reads x and g at each multiple of its period T, adds T e to the integral, and holds D until the next sample.
 
     Attributes:
         lags: True if the lag is more than 0, so that the duty is a state.
+        rate: of the samples, the first of which is at the start of a run [Hz]. 0: a continuous controller.
+        samples_late: number of samples after which D acts, 0 or 1.
         supply_voltage: supply voltage of the driver, for tables without its column [V]. 0: they have the column.
     """
 
@@ -45,7 +46,16 @@ class Controller(eqx.Module):
         (0.0, 1.0), STATED, relative_sd=0.3,
     )  # fmt: skip
     lags: bool = eqx.field(default=False, static=True)
+    rate: float = eqx.field(default=0.0, static=True)
+    samples_late: float = eqx.field(default=0.0, static=True)
     supply_voltage: float = eqx.field(default=0.0, static=True)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Its fields of `State`. The last one of a controller with a rate is its clock."""
+        if self.rate:
+            return ("integral", "command", *["pending"] * bool(self.samples_late), "clock")
+        return ("integral", *["command"] * self.lags)
 
     def duty(self, error: Scalar, integral: Scalar, speed: Scalar, goal: Scalar) -> Scalar:
         """Duty that the controller demands [-], within its limit.

@@ -175,9 +175,12 @@ class Robot(eqx.Module):
         return self.rig.loose
 
     @property
-    def controller_size(self) -> int:
-        """Number of states of its controller: the integral of the error, and the duty if that lags."""
-        return 0 if self.controller is None else 1 + self.controller.lags
+    def controller_states(self) -> tuple[str, ...]:
+        """Fields of `State` that its controller has."""
+        return () if self.controller is None else self.controller.states
+
+    def __dir__(self) -> list[str]:  # methods are the program's own
+        return [field.name for field in dataclasses.fields(self)]
 
     @property
     def moves_as_one(self) -> bool:

@@ -54,7 +54,9 @@ class State(eqx.Module):
         distance: travelled since the start of the run [m]. Used by loads that depend on their angle.
         gap: angle of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
         integral: integral of the controller's error over time, as in `Controller`. None: no controller.
-        command: duty of a controller with a lag [-]. None: without a lag.
+        command: duty of a controller with a lag or a rate [-]. None: without.
+        pending: duty of a controller with a rate that acts from its next sample on [-]. None: without delay.
+        clock: time until the next sample of a controller with a rate [s]. None: without a rate.
     """
 
     current: Scalar
@@ -67,6 +69,8 @@ class State(eqx.Module):
     gap: Scalar | None = None
     integral: Scalar | None = None
     command: Scalar | None = None
+    pending: Scalar | None = None
+    clock: Scalar | None = None
 
 
 class PlaneMotion(eqx.Module):

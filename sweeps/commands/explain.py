@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Names, effect_file
+from calibration.data import Names, effect_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.words import experiment_words
 from mmrjax import derived, effects
@@ -34,6 +34,13 @@ Explain = Callable[[str, Library], Iterator[Line]]
 WIDTH, INDENT = 80, 16
 #: Outputs of runs, and of missions.
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
+
+#: Keys of robot files that no fit frees, with their meanings.
+KEYS: dict[str, str] = {
+    **{name: str(about[-1]).strip("()") for name, about in (robot_file.COUNTS | robot_file.RATINGS).items()},
+    **robot_file.SWITCHES,
+    **{name: meaning for name, (_, meaning) in robot_file.CHOICES.items()},
+}
 
 
 def explain_name(name: str | None, files: Names = ()) -> int:
@@ -86,6 +93,7 @@ def explainable_names(library: Library) -> dict[str, list[str]]:
         "channels": [c.name for c in channels.EVERY],
         "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
+        "keys that no fit frees": list(KEYS),
         "parameters": [p.name for p in params.walk_parameters(paper_robots.nominal())],
     }
 
@@ -282,6 +290,7 @@ EXPLAINED: dict[str, Explain] = {
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,
+    "key of a robot file": _explain_by_table(KEYS),
     "condition": _operating_condition_lines,
     "word of the reports": _explain_by_table(
         {k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}

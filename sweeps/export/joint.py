@@ -131,8 +131,8 @@ class DriveJoint:
 
     @property
     def controller_states(self) -> Names:
-        """Names of the controller's states: the integral of its error, and the duty if it lags."""
-        return ("integral", "duty")[: self.robot.controller_size]
+        """Names of the controller's states."""
+        return tuple("duty" if name == "command" else name for name in self.robot.controller_states)
 
     @property
     def states(self) -> Names:

@@ -273,6 +273,9 @@ def step_lines(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
     return lines
 
 
+_PENDING = 'state["pending"]'
+
+
 def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
     """Lines of the controller: the voltage for a goal, and the states after the step."""
     imposed, own, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
@@ -284,6 +287,19 @@ def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
         else '+ p["controller.feed_forward"] * command'
     )
     limit = 'p["controller.limit"]'
+    if own.rate:
+        return [
+            f"# Controller: acts every {1 / own.rate:g} s, in the nearest step, and holds its share of the supply.",
+            f"error = command - {shown}",
+            f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
+            f"demanded = {library.clipped('wanted', limit)}",
+            f'due, limited = state["clock"] < 0.5 * dt, ({prefix}.abs(demanded) >= {limit}) & (demanded * error > 0)',
+            f'integral = state["integral"] + {prefix}.where(due & ~limited, error, 0.0 * error) / {own.rate!r}',
+            f'duty = {prefix}.where(due, {_PENDING if own.samples_late else "demanded"}, state["duty"])',
+            *([f"pending = {prefix}.where(due, demanded, {_PENDING})"] if own.samples_late else []),
+            f'clock = {prefix}.where(due, state["clock"] + {1 / own.rate!r}, state["clock"]) - dt',
+            f'voltage = p["{SUPPLY}"] * duty',
+        ]
     return [
         "# Controller: share of the supply's voltage. At its limit, it integrates no error that drives it further.",
         f"error = command - {shown}",

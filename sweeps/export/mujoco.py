@@ -192,13 +192,13 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
         how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
         fates.append(EffectFate(PLAY, HELD, how))
     if own := joint.controller:
-        fates.append(_controller_fate(joint, float(own.lag), float(own.ki)))
+        fates.append(_controller_fate(joint, float(own.lag), float(own.ki), own.rate))
     if joint.limit is not None:
         fates.append(EffectFate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]
 
 
-def _controller_fate(joint: DriveJoint, lag: float, ki: float) -> EffectFate:
+def _controller_fate(joint: DriveJoint, lag: float, ki: float, rate: float) -> EffectFate:
     """Fate of a controller in `<dcmotor>`, whose own follows the motor's angle, at once, with a limited integral."""
     imposed = joint.robot.rig.imposed
     if imposed != "goal_angle":
@@ -208,6 +208,7 @@ def _controller_fate(joint: DriveJoint, lag: float, ki: float) -> EffectFate:
         )
         return EffectFate(CONTROLLER, DROPPED, how)
     limitations = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
+    limitations += [f"it acts at each step, not at {rate:g} Hz"] * (rate > 0)
     limitations += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
     limitations += ["it measures the angle on the motor's side of the backlash"] * joint.loose
     return EffectFate(

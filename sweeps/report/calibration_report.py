@@ -10,17 +10,20 @@ import numpy as np
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
 from calibration.inference import blocks
+from calibration.inference.feedforward import Feedforward
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import METHOD, CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from sweeps.pages import words
-from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report import catalogue, feedforward_report, fit_tables, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
 
 
-def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
+def calibration_document(
+    found: CalibrationResult, robot_name: str, voltage_fit: Feedforward | None = None
+) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
     chi, about = found.chi_square, found.identifiability
@@ -53,6 +56,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
             Section("Errors before and after, seen and unseen", (before_after,)),
             *_over_rows(found, sized),
+            *([feedforward_report.voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
             Section("How sure", tuple(_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),

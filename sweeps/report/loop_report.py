@@ -376,6 +376,8 @@ def _blocks_of_missing_terms(
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
         yield catalogue.figure("loop.input_correlation", found.runs, table, found.channels, verdict)
     else:
+        if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
+            yield catalogue.figure("run.measured_drive_plane", found.robot, found.runs)
         figure_input = table, verdict, sized
         yield catalogue.figure(
             "loop.defects",

@@ -46,7 +46,7 @@ def simulate(goal, times, values=TRUE, tolerance=1e-10, period=0.0, late=False):
 
     Args:
         goal: (instants, values): held from each instant until the next.
-        period: of a sampled controller, which holds its duty for so long [s]. 0: a continuous one.
+        period: of a sampled controller, which integrates and then holds its duty for so long [s]. 0: a continuous one.
         late: True if the duty acts one sample later.
     """
     v, states, y = values, [np.zeros(5)], np.zeros(5)
@@ -57,17 +57,20 @@ def simulate(goal, times, values=TRUE, tolerance=1e-10, period=0.0, late=False):
         wanted = v["kp"] * (aim - y[2]) + v["ki"] * y[3] - v["kd"] * y[1]
         return min(max(wanted, -v["limit"]), v["limit"])
 
+    def integrated(aim, y):
+        wound = abs(demand(aim, y)) >= v["limit"] and demand(aim, y) * (aim - y[2]) > 0
+        return 0.0 if wound else aim - y[2]
+
     def rates(aim, y):
-        current, speed, angle, _, lagging = y
+        current, speed, _, _, lagging = y
         wanted = demand(aim, y)
         duty = duties[0] if period else lagging if lag else wanted
         back = v["constant"] * v["ratio"] * speed
         friction = v["coulomb"] * np.clip(speed / REST, -1, 1) + v["viscous"] * speed
         torque = v["ratio"] * v["constant"] * current - friction
-        wound = abs(wanted) >= v["limit"] and wanted * (aim - angle) > 0
         return [
             (duty * v["supply"] - v["resistance"] * current - back) / v["inductance"],
-            torque / inertia, speed, 0.0 if wound else aim - angle, (wanted - lagging) / lag if lag else 0.0,
+            torque / inertia, speed, 0.0 if period else integrated(aim, y), (wanted - lagging) / lag if lag else 0.0,
         ]  # fmt: skip
 
     samples = np.arange(0.0, times[-1], period) if period else []
@@ -76,6 +79,7 @@ def simulate(goal, times, values=TRUE, tolerance=1e-10, period=0.0, late=False):
         aim = goal[1][np.searchsorted(goal[0], now + 1e-9, side="right") - 1]
         if period and abs(now / period - round(now / period)) < 1e-6:
             duties[:] = (duties[1], demand(aim, y)) if late else (demand(aim, y), 0.0)
+            y = y + period * integrated(aim, y) * np.eye(5)[3]
         law = lambda _, y, aim=aim: rates(aim, y)  # noqa: E731
         y = solve_ivp(law, (now, until), y, "Radau", rtol=tolerance, atol=tolerance).y[:, -1]
         if np.abs(times - until).min() < 1e-9:

@@ -128,6 +128,8 @@ LASTING = 0.25
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
 SLOW |= dict.fromkeys(GOALS, SLOW["motor_current"])
+#: Time before a row from which a sample of a controller reads its goal, as a share of the controller's period.
+EARLIEST = 1e-3
 #: Longest step elsewhere, in usual longest steps.
 FAST = 2
 #: Longest step of a load on an elastic joint, as a share of its swing's time per radian: readings within 0.1 %.
@@ -301,11 +303,15 @@ class Histories(Observer):
             whole_log = _average_imposed_current(whole_log, rows_of_whole, noted)
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
+        jumps, early = _drive_jumps(whole_log, rows_of_whole, robot.rig), 0.0
+        if robot.controller is not None and robot.controller.rate:
+            period = 1 / robot.controller.rate
+            instants = [np.arange(0.0, whole_log["time_s"][rows[-1]], period) for rows in rows_of_whole]
+            all_jumps = [np.union1d(at, x) for (at, _), x in zip(jumps, instants, strict=True)]
+            jumps, early = [(x, np.ones(len(x))) for x in all_jumps], EARLIEST * period
         grids = [
             time_grid(whole_log["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
-            for rows, n, c, h in zip(
-                rows_of_whole, noted, _drive_jumps(whole_log, rows_of_whole, robot.rig), steps, strict=True
-            )
+            for rows, n, c, h in zip(rows_of_whole, noted, jumps, steps, strict=True)
         ]
         # The last instant begins a step too, of length zero.
         longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, own_rows))
@@ -315,7 +321,7 @@ class Histories(Observer):
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_choose_knots(m, most) for m in own_rows])
         conditions = _conditions_over_time(
-            whole_log.conditions(robot), rows_of_whole, whole_log["time_s"], times, ON_LINES if linear else ()
+            whole_log.conditions(robot), rows_of_whole, whole_log["time_s"], times + early, ON_LINES if linear else ()
         )
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]

@@ -192,10 +192,12 @@ def _further_equations(joint: DriveJoint) -> list[str]:
     lines = []
     if joint.controller is not None:
         goal, unit, rate = GOALS[joint.robot.rig.imposed]
+        own = joint.controller
+        sampled = f" It acts at {own.rate:g} Hz, {own.samples_late:g} samples late, and holds D." * (own.rate > 0)
         lines.append(
             f"Controller: e = goal - {goal} [{unit}], D = K_p e + K_i ∫ e dt {rate} within ± limit, U = D times the "
             "supply. At the limit, an error that drives D further is not integrated. With a lag T, the duty follows: "
-            "T dD'/dt = D - D'. [-]"
+            f"T dD'/dt = D - D'.{sampled} [-]"
         )
     if joint.loose:
         lines.append(
