@@ -138,7 +138,6 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
 
 
 def test_no_other_word_is_left_for_it():
-    root = ROOT
     old = re.compile(
         r"prior says more than the data of:|prior only|held by the prior\b|['\"]held by (its|their) prior|stands in for something"
     )
