@@ -142,8 +142,8 @@ def test_no_other_word_is_left_for_it():
         r"prior says more than the data of:|prior only|held by the prior\b|['\"]held by (its|their) prior|stands in for something"
     )
     for path in [
-        *root.glob("calibration/**/*.py"),
-        *root.glob("sweeps/**/*.py"),
-        *root.glob("sweeps/pages/templates/*"),
+        *ROOT.glob("calibration/**/*.py"),
+        *ROOT.glob("sweeps/**/*.py"),
+        *ROOT.glob("sweeps/pages/templates/*"),
     ]:
         assert not old.search(path.read_text("utf-8")), path
