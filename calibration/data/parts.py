@@ -33,6 +33,11 @@ def _text_field(name: str) -> Any:
     return dataclasses.field(metadata={"column": name, "text": True})
 
 
+def _list_field(name: str) -> Any:
+    """Field read from a column with several names in a cell, separated by semicolons."""
+    return dataclasses.field(metadata={"column": name, "list": True})
+
+
 @dataclasses.dataclass(frozen=True)
 class MotorSheet:
     """Data sheet of a brushed DC motor at 25 °C. NaN marks values that the sheet does not give.
@@ -84,7 +89,7 @@ class MotorSheet:
     temperature_winding_max: float = _number_field("max_winding_temperature_C")
     mass: float = _number_field("weight_g", MILLI)
     price: float = _number_field("price_EUR")
-    gearboxes: tuple[str, ...] = dataclasses.field(metadata={"column": "gearboxes", "list": True})
+    gearboxes: tuple[str, ...] = _list_field("gearboxes")
     source: str = _text_field("source")
     note: str = _text_field("note")
 
