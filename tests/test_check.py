@@ -308,7 +308,7 @@ REFUSED = {
     "slope_deg = 95": r"^r.toml, slope_deg: got 95; expected 0 to 45 deg$",
     "speed_m_s = -1": r"^r.toml, speed_m_s: got -1; expected 0 to 1e\+06 m/s$",
     'speed_m_s = "1 m/s"': r"^r.toml, speed_m_s: got '1 m/s'; expected a number \[m/s\]$",
-    "speed_m_s = 'rated'": r"^r.toml, speed_m_s: got 'rated'; expected a number, only winding_C, ",
+    "speed_m_s = 'rated'": r"^r.toml, speed_m_s: got 'rated'; expected a number; only winding_C, ",
     "speed_m_s = true": r"^r.toml, speed_m_s: got True; expected a number \[m/s\]$",
     "speed_m_s = []": r"^r.toml, speed_m_s: got an empty list; expected ",
     "speed_m_s = {slope_deg = 3}": r"^r.toml, speed_m_s: expected least, most or both \[m/s\]$",

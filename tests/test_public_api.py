@@ -75,7 +75,7 @@ def test_a_sweep_is_its_grid_simulated(robot):
 
 def test_a_robot_shows_values_and_units(robot):
     text = repr(dataclasses.replace(robot, effects=(ALL[0](amplitude=0.1),)))
-    assert text.startswith("Robot: 6T2A, 4W2T; 2 motors driven alike, mass_error\n")
+    assert text.startswith("Robot: 6T2A, 4W2T; 2 motors with the same command, mass_error\n")
     assert (
         "  motor: resistance 0.611 ohm, inductance 0.000119 H" in text and "effects.mass_error: amplitude 0.1" in text
     )

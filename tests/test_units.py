@@ -49,10 +49,20 @@ def test_per_cent_of_a_slope_are_those_of_its_tangent():
 
 @pytest.mark.parametrize(
     ("written", "column"),
-    [("U/min", "rpm"), ("1/min", "rpm"), ("min-1", "rpm"), ("°/s", "deg_s"), ("Nmm", "mNm"), ("N·m", "Nm"), ("%", "percent")],
+    [("U/min", "rpm"), ("1/min", "rpm"), ("min-1", "rpm"), ("°/s", "deg_s"), ("Nmm", "mNm"), ("N·m", "Nm"), ("%", "percent"),
+     ("RPM", "rpm"), ("Deg/s", "deg_s"), ("N-m", "Nm"), ("N m", "Nm"), ("mN.m", "mNm"), ("torque", "torque"),
+     ("MNm", "MNm"), ("G", "G")],
 )  # fmt: skip
 def test_units_as_people_write_them_are_those_of_columns(written, column):
     assert quantities.unit_in_column(written) == column
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("speed_RPM", "rpm"), ("torque_nm", "Nm"), ("omega_rad_s", "rad_s"), ("phase_a", None), ("torque_kNm", "kNm")],
+)
+def test_unit_at_the_end_of_a_name_may_have_other_capitals(name, unit):
+    assert quantities.unit_at_end(name, ("rpm", "Nm", "kNm", "A", "V", "rad_s", "rad")) == unit
 
 
 # --- a quantity is one row -----------------------------------------------------------------------------------

@@ -65,10 +65,10 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
         size = sobol.base_point_count(evaluations / points, len(input_set), True)
         design = sobol.sobol_design(len(input_set), size, seed)
         scores = _sampled_scores(study, design.points, np.array(input_set))
-        for k, made in study.sample(study.values_at(scores), group):
+        for k, outputs in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
             for name in names:
-                output_terms = sobol.sobol_terms(design, made[name])
+                output_terms = sobol.sobol_terms(design, outputs[name])
                 rows = design.size * design.replicates
                 lost_counts[name][k] = 1.0 if output_terms is None else output_terms.lost / rows
                 if output_terms is not None and lost_counts[name][k] <= MOST_LOST:
@@ -118,9 +118,9 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
         for j, i in enumerate(input_set):
             if normal[i]:
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
-        for k, made in study.sample(study.values_at(scores), group):
+        for k, outputs in study.sample(study.values_at(scores), group):
             for name in names:
-                effects = morris.elementary_effects(unit, made[name])
+                effects = morris.elementary_effects(unit, outputs[name])
                 lost_counts[name][k] = 1.0 if effects is None else effects.lost / count
                 if effects is not None and lost_counts[name][k] <= MOST_LOST:
                     found[name][k] = effects, input_set

@@ -247,7 +247,7 @@ class SensitivityResult:
     def importance(self) -> np.ndarray:
         """Largest share of the variance that each input causes, over all outputs and points, shape (inputs,). Shares
         at single points count with the upper ends of their intervals."""
-        most = np.zeros(len(self.inputs))
+        largest_share = np.zeros(len(self.inputs))
         for study in self.outputs.values():
             ends = [study.overall_share]
             if study.at_points:
@@ -256,8 +256,8 @@ class SensitivityResult:
                     ends.append(np.nanmax(np.where(np.isfinite(main.high), main.high, 0.0), axis=0))
             shares = np.where(np.isfinite(study.share), study.share, 0.0)
             ends.append(shares.max(0, initial=0.0))
-            most = np.maximum(most, np.max(np.stack(ends), 0))
-        return np.clip(most, 0.0, 1.0)
+            largest_share = np.maximum(largest_share, np.max(np.stack(ends), 0))
+        return np.clip(largest_share, 0.0, 1.0)
 
     @property
     def negligible(self) -> Names:

@@ -153,8 +153,8 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
         ba = values_by_block[..., d + 1 : 2 * d + 1]
         # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
         mixed = np.einsum("rnj,rnk->rjk", ba, ab)
-        alone = np.einsum("rn,rn->r", a, b)[:, None, None]
-        closed = weight * (mixed - alone)
+        square_of_means = np.einsum("rn,rn->r", a, b)[:, None, None]
+        closed = weight * (mixed - square_of_means)
         second = (closed + np.swapaxes(closed, 1, 2)) / 2
     return VarianceTerms(
         variance=weight * np.sum(a**2 + b**2, 1) / 2,
@@ -184,8 +184,8 @@ def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> Sob
     variance, first = terms.variance[replicate_slice], terms.first[replicate_slice]
     second = None
     if terms.second is not None:
-        beyond = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
-        second = ratio_estimate(beyond, variance)
+        interaction = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
+        second = ratio_estimate(interaction, variance)
     return SobolIndices(
         ratio_estimate(first, variance),
         ratio_estimate(terms.total[replicate_slice], variance),

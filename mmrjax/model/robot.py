@@ -106,9 +106,8 @@ class Robot(eqx.Module):
 
     def __repr__(self) -> str:
         effects = "".join(f", {e.name}" for e in self.effects)
-        head = (
-            f"Robot: {', '.join(self.configurations)}; {params.number_text(self.sides)} motors driven alike{effects}"
-        )
+        motors = f"{params.number_text(self.sides)} motors with the same command"
+        head = f"Robot: {', '.join(self.configurations)}; {motors}{effects}"
         return f"{head}\n{params.parameter_table(self)}"
 
     def for_equations(self) -> Robot:

@@ -197,10 +197,10 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
         yield "other units", ", ".join(c.other_units)
     yield "typical noise", f"{100 * c.sd_share:g} % of the reading, which is assumed if you give no noise"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
-    wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
-    if wrong:
-        yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(experiment_words.effect_tests(wrong[0])):
+    sensor_effects = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
+    if sensor_effects:
+        yield "its errors", ", ".join(e.name for e in sensor_effects)
+        for k, test in enumerate(experiment_words.effect_tests(sensor_effects[0])):
             yield "" if k else "on a bench", test
 
 
@@ -248,8 +248,8 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
     yield "nominal", f"{float(parameter.value):g} {spec.unit}. Source: {spec.source}"
     yield "prior", _prior_text(parameter)
     yield "bounds", _bounds_text(spec)
-    first = name.partition(".")[0]
-    part: Any = dict(robot.configurations.items()).get(first, robot)
+    first_part = name.partition(".")[0]
+    part: Any = dict(robot.configurations.items()).get(first_part, robot)
     for step in name.split(".")[:-1]:
         part = getattr(part, step, part)
     equation = " ".join((inspect.getdoc(type(part)) or "").partition("\n\nAttributes:")[0].split())

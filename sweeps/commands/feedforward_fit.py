@@ -42,13 +42,13 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
     tolerances = Tolerances(
         config.position_error, config.velocity_error, config.effort_V, config.period_s, config.measurement_delay_s
     )
-    found = fit_feedforward(log, config.feedforward or "", tolerances)
+    fit = fit_feedforward(log, config.feedforward or "", tolerances)
     with open_folder("calibrate", config, robot, beside, runs) as folder:
-        folder.write_json("feedforward.json", found.to_json())
-        folder.write_table("windows.csv", found.windows)
-        shown = print_report(feedforward_report.feedforward_document(found))
+        folder.write_json("feedforward.json", fit.to_json())
+        folder.write_table("windows.csv", fit.windows)
+        page = print_report(feedforward_report.feedforward_document(fit))
         note = "the rig of this log" if has_robot else "a rig that reads this log"
-        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=shown, runs=runs)
+        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=page, runs=runs)
 
 
 def voltage_fit(runs: Runs) -> Feedforward | None:

@@ -22,7 +22,7 @@ from mmrjax.model.signals import is_done
 from sweeps.export.joint import UNLIMITED
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
 
-#: Where power goes, with its colour: losses in the order of the chain, then what is left.
+#: Uses of power and their colours: losses in the order of the drivetrain, then useful power.
 ITEMS = {
     "winding and motor friction": ORANGE,
     "gearbox": PURPLE,
@@ -57,12 +57,12 @@ def drawable_runs(runs: Columns) -> np.ndarray:
     )
 
 
-#: Words of an item where the load is a shaft, which takes all that the gearboxes pass on.
+#: Name of an item if the load is a shaft, which receives all output power of the gearboxes.
 ON_SHAFT = {"track and slip": "load"}
 
 
 def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -> Figure:
-    """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
+    """One bar for each run [W], from the motor's losses to the power that lifts the robot or that the load takes."""
     fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], power_by_item(runs)
     labels = {} if has_ground else ON_SHAFT
@@ -94,13 +94,13 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     axes.set_yticks(place, names, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    beyond = 1.35 if (slope > 1e-6).any() else 1.1
-    axes.set(xlabel="power [W]", xlim=(0, beyond * float(total.max())))
+    axis_factor = 1.35 if (slope > 1e-6).any() else 1.1
+    axes.set(xlabel="power [W]", xlim=(0, axis_factor * float(total.max())))
     outer_legend(axes, "upper center")
     return fig
 
 
-#: Loads of a curve of the drive, and balances whose effects it has.
+#: Loads of a drive curve, and balances whose effects it includes.
 LOADS = 60
 INSIDE = ("duty", "supply", "electrical", "motor", "gearbox")
 
@@ -128,7 +128,7 @@ def drive_curves(robot: Robot, voltage: float) -> Columns:
 
 
 def operating_points(robot: Robot, runs: Columns) -> Columns:
-    """Torque at the gearbox output, speed and current of one motor in settled runs, out of columns of `runs.csv`."""
+    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`."""
     radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
     output = runs["theoretical_speed_mm_s"] / 1e3 / radius
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -138,7 +138,7 @@ def operating_points(robot: Robot, runs: Columns) -> Columns:
 
 
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
-    """The chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
+    """Chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
     keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
     single_corners = (
         corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys)
@@ -185,12 +185,19 @@ def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -
             continue
         continuous = float(np.interp(bears, curves["motor_A"], curves["torque_Nm"]))
         if style == "-":
-            most = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
+            largest_torque = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
             for axes in grid[0]:
-                axes.axvspan(0, min(continuous, most), color=GREEN, alpha=0.18, lw=0, label="continuous")
-                axes.axvspan(min(continuous, most), most, color=ORANGE, alpha=0.12, lw=0, label="short time")
-                axes.set_xlim(0, most)
-        shown = curves["torque_Nm"] <= most
+                axes.axvspan(0, min(continuous, largest_torque), color=GREEN, alpha=0.18, lw=0, label="continuous")
+                axes.axvspan(
+                    min(continuous, largest_torque),
+                    largest_torque,
+                    color=ORANGE,
+                    alpha=0.12,
+                    lw=0,
+                    label="short time",
+                )
+                axes.set_xlim(0, largest_torque)
+        shown = curves["torque_Nm"] <= largest_torque
         for axes, (name, label) in zip(grid[0], panels.items(), strict=True):
             axes.plot(curves["torque_Nm"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
             axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)
