@@ -2,10 +2,10 @@
 
     python benchmarks/emps.py --data DIR [--out docs/lab/emps.md]
 
-`DIR` holds `train.csv` and `test.csv` (`time_s`, `force_N`, `position_m`, 24 841 rows at 1 kHz). The robot's file
-below states what a user knows before any fit: the force acts on the carriage, and rough magnitudes. `mmrjax inspect`
-and `mmrjax loop` see the training record alone. Then each robot file of the run folder is simulated freely over the
-test record from its first 20 samples. No choice depends on the result.
+`DIR` holds `train.csv` and `test.csv` (`time_s`, `force_N`, `position_m`, 24 841 rows at 1 kHz).
+`docs/rigs/public/emps.toml` states what a user knows before any fit: the force acts on the carriage, and rough
+magnitudes. `mmrjax inspect` and `mmrjax loop` see the training record alone. Then each robot file of the run folder
+is simulated freely over the test record from its first 20 samples. No choice depends on the result.
 
 Source: A. Janot, M. Gautier, M. Brunot, Data Set and Reference Models of EMPS, Workshop on Nonlinear System
 Identification Benchmarks, Eindhoven, 2019.
@@ -27,31 +27,8 @@ import numpy as np
 FIRST = 20
 #: Wall-clock limit of the loop. A loaded core needs more than its usual ten minutes.
 LONGEST = "40min"
-#: Torque on the screw for a force of 1 N [N·m]: any lead gives the same force on the carriage.
-LEAD = 5.0
-ROBOT = f"""
-schema = "mmrjax.robot/2"
-base = "none"
-sides = 1
-imposed = "current"
-channels = ["position"]
-start = "measured"
-[columns]
-motor_current_A = {{column = "force_N", factor = {1e-3 * LEAD / (2 * np.pi):.9g}}}
-position_mm = {{column = "position_m", factor = 1000.0}}
-[motor]
-torque_constant = "1 ± 0"
-inertia = "1e-9 ± 0"
-[gearbox]
-ratio = 1.0
-efficiency_load = "1 ± 0"
-[carriage]
-load = "linear"
-mass_kg = "100 ± 30 %"
-lead_mm = {LEAD}
-force_coulomb_N = "20 ± 100 %"
-force_viscous_N_s_m = "200 ± 100 %"
-"""
+#: The robot's file.
+ROBOT = Path(__file__).parents[1] / "docs" / "rigs" / "public" / "emps.toml"
 #: Free-run errors of others on the same split [mm], and their sources.
 PUBLISHED = (
     ("GRU, LSTM", "220, 74", "Champneys et al. 2024, IFAC-PapersOnLine 58-15"),
@@ -148,12 +125,10 @@ def main() -> int:
     given = wanted.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = given.runs or Path(scratch) / "loop"
-        robot = Path(scratch) / "emps.toml"
-        robot.write_text(ROBOT, encoding="utf-8")
         train = str(given.data / "train.csv")
         listing, _ = command("inspect", train)
         told, seconds = command(
-            "loop", train, "--robot", str(robot), "--out", str(folder), "--force", "--no-report", "--within", LONGEST
+            "loop", train, "--robot", str(ROBOT), "--out", str(folder), "--force", "--no-report", "--within", LONGEST
         )
         print(told)
         if not (folder / "result.json").exists():

@@ -17,7 +17,7 @@ __all__ = [
     "calibrate", "discover", "read_robot", "read_runs", "runs", "to_pandas", "to_polars", "to_xarray",
 ]  # fmt: skip
 
-#: Module and attribute of each name; imported when it is asked for, since most of them load JAX.
+#: Module and attribute of each name, imported on first access because most of them load JAX.
 _HOMES = {
     "calibrate": ("calibration.inference.calibration", "calibrate"),
     "discover": ("calibration.discovery.discover", "discover"),

@@ -18,21 +18,16 @@ from mmrjax.model.quantities import WARMING
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
 
-#: Columns of runs and histories that are of the ground.
+#: Columns of runs and histories about the ground.
 OF_GROUND = (
     "slip", "adhesion_used", "traction_N", "slope_deg", "power_ground_W", "power_lift_W", "efficiency_chassis",
 )  # fmt: skip
-#: Those of travel, which a shaft has where a channel shows it.
+#: Columns of travel, which a shaft has only if a channel shows it.
 OF_TRAVEL = (
     "theoretical_speed_mm_s", "distance_m", "displacement_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
 )  # fmt: skip
-#: Column → parameters on which it rests and which a rig's file may leave open; of a channel over time last.
+#: Column → parameters that it depends on and that a rig file may omit. Channels over time are last.
 RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
-
-
-def _parameters_of_bare_rig(robot: Robot) -> dict[str, float]:
-    """Parameters of a rig whose file describes only its loads."""
-    return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
 
 
 def states_parameter(robot: Robot, prefix: str) -> bool:
@@ -55,10 +50,14 @@ def has_battery(robot: Robot) -> bool:
 
 def unknown_numbers_sentence(robot: Robot) -> list[str]:
     """Sentences on results that cannot be computed because the robot's file lacks their parameters."""
-    gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
-    lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
-    labels = "; ".join(output.label for output in gone)
-    return [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"] if gone else []
+    unknown_outputs = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
+    lacking = dict.fromkeys(name for output in unknown_outputs for name in robot.unknown(output.rests_on))
+    labels = "; ".join(output.label for output in unknown_outputs)
+    return (
+        [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"]
+        if unknown_outputs
+        else []
+    )
 
 
 def inapplicable_columns(robot: Robot) -> set[str]:
@@ -80,14 +79,15 @@ def drop_inapplicable_columns(robot: Robot, table: Columns) -> Columns:
     """Table without the columns that do not apply to the robot. Columns of its channels are kept."""
     idle = inapplicable_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")
-    gone = {column + end for column in idle for end in ends}
-    return {column: values for column, values in table.items() if column not in gone}
+    dropped = {column + end for column in idle for end in ends}
+    return {column: values for column, values in table.items() if column not in dropped}
 
 
 def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
     """Parameters that a rig file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
-    nothing, stated_parameters = _parameters_of_bare_rig(robot), []
+    bare = blank_robot(robot.configurations, rig=robot.rig)
+    nothing, stated_parameters = {p.name: float(p.value) for p in params.walk_parameters(bare)}, []
     for p in params.walk_parameters(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations

@@ -520,7 +520,7 @@ class ProfilePart(FidelityPart):
 
     @property
     def options(self) -> dict[str, float]:
-        """Every option of the fidelity. Over a profile it has none."""
+        """Options of the fidelity. With a profile there are none."""
         return super().options if self.profile is None else {}
 
 
@@ -926,7 +926,7 @@ def resolve_further_options(kind: type[C], file: Path | None, options: Json, tru
     """Options of a command that are not part of its configuration. A file may state only their `[solver]` keys.
 
     Args:
-        trust: as of `resolve_configuration`.
+        trust: as in `resolve_configuration`.
 
     Raises:
         BadConfiguration: for the same reasons as `resolve_configuration`.

@@ -34,13 +34,13 @@ from mmrjax.errors import printable
 COLUMNS = 80
 #: Longest silence of a long computation, and of a command that begins [s].
 SILENCE, FIRST = 2.0, 1.0
-#: What results are printed to, as an error calls it.
+#: Name of the output of results in error messages.
 OUTPUT = "standard output"
 
 
 class _SafeConsole(Console):
-    """Console that replaces characters which a terminal would interpret, because names, units and cells may come from
-    others.
+    """Console that replaces characters which a terminal would interpret, because names, units and cells may be
+    untrusted.
     """
 
     def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
@@ -49,7 +49,7 @@ class _SafeConsole(Console):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
 
 
-_WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 160  # a file has no width of its own
+_WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 160  # a file has no width
 _out = _SafeConsole(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 
@@ -77,25 +77,25 @@ _err = _SafeConsole(file=cast(IO[str], MESSAGES), highlight=False, soft_wrap=Tru
 
 
 def print_output(what: Any) -> None:
-    """Print text or a table to stdout."""
+    """Prints text or a table to stdout."""
     with naming_file(OUTPUT):
         _out.print(wrap_for_terminal(what) if isinstance(what, str) and sys.stdout.isatty() else what)
 
 
 def print_json(content: Json) -> None:
-    """Print JSON to stdout."""
+    """Prints JSON to stdout."""
     with naming_file(OUTPUT):
         print(json_text(content))
 
 
 def print_message(text: str) -> None:
-    """Print a line to stderr. It replaces a progress line."""
+    """Prints a line to stderr. It replaces a progress line."""
     rewrite_line("")
     _err.print(wrap_for_terminal(text) if MESSAGES.isatty() else text)
 
 
 def rewrite_line(text: str) -> None:
-    """Rewrite the last line of a terminal. Nothing is written to a file."""
+    """Rewrites the last line of a terminal. Nothing is written to files."""
     if MESSAGES.isatty():
         MESSAGES.write(f"\r\x1b[K{printable(text)[: COLUMNS - 1]}")
         MESSAGES.flush()
@@ -114,7 +114,7 @@ def wrap_for_terminal(text: str) -> str:
 
 @contextmanager
 def report_working(name: str) -> Iterator[None]:
-    """Print that a command is working if it takes longer than usual, because imports and compilation take time."""
+    """Reports that a command is working if imports and compilation take longer than usual."""
     soon = threading.Timer(FIRST, print_message, [f"{name}: working"])
     soon.daemon = True
     soon.start()
@@ -133,10 +133,10 @@ def step_reporter(
     the number of programs compiled.
 
     Args:
-        tell: prints a line.
+        tell: function that prints a line.
         doing: step before the first call.
         silence: longest time without output [s].
-        again: rewrites the progress line.
+        again: function that rewrites the progress line.
     """
     import jax
 
@@ -175,7 +175,7 @@ def step_reporter(
 
 @contextmanager
 def report_stage(number: int, total: int, doing: str, silent: bool = False) -> Iterator[None]:
-    """Report a stage of a command and, while it lasts, its time. `silent`: without the time, next to a bar."""
+    """Reports a stage of a command and its elapsed time. `silent`: without the time, next to a progress bar."""
     text = f"{number} of {total}, {doing}"
     if silent:
         print_message(text)
@@ -190,7 +190,7 @@ class RateColumn(ProgressColumn):
     """Column with the rate per second."""
 
     def render(self, task: Task) -> Text:
-        """Rate over the latest minute, or over the whole run at its end."""
+        """Rate over the last minute, or over the whole run at its end."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:,.0f}/s")
 
@@ -202,11 +202,11 @@ def progress_bar(
     """A progress bar on stderr. Yields a function to call with the number of newly finished items.
 
     Args:
-        done: of the total already.
-        rate: whether to show how many are done in a second.
+        done: number of items already finished.
+        rate: True to show the rate per second.
     """
     columns = [TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()]
     with Progress(*columns, *([RateColumn()] if rate else []), console=_err, disable=quiet) as bar:
         task = bar.add_task("", total=total, completed=done)
-        # rounded, or the sum of a chunk's shares would end a hair below its runs
+        # rounded, because the sum of a chunk's shares may be slightly below its runs
         yield lambda count: bar.update(task, completed=round(bar.tasks[task].completed + count, 6))

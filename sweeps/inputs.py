@@ -1,4 +1,4 @@
-"""Inputs of commands: the robot that a configuration names, tables of runs, and single runs from options."""
+"""Inputs of commands: the robot of a configuration, tables of runs, and single runs from options."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from sweeps.options import options_of_fields
 from sweeps.points import imposed
 from sweeps.report.words import turn_words
 
-#: Option that states a condition of one run.
+#: Option for each condition of a single run.
 OPTIONS = options_of_fields(OneRun)
 
 
 def load_robot(config: RobotPart) -> RobotFile:
-    """The robot that a configuration names, with its changes. Its effects may be the user's own.
+    """Robot of a configuration, with its changes and the user's own effects.
 
-    Former names of parameters are accepted, with a note on stderr. A running gear of an example is noted too.
+    Former parameter names are accepted with a note on stderr. Another note reports an example running gear.
 
     Raises:
-        BadConfiguration: no such robot, a file or a change that is refused.
+        BadConfiguration: the robot does not exist, or its file or a change is rejected.
     """
     notes: list[str] = []
     file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
@@ -51,10 +51,10 @@ def load_robot(config: RobotPart) -> RobotFile:
     unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
-        wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
+        wide_words = f"± {100 * stated.EXAMPLE_SHARE:g} %"
         notes.append(
             f"{file.name}: these values are still example numbers of the template: {examples}. The fit widens each ± "
-            f"among them to {wide}"
+            f"among them to {wide_words}"
         )
     for note in (*notes, *unlike):
         print_message(note)
@@ -66,13 +66,13 @@ def load_robot(config: RobotPart) -> RobotFile:
     )
     if (
         resolves and runs and not capabilities.states_parameter(robot, "running_gear.")
-    ):  # else the model itself is refused
+    ):  # otherwise the model itself would be rejected
         print_message("the robot's file has no running_gear: wheelbase, belt and internal masses are example values")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
 
 def _unlike_sides_sentence(name: str, robot: Robot) -> Names:
-    """Sentence for straight travel: how a robot with different sides turns if both are driven the same."""
+    """Sentence for straight travel on how a robot with different sides turns if both are driven equally."""
     if not robot.unlike or not robot.has_ground:
         return ()
     if why := turn_error(robot, robot.configurations):
@@ -108,10 +108,10 @@ def recorded_fit(file: RobotFile, runs: records.Runs) -> str:
 
 
 def check_configurations(robot: Robot, names: Names, where: str) -> None:
-    """Reject a configuration that the robot does not have.
+    """Rejects a configuration that the robot does not have.
 
     Raises:
-        BadConfiguration: says `where`, and which the robot has.
+        BadConfiguration: the robot does not have it. The message has `where` and the robot's configurations.
     """
     for name in names:
         if name not in robot.configurations:
@@ -122,7 +122,7 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
 
 
 def check_surface(robot: Robot, names: Collection[str], surface: str | None, where: str) -> None:
-    """Reject a surface whose adhesion is neither in Table 5 nor in a configuration of the robot.
+    """Rejects a surface whose adhesion is neither in Table 5 nor in a configuration of the robot.
 
     Args:
         names: names of the configurations that are simulated.
@@ -149,20 +149,19 @@ def read_runs(
     battery: bool = False,
     of_turns: bool = False,
 ) -> records.Runs:
-    """Read a table and list its unused columns on stderr.
+    """Reads a table and lists its unused columns on stderr.
 
     Args:
         source: a file of any format, or a packaged table.
-        robot: has the configurations of the table.
-        measured: whether readings are needed.
-        series: whether time histories are taken.
-        columns: a preset, its file or names by this program's, see `records.read_runs`.
-        battery: whether the runs are on the battery, see `records.read_runs`.
-        of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
+        robot: robot with the configurations of the table.
+        measured: True if readings are required.
+        series: True if time histories are accepted.
+        columns: preset, preset file, or names by those of this program, see `runs.read_runs`.
+        battery: True if the runs are on the battery, see `runs.read_runs`.
+        of_turns: True to add each channel of the sides and of the yaw for which a table of turns has a column.
 
     Raises:
-        BadData: what `records.read_runs` refuses, time histories where none are taken, or a configuration that the
-            robot does not have.
+        BadData: as in `runs.read_runs`, or time histories are not accepted, or the robot lacks a configuration.
     """
     runs = records.read_runs(source, robot, columns=columns, measured=measured, battery=battery, of_turns=of_turns)
     if not series:
@@ -191,8 +190,9 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
         elsewhere: columns that a profile states.
 
     Raises:
-        BadConfiguration: a value out of range, an unknown configuration, or a voltage together with the battery. Also
-            a condition that does not act on the robot, or nothing imposed and no limit in its file.
+        BadConfiguration: a value is out of range, the configuration is unknown, or a voltage is combined with the
+            battery. Also if a condition does not act on the robot, or the imposed value is missing and the file has
+            no limit.
     """
     if battery and cells.get("supply_voltage_V") is not None:
         raise BadConfiguration(
@@ -212,8 +212,8 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
     if battery:
         imposed.check_battery(robot)
     elif column not in cell_values:
-        rest = 0.0 if column in elsewhere else None
-        cell_values[column] = imposed.imposed_default(robot, OPTIONS[column]) if rest is None else rest
+        default = 0.0 if column in elsewhere else None
+        cell_values[column] = imposed.imposed_default(robot, OPTIONS[column]) if default is None else default
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}

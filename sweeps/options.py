@@ -1,4 +1,4 @@
-"""Command-line options made from configuration fields, which state their type, default and help."""
+"""Command-line options from configuration fields, which state type, default and help."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, parse_number
 
-#: Units that names of fields end with, the longest first, and as they are written.
+#: Units at the end of field names, longest first, and their notation.
 UNITS = {
     "rad_s": "rad/s",
     "m_s": "m/s",
@@ -31,7 +31,7 @@ UNITS = {
 
 
 def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
-    """Schema of each field of a configuration, in the order of its parts, its own first."""
+    """Schema of each field of a configuration: its own fields, then those of its parts."""
     schema = kind.model_json_schema()["properties"]
     own_metadata = [
         name for part in kind.__mro__ if issubclass(part, BaseModel) for name in vars(part).get("__annotations__", {})
@@ -63,7 +63,7 @@ def options_of_fields(kind: type[BaseModel]) -> dict[str, str]:
 
 
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
-_LISTS = {"number": str, "string": list[str]}  # an axis is one text
+_LISTS = {"number": str, "string": list[str]}  # an axis is a single text
 
 
 def option_help(name: str, fact: Json) -> str:
@@ -132,7 +132,7 @@ def take_options(kind: type[BaseModel], values: Json) -> Json:
     """Removes the options of a configuration from a command's values and parses them.
 
     Raises:
-        BadConfiguration: an axis or a change that cannot be read.
+        BadConfiguration: an axis or a change cannot be parsed.
     """
     return {name: _parse_option(name, fact, values.pop(name, None)) for name, fact in schema_facts(kind).items()}
 
@@ -178,7 +178,7 @@ def parse_settings(options: list[str]) -> dict[str, bool | float]:
     """The `--set NAME=VALUE` options as a table.
 
     Raises:
-        BadConfiguration: no equals sign, or a value that is neither a number nor true or false.
+        BadConfiguration: the equals sign is missing, or the value is no number and not true or false.
     """
     table: dict[str, bool | float] = {}
     for option in options:
@@ -196,10 +196,10 @@ def parse_settings(options: list[str]) -> dict[str, bool | float]:
 
 
 def parse_axis(option: str, text: str) -> tuple[float, ...]:
-    """An axis of a grid: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
+    """Values of a grid axis: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
 
     Raises:
-        BadConfiguration: something that is neither.
+        BadConfiguration: the text has neither form.
     """
     values: list[float] = []
     for part in text.split(","):

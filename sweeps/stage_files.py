@@ -1,8 +1,9 @@
-"""Results of stages in files: JSON of values, of names of our own classes and of places of arrays, and their bytes.
+"""Files with results of stages: JSON with values, names of our classes and places of arrays, and the bytes of the
+arrays.
 
-A file is an archive as `np.savez` writes it, whose checksum covers both. Reading one runs no code that it brings. It
-can name only dataclasses of `mmrjax` and `calibration`, effects that the user has loaded, and the functions of
-`FUNCTIONS`. It sets fields without calling a constructor.
+A file is an archive of `np.savez`, whose checksum covers both. Reading runs no code from the file. A file can name
+only dataclasses of `mmrjax` and `calibration`, effects that the user has loaded, and the functions in `FUNCTIONS`.
+Fields are set without calling a constructor.
 """
 
 from __future__ import annotations
@@ -26,26 +27,26 @@ from mmrjax.effects.scaled import scaled_effect
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 
-#: Packages whose dataclasses a file may name, and modules whose functions it may.
+#: Packages whose dataclasses a file may name, and modules whose functions it may name.
 PACKAGES = ("mmrjax", "calibration")
 FUNCTIONS = ("calibration.discovery.menu", "calibration.discovery.menu")
-#: Kinds of arrays that are bytes alone.
+#: Kinds of arrays that consist only of bytes.
 KINDS = "biufcSU"
 
 
 class Unwritable(Exception):
-    """A value whose type has no place in such a file."""
+    """A value has a type that such a file cannot hold."""
 
 
 class Unreadable(Exception):
-    """A file that is damaged, or not one of a stage."""
+    """A file is damaged, or holds no stage."""
 
 
 def write_stage(file: Path, value: Any) -> None:
-    """Write a value.
+    """Writes a value.
 
     Raises:
-        Unwritable: something in it is neither a value, an array nor an instance of our own dataclasses.
+        Unwritable: a part of it is no value, no array, and no instance of our dataclasses.
         OSError: the file cannot be written.
     """
     writer = _Writer()
@@ -59,25 +60,25 @@ def write_stage(file: Path, value: Any) -> None:
 
 
 def read_stage(file: Path) -> Any:
-    """Value that `write_stage` wrote.
+    """Reads a value written by `write_stage`.
 
     Raises:
-        Unreadable: it cannot be read, or names what it may not.
+        Unreadable: the file cannot be read, or names something that it must not.
     """
     try:
         arrays = read_arrays(file)
         return _Reader(arrays["data"].tobytes()).decoded(json.loads(arrays["tree"].tobytes()))
-    except Exception as error:  # whatever a damaged or a made-up file comes to
+    except Exception as error:  # a damaged or forged file can raise anything
         raise Unreadable(f"{type(error).__name__}: {error}") from error
 
 
 def read_arrays(file: Path) -> Columns:
-    """Arrays of a file of `np.savez` without objects. A damaged file raises whatever NumPy raises."""
+    """Arrays of a file of `np.savez` without objects. A damaged file raises NumPy's errors."""
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         return {key: arrays[key] for key in arrays.files}
 
 
-#: Weakly typed arrays of more values are read as arrays of the other kind.
+#: Weakly typed arrays with more values are read as strongly typed arrays.
 FEW = 256
 
 
@@ -88,7 +89,7 @@ class _Writer:
         self.data: list[bytes] = []
         self._size = 0
         self._number: dict[int, int] = {}
-        self._alive: list[Any] = []  # so that no two have one id
+        self._alive: list[Any] = []  # so that ids stay unique
 
     def encoded(self, x: Any) -> Any:
         if x is None or type(x) in (bool, int, str) or (type(x) is float and math.isfinite(x)):
@@ -135,9 +136,9 @@ class _Writer:
             "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
         )  # which sums depend on
         content = x.tobytes(order)
-        at, self._size = self._size, self._size + len(content)
+        offset, self._size = self._size, self._size + len(content)
         self.data.append(content)
-        return [x.dtype.str, list(x.shape), order, at]
+        return [x.dtype.str, list(x.shape), order, offset]
 
 
 class _Reader:
@@ -180,7 +181,7 @@ class _Reader:
 
             if not weak or not 0 < x.size <= FEW:
                 return jnp.asarray(x)
-            # Scalars of Python are of the weak kind, for which another program would be compiled.
+            # Python scalars are weakly typed, and another program would be compiled for them.
             scalars = [jnp.asarray(value) for value in x.ravel().tolist()]
             return scalars[0] if x.shape == () else jnp.stack(scalars).reshape(x.shape)
         if kind == "type":
@@ -198,11 +199,11 @@ class _Reader:
             filled = np.empty(math.prod(shape), object)
             filled[:] = [self.decoded(item) for item in rest[0]]
             return filled.reshape(shape)
-        order, at = rest
+        order, offset = rest
         kind = np.dtype(dtype)
         if kind.kind not in KINDS:
             raise Unreadable(f"array of {dtype}")
-        return np.frombuffer(self._data, kind, math.prod(shape), at).reshape(shape, order=order).copy("K")
+        return np.frombuffer(self._data, kind, math.prod(shape), offset).reshape(shape, order=order).copy("K")
 
     def _instance(self, module: str, name: str, factors: list[float] | None, fields: dict[str, Any]) -> Any:
         kind = _class(module, name, factors)
@@ -215,14 +216,14 @@ class _Reader:
 
 
 def _holds(kind: type, name: str) -> bool:
-    """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
+    """True if instances of a dataclass hold a value by that name: a field, or a cached property."""
     attribute = inspect.getattr_static(kind, name, None)
     fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
     return name in fields or isinstance(attribute, functools.cached_property)
 
 
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:
-    """Module and name of a class, and the factors of an effect that differs from it by its priors alone."""
+    """Module and name of a class, and the factors of an effect that differs from it only by its priors."""
     plain = getattr(kind, "plain", None)
     base, factors = (kind, None) if plain is None else (plain, list(vars(kind)["factors"]))
     name = base.__module__, base.__qualname__
@@ -232,10 +233,10 @@ def _named_class(kind: type) -> tuple[str, str, list[float] | None]:
 
 
 def _class(module: str, name: str, factors: list[float] | None) -> type:
-    """Class by its name, of our packages or of effects that the user has loaded.
+    """Class by name, from our packages or the effects that the user has loaded.
 
     Raises:
-        Unreadable: no such class there.
+        Unreadable: there is no such class.
     """
     if module.partition(".")[0] in PACKAGES:
         target: Any = importlib.import_module(module)

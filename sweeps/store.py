@@ -1,4 +1,4 @@
-"""Run folders: everything that a command leaves, written aside and moved into place when it is whole."""
+"""Run folders with the files of a command, written to a temporary folder that is moved into place when complete."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Page = Callable[[Path], Any]
 
 
 def print_report(document: Document, file: RobotFile | None = None, brief: bool = False) -> Page:
-    """Print a document and return its page, which ends with the robot's parameters if its file is given."""
+    """Prints a document and returns its page, which ends with the robot's parameters if its file is given."""
     terminal_renderer.print_document(document, brief)
     return lambda folder: importlib.import_module("sweeps.report.page_renderer").write_report_page(
         folder, document, file
@@ -57,17 +57,17 @@ def finish_run_folder(
     page: Page | None = None,
     runs: Runs | None = None,
 ) -> int:
-    """Write the configuration and the page (if wanted), move the folder into place and print its path.
+    """Writes the configuration and the page (if wanted), moves the folder into place and prints its path.
 
     Args:
         folder: folder with the command's own files.
-        robot: written as `robot.toml` with a note, if it is not among them.
-        manifest: entries besides program, versions and hashes.
+        robot: robot that is written as `robot.toml` with a note, unless the command has written it.
+        manifest: entries in addition to program, versions and hashes.
         runs: the table whose hash is recorded, if any.
         solved: True if every solver gave an answer.
 
     Returns:
-        The exit code: 0, or 3 where a solver failed.
+        Exit code: 0, or 3 if a solver failed.
     """
     if robot is not None:
         robot_file.write_robot(robot, folder.results() / "robot.toml", note=f"{note}, from {config.robot}")
@@ -79,23 +79,23 @@ def finish_run_folder(
 
 
 T = TypeVar("T")
-#: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
-#: requirement that is missed and any verdict are answers.
+#: Exit codes of a finished command: all solvers gave an answer, or one failed. A run that stalls or slides, a missed
+#: requirement and any verdict are answers.
 DONE, SOLVER_FAILED = 0, 3
-#: Schemas of a finished run folder, and of the file that marks an unfinished one and is locked while it is worked on.
+#: Schemas of a finished run folder, and of the lock file that marks an unfinished one.
 MANIFEST, UNFINISHED = "mmrjax.manifest/1", "mmrjax.unfinished/1"
 LOCK, CHUNKS = "lock", "chunks"
-#: The Zarr group of a sweep, the record of its chunks, and the folder in which its files are written first.
+#: Zarr group of a sweep, journal of its chunks, and temporary folder for its files.
 STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "writing"
 #: Names in an unfinished folder, before the results are written.
 PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
 #: Endings of the files in `CHUNKS`.
 KEPT = (".npz", ".stage")
-#: File of what the loop's regression says before anything is confirmed.
+#: File with the loop's ranking by regression, before any confirmation.
 SCREENING_FILE = "screening.json"
-#: Key of the mark with the names of files that are not ours.
+#: Key of the lock file with the names of foreign files.
 FOREIGN = "foreign"
-#: First arguments of commands that fit a robot.
+#: Commands that fit a robot.
 FITS = (["calibrate"], ["loop"])
 #: Largest manifest or mark that is read [bytes].
 LARGEST = 2**20
@@ -104,16 +104,17 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "l
 
 
 class Folder:
-    """Files that a command leaves, in `path` + `.partial` until the folder is whole and moved into place."""
+    """Folder with the files of a command, named `path` + `.partial` until it is complete and moved into place."""
 
-    #: Names beside those of the manifest that a finished folder may hold: what a kill while it was moved leaves.
+    #: Names that a finished folder may contain besides those of the manifest, if the process was killed while moving
+    #: it.
     further: Names = (LOCK,)
 
     def __init__(self, path: Path) -> None:
-        """The folder that is to appear at `path`.
+        """Folder that will appear at `path`.
 
         Raises:
-            BadConfiguration: no name of a folder.
+            BadConfiguration: the path is no name of a folder.
         """
         if not path.name:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
@@ -123,10 +124,10 @@ class Folder:
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
-        """Reject a path that holds something already.
+        """Rejects a path that already exists.
 
         Args:
-            force: replace a run folder that holds nothing but what its command left.
+            force: True to replace a run folder that contains only files of its command.
 
         Raises:
             BadConfiguration: it does.
@@ -147,11 +148,12 @@ class Folder:
         raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
 
     def refuse_foreign(self, command: str, force: bool) -> None:
-        """Reject a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
+        """Rejects a `.partial` folder that is not ours, or contains a foreign file or interrupted work of another
+        command.
 
         Args:
-            command: command that is to go on there.
-            force: begin anew in place of another command.
+            command: command that will continue there.
+            force: True to start again in place of another command.
 
         Raises:
             BadConfiguration: it does.
@@ -175,10 +177,10 @@ class Folder:
             )
 
     def refuse_appeared(self, force: bool) -> None:
-        """Reject a path where something has appeared since the run began.
+        """Rejects a path that was created since the run began.
 
         Raises:
-            OSError: it has, the partial folder is left.
+            OSError: it was. The partial folder is kept.
         """
         try:
             self.refuse_taken(force)
@@ -186,9 +188,9 @@ class Folder:
             raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path)) from None
 
     def _foreign(self) -> set[str]:
-        """Names in the partial folder that no command of ours wrote.
+        """Names of foreign files in the partial folder.
 
-        Before the results are written these are all but `PARTS`. Later the lock's file lists them.
+        Before results are written, these are all names except `PARTS`. Later the lock file lists them.
         """
         foreign = {p.name for p in self.partial.iterdir()} - PARTS
         foreign_names = _json(self.partial / LOCK).get(FOREIGN)
@@ -198,22 +200,22 @@ class Folder:
         }
 
     def _begin_results(self) -> None:
-        """Lists foreign files in the lock's file before the first result is written: all other files are ours."""
+        """Lists foreign files in the lock file before the first result is written. All other files are then ours."""
         mark = _json(self.partial / LOCK)
         if FOREIGN not in mark:
             text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
             with writing.naming_file(self.partial / LOCK), (self.partial / LOCK).open("r+b", buffering=0) as lock:
-                lock.write(text.encode())  # at once and longer than before, so that others never read a part of it
+                lock.write(text.encode())  # in one write, so that others never read a part
 
     def _clear(self) -> None:
-        """Delete everything of ours in the partial folder but its lock."""
+        """Deletes all our files in the partial folder except its lock."""
         foreign = self._foreign()
         for entry in self.partial.iterdir():
             if entry.name != LOCK and entry.name not in foreign:
                 shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
 
     def _remove_partial(self) -> None:
-        """Delete the partial folder, the lock last, foreign files stay."""
+        """Deletes the partial folder, the lock last. Foreign files are kept."""
         with contextlib.suppress(OSError):
             self._clear()
             if {p.name for p in self.partial.iterdir()} <= {LOCK}:
@@ -221,42 +223,42 @@ class Folder:
                 self.partial.rmdir()
 
     def results(self) -> Path:
-        """Folder for the results, which are moved into place when all are written."""
+        """Folder for the results, which is moved into place when all are written."""
         if not self._results_begun:
             self._begin_results()
             self._results_begun = True
         return self.partial
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a text file."""
+        """Writes a text file."""
         writing.write_text(self.results() / name, text)
 
     def write_bytes(self, name: str, content: bytes) -> None:
-        """Write a file of bytes."""
+        """Writes bytes to a file."""
         with writing.naming_file(self.partial / name):
             (self.results() / name).write_bytes(content)
 
     def write_json(self, name: str, content: Json) -> None:
-        """Write a JSON file. Numbers that are not finite become null."""
+        """Writes a JSON file. Numbers that are not finite become null."""
         writing.write_json(self.results() / name, content)
 
     def write_table(self, name: str, columns: Columns) -> None:
-        """Write a table as CSV, and as Parquet too where asked. Numbers that are not finite become empty cells."""
+        """Writes a table as CSV and, if requested, as Parquet. Numbers that are not finite become empty cells."""
         writing.write_table(self.results() / name, columns, self.tables)
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """Write the manifest and move the folder into place. Returns its path.
+        """Writes the manifest and moves the folder into place. Returns its path.
 
-        Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
-        all that the folder holds: `--force` deletes nothing else.
+        The manifest also has hashes of `robot.toml` and of the file of `runs`, if any, and the names of all files:
+        `--force` deletes nothing else.
         """
         hashes = {"robot": sha256_hex((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
         if runs is not None and runs.digest:
             hashes[runs.source] = runs.digest
-        now = datetime.datetime.now(datetime.UTC)
+        end_time = datetime.datetime.now(datetime.UTC)
         times = {
             "started": self.started.isoformat(timespec="seconds"),
-            "seconds": round((now - self.started).total_seconds(), 3),
+            "seconds": round((end_time - self.started).total_seconds(), 3),
         }
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
         # Program, versions and devices that made a result
@@ -282,12 +284,12 @@ class Folder:
         return self.move_into_place()
 
     def move_into_place(self) -> Path:
-        """The finished folder, where it is to appear."""
+        """Moves the finished folder to its final path."""
         raise NotImplementedError
 
 
 def listed_names(folder: Path) -> list[str] | None:
-    """Names that the manifest of a run folder lists, None if it is no run folder of ours."""
+    """Names in the manifest of a run folder. None if it is not one of ours."""
     manifest = _json(folder / "manifest.json")
     names = manifest.get("contents")
     if manifest.get("schema") != MANIFEST or not isinstance(names, list):
@@ -296,13 +298,13 @@ def listed_names(folder: Path) -> list[str] | None:
 
 
 def interrupted_run(partial: Path) -> dict[str, str] | None:
-    """Command and identity of an interrupted run, None if a folder is not one of ours.
+    """Command and identity of an interrupted run. None if the folder is not one of ours.
 
-    Of a run that was killed before it could write them both are empty.
+    Both are empty if the run was killed before it wrote them.
     """
     if partial.is_symlink() or not (partial / LOCK).is_file():
         return None
-    for _ in range(2):  # another process may write it between the first look and the list of what is there
+    for _ in range(2):  # another process may write it between the first check and the listing
         mark = _json(partial / LOCK)
         if mark.get("schema") == UNFINISHED and isinstance(mark.get("command"), str):
             return {"command": mark["command"], "identity": str(mark.get("identity", ""))}
@@ -318,13 +320,13 @@ def lock_text(command: str, identity: str = "") -> str:
 
 
 def holds_work(partial: Path) -> bool:
-    """True if a run that ended early has kept anything: chunks, stages, lines of a sweep's journal, or a result."""
+    """True if a run that ended early stored anything: chunks, stages, journal lines, or a result."""
     patterns = (*(f"{CHUNKS}/[!.]*{ending}" for ending in KEPT), f"{JOURNAL}/*.jsonl", "manifest.json")
     return any(file.stat().st_size for pattern in patterns for file in partial.glob(pattern))
 
 
 def share_at_work(partial: Path, own: Path | None = None) -> str | None:
-    """Share of a sweep that another process is computing. None: no such share.
+    """Share of a sweep that another process is computing. None if there is none.
 
     Args:
         own: journal of this process.
@@ -338,7 +340,7 @@ def share_at_work(partial: Path, own: Path | None = None) -> str | None:
 
 
 def try_to_lock(file: TextIO) -> bool:
-    """Lock an open file until it is closed, False if another process has locked it."""
+    """Locks an open file until it is closed. False if another process has locked it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -349,7 +351,7 @@ def try_to_lock(file: TextIO) -> bool:
 
 
 def _json(file: Path) -> Json:
-    """Object of a small JSON file, empty if it cannot be read."""
+    """Content of a small JSON file, empty if it cannot be read."""
     try:
         with file.open("rb") as stream:
             content = json.loads(stream.read(LARGEST))
@@ -361,22 +363,22 @@ def _json(file: Path) -> Json:
 class RunFolder(Folder):
     """A folder that appears at `path` only when `finish` is called.
 
-    If the command is stopped, the same command with the same configuration finds its finished chunks in `partial`
-    and goes on. Another configuration begins the partial folder anew with `force`. One process at a time works on it.
+    If the command is stopped, the same command with the same configuration continues from the finished chunks in
+    `partial`. With `force`, another configuration starts again. Only one process at a time uses the folder.
     """
 
     def __init__(self, path: Path, identity: Json, *, force: bool = False) -> None:
-        """Begin or take up a run folder.
+        """Creates or continues a run folder.
 
         Args:
-            path: where the folder is to appear.
-            identity: what makes this run what it is, its `command` among it. Two runs with the same identity share
+            path: final path of the folder.
+            identity: everything that determines the run, including its `command`. Runs with the same identity share
                 their chunks.
-            force: replace an existing run folder, and an interrupted one of another command.
+            force: True to replace an existing run folder, or an interrupted one of another command.
 
         Raises:
-            BadConfiguration: `path` holds something already or cannot be written, another process is at work on it,
-                or another command was interrupted there.
+            BadConfiguration: `path` already exists or cannot be written, another process is using it, or another
+                command was interrupted there.
         """
         super().__init__(path)
         self._force, self._command = force, str(identity.get("command", ""))
@@ -399,7 +401,7 @@ class RunFolder(Folder):
             ) from error
 
     def _entered(self) -> TextIO | None:
-        """Lock of the partial folder, None if another process has removed or moved the folder meanwhile."""
+        """Lock of the partial folder. None if another process has removed or moved the folder meanwhile."""
         self.partial.mkdir(parents=True, exist_ok=True)
         lock = (self.partial / LOCK).open("a+", encoding="utf-8")
         if not try_to_lock(lock) or share_at_work(self.partial) is not None:
@@ -416,7 +418,7 @@ class RunFolder(Folder):
     def _begin_or_take_up(self) -> None:
         assert self._lock is not None
         try:
-            self.refuse_taken(self._force)  # by a process that has finished meanwhile
+            self.refuse_taken(self._force)  # moved by a process that has finished meanwhile
         except BadConfiguration:
             if not holds_work(self.partial):
                 self._remove()
@@ -441,9 +443,8 @@ class RunFolder(Folder):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
-        """Leave nothing behind if the command ended before a chunk was done, or was refused after it began anew.
-
-        Chunks and stages of any other end are taken up again.
+        """Removes the folder if the command ended before a chunk was done, or was rejected after starting again.
+        Otherwise stored chunks and stages are used later.
         """
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(self.partial)
@@ -453,18 +454,18 @@ class RunFolder(Folder):
         self.close()
 
     def _remove(self) -> None:
-        """Remove the partial folder of this process."""
+        """Removes the partial folder of this process."""
         self._remove_partial()
         self.close()
 
     def close(self) -> None:
-        """Let other processes work on what is left."""
+        """Releases the lock, so that other processes can use the folder."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
     def chunk(self, name: str) -> Columns | None:
-        """Chunk finished by an interrupted run, None if missing or unreadable."""
+        """Chunk from an interrupted run. None if missing or unreadable."""
         from sweeps import stage_files
 
         file = self.partial / CHUNKS / f"{name}.npz"
@@ -472,20 +473,21 @@ class RunFolder(Folder):
             return None
         try:
             return stage_files.read_arrays(file)
-        except Exception:  # whatever a damaged file makes the reader raise
+        except Exception:  # a damaged file can make the reader raise anything
             print_message(f"{file}: damaged, so it is computed again")
             return None
 
     def keep_chunk(self, name: str, columns: Columns) -> None:
-        """Keep a finished chunk for a run that is taken up again."""
+        """Stores a finished chunk, for continuing an interrupted run."""
         file = self.partial / CHUNKS / f"{name}.npz"
-        with writing.replacing(file) as aside, aside.open("wb") as stream:
+        with writing.replacing(file) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
 
     def stage(self, name: str, make: Callable[[], T]) -> T:
-        """Result of a stage: read if an interrupted run of the same identity kept it, else made and kept.
+        """Result of a stage: read if an interrupted run of the same identity stored it, otherwise computed and
+        stored.
 
-        A damaged file is reported, and the stage made again. A result that cannot be written is not kept.
+        A damaged file is reported, and the stage is computed again. A result that cannot be written is not stored.
         """
         from sweeps import stage_files
 
@@ -497,26 +499,26 @@ class RunFolder(Folder):
             except stage_files.Unreadable:
                 print_message(f"{file}: damaged, so it is computed again")
         result = make()
-        with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as aside:
-            stage_files.write_stage(aside, result)
+        with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as temporary:
+            stage_files.write_stage(temporary, result)
         return result
 
     def keeps(self, name: str) -> bool:
-        """True if the result of a stage is kept."""
+        """True if the result of a stage is stored."""
         return self._of_stage(name).is_file()
 
     def _of_stage(self, name: str) -> Path:
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """As of `Folder`, with the identity of the run in the manifest."""
+        """As in `Folder`, with the identity of the run in the manifest."""
         return super().finish({**manifest, "identity": self._digest}, runs)
 
     def move_into_place(self) -> Path:
-        """Drop the chunks, and move the folder to where it is to appear. The lock's file goes last.
+        """Deletes the chunks and moves the folder to its final path. The lock file is removed last.
 
         Raises:
-            OSError: something has appeared there meanwhile, the partial folder is left.
+            OSError: the path was created meanwhile. The partial folder is kept.
         """
         self.refuse_appeared(self._force)
         shutil.rmtree(self.partial / CHUNKS)
@@ -534,14 +536,14 @@ def open_folder(
 ) -> RunFolder:
     """Run folder of a command. Its identity is the configuration and the program's source.
 
-    Files kept by another version are not continued.
+    Files of another version are not used.
 
     Args:
-        command: its name.
-        config: its configuration.
+        command: name of the command.
+        config: configuration of the command.
         robot: robot of the configuration, with its changes.
-        beside: says where the folder is to appear, and if it replaces an existing one.
-        runs: the table that it was given, if any.
+        beside: options for the path of the folder, and for replacing an existing one.
+        runs: input table, if any.
     """
     folder = RunFolder(
         beside.out or default_path(command), run_identity(command, config, robot, runs), force=beside.force
@@ -551,7 +553,7 @@ def open_folder(
 
 
 def run_identity(command: str, config: RobotPart, robot: Robot, runs: Runs | None) -> Json:
-    """Identity of a run: its configuration, its inputs and the program's source. Arguments: as of `open_folder`."""
+    """Identity of a run: its configuration, its inputs and the program's source. Arguments as in `open_folder`."""
     import jax
 
     from mmrjax.compile.programs import source_hash
@@ -577,7 +579,7 @@ def identity_digest(identity: Json) -> str:
 
 
 def rows_of_fit(robot: Path) -> frozenset[str]:
-    """Hashes of the tables that a robot was fitted to, from the manifest in its folder, may be empty."""
+    """Hashes of the tables that a robot was fitted to, from the manifest in its folder. May be empty."""
     manifest = _json(robot.parent / "manifest.json") if robot.is_file() else {}
     hashes, arguments = manifest.get("hashes"), manifest.get("arguments")
     if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:
@@ -592,7 +594,7 @@ def sha256_hex(content: bytes) -> str:
 
 
 def default_path(command: str) -> Path:
-    """`runs/<command>-<time>`, for a command that was given no `--out`."""
+    """`runs/<command>-<time>`, for a command without `--out`."""
     now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     path = Path("runs") / f"{command}-{now}"
     return path if not path.exists() else path.with_name(f"{path.name}-{os.getpid()}")

@@ -21,10 +21,10 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
-from tests.commands import command, read_json
+from tests.commands import command, read_json, schema_of
 from tests.pages import Tables
 
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json")
+SCHEMA = schema_of("check")
 
 
 def read(text):
@@ -308,7 +308,7 @@ REFUSED = {
     "slope_deg = 95": r"^r.toml, slope_deg: got 95; expected 0 to 45 deg$",
     "speed_m_s = -1": r"^r.toml, speed_m_s: got -1; expected 0 to 1e\+06 m/s$",
     'speed_m_s = "1 m/s"': r"^r.toml, speed_m_s: got '1 m/s'; expected a number \[m/s\]$",
-    "speed_m_s = 'rated'": r"^r.toml, speed_m_s: got 'rated'; expected a number, only winding_C, ",
+    "speed_m_s = 'rated'": r"^r.toml, speed_m_s: got 'rated'; expected a number; only winding_C, ",
     "speed_m_s = true": r"^r.toml, speed_m_s: got True; expected a number \[m/s\]$",
     "speed_m_s = []": r"^r.toml, speed_m_s: got an empty list; expected ",
     "speed_m_s = {slope_deg = 3}": r"^r.toml, speed_m_s: expected least, most or both \[m/s\]$",

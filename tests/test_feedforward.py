@@ -9,9 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 from test_more_formats import wpilog
 
+from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
 from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
+from sweeps.commands import feedforward_fit
+from sweeps.report import feedforward_report
 
 TESTS = ("quasistatic-forward", "quasistatic-reverse", "dynamic-forward", "dynamic-reverse")
 STEP, FINE = 0.02, 5
@@ -142,6 +145,21 @@ def test_gains_solve_the_riccati_equation_by_iteration():
     assert_allclose(feedback_gains(kV, kA, Tolerances())["velocity_kP"], k, rtol=1e-9)
     late = feedback_gains(kV, kA, Tolerances(delay=0.05))["velocity_kP"]
     assert_allclose(late, k * (a - b * k) ** 2.5, rtol=1e-9)
+
+
+def test_a_log_of_voltage_and_speed_has_two_plots_on_any_page():
+    """With the constants of the same fit as of `--feedforward`. Settled runs and a log at rest have none."""
+    log, _ = simulated(1)
+    columns = {"run_id": log.run, "time_s": log.time, "supply_voltage_V": log.voltage}
+    runs = records.Runs("log.csv", columns | {"output_speed_rpm": 60.0 * log.velocity})
+    found = feedforward_fit.voltage_fit(runs)
+    direct = fit_feedforward(dataclasses.replace(log, position=None))
+    assert found.constants == pytest.approx(direct.constants, rel=1e-6)
+    quasistatic, dynamic, constants = feedforward_report.voltage_section(found).blocks
+    assert (quasistatic.name, dynamic.name) == ("quasistatic", "dynamic")
+    assert [row[1] for row in constants.rows] == list(found.constants.values())
+    rest = records.Runs("rest.csv", columns | {"output_speed_rpm": 0.0 * log.velocity})
+    assert feedforward_fit.voltage_fit(rest) is feedforward_fit.voltage_fit(records.read_runs("measured")) is None
 
 
 def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):

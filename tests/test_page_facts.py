@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
+from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
@@ -183,3 +184,27 @@ def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
     corner = {"configuration": "4W2T", "payload_kg": 0.0, "slope_deg": 5.0, "state_of_charge": 0.5}
     with figure_style.figure_settings():
         assert power_figures.draw_chart_of_corners(robot, [corner]).axes
+
+
+def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox():
+    """Driving, the load needs 1/η of its torque, driven back it gives η of it, and `backdriving_loss` less. Readings of
+    the same robot lie on its lines."""
+    robot = params.replace(paper_robots.nominal(), {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0})
+    load, losing = (
+        np.array([-4.0, 4.0]),
+        dataclasses.replace(robot, effects=(effects.BY_NAME["backdriving_loss"](amplitude=0.25),)),
+    )
+    needs, loses = (power_figures.torque_of_motor(r, 24.0, load) for r in (robot, losing))
+    share = float(robot.gearbox.efficiency_load)
+    np.testing.assert_allclose(needs / load, [share, 1 / share], rtol=1e-4)
+    np.testing.assert_allclose(loses / load, [0.75 * share, 1 / share], rtol=1e-4)
+    np.testing.assert_allclose(power_figures.torque_of_motor(robot, -24.0, load), -needs[::-1], rtol=1e-4)
+    runs = records.read_runs("measured")
+    simulated = mm.simulate(losing, runs.conditions(losing))
+    runs = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": np.asarray(simulated.total_current)})
+    with figure_style.figure_settings():
+        plane = power_figures.draw_measured_drive_plane(losing, runs).axes[0]
+    lines = {line.get_label(): line.get_xydata() for line in plane.lines}
+    dots = lines["measured"][np.isfinite(lines["measured"]).all(1)]
+    assert len(dots) > 10 and dots[:, 0].min() > 0
+    np.testing.assert_allclose(dots[:, 1], np.interp(dots[:, 0], *lines["runs forward"].T), rtol=1e-3)

@@ -125,6 +125,45 @@ def test_several_candidates_are_listed_with_their_question():
     assert "or wheel velocity b [rad/s]: which one is the output speed?" in line
 
 
+def test_results_of_a_calculation_are_no_readings():
+    """A student's workbook: its speed had no proposal, and its torque was the prediction of a regression."""
+    table = {
+        "Tach Reading (RPM)": 100 + WAVE, "Current Draw (A)": 0.4 + 0.1 * WAVE, "Torque (N-m)": 0.2 + 0.1 * WAVE,
+        "Applied Voltage (v)": 9 + WAVE, "Predicted_Torque": 0.2 + 0.1 * WAVE, "Residuals": 0.01 * WAVE,
+        "Z_Score_Current Draw (A)": WAVE, "Z_Score_Tach Reading (RPM)": WAVE, "Standardized Residuals": WAVE,
+    }  # fmt: skip
+    assert proposed(table) == {
+        "motor_speed_rpm": "Tach Reading (RPM)", "total_current_A": "Current Draw (A)",
+        "output_torque_Nm": "Torque (N-m)", "supply_voltage_V": "Applied Voltage (v)",
+    }  # fmt: skip
+
+
+def test_letters_within_a_device_name_mean_nothing():
+    """A leg's actuators: `pack` of `Actpack` made the motor's current and voltage those of the supply."""
+    device = "knee[DephyActpack]:"
+    table = {"t": TIME, f"{device}motor_current": 4000 + 99 * WAVE, f"{device}battery_current": 900 + 9 * WAVE}
+    table |= {f"{device}motor_voltage": 7000 + 99 * WAVE, f"{device}battery_voltage": 40000 + 99 * WAVE}
+    assert proposed(table) == {
+        "time_s": "t", **{f"{q}_m{u}": f"{device}{name}" for q, u, name in (
+            ("motor_current", "A", "motor_current"), ("total_current", "A", "battery_current"),
+            ("motor_voltage", "V", "motor_voltage"), ("supply_voltage", "V", "battery_voltage"),
+        )},
+    }  # fmt: skip
+
+
+def test_volts_of_a_sensor_are_no_supply():
+    assert "supply_voltage_V" not in proposed({"t": TIME, "encoder_V": 3 + WAVE, "current_A": 1 + WAVE})
+
+
+def test_a_column_of_a_channel_that_the_robot_lacks_is_reported(tmp_path):
+    entry = 'output_torque_Nm = "Torque [Nm]"'
+    (tmp_path / "rig.toml").write_text(RIG.replace("[motor]", f"[columns]\n{entry}\n[motor]"))
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    table = {"supply_voltage_V": 9 + WAVE, "motor_speed_rpm": 900 + WAVE, "Torque [Nm]": 0.2 + 0.1 * WAVE}
+    (note,) = (str(n) for n in runs.read_runs(table, robot).notes if "Torque [Nm]" in str(n))
+    assert '"channels" does not list output_torque' in note and "load_torque_Nm if a brake" in note
+
+
 def test_contents_of_a_log_with_two_rates_say_so(tmp_path):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
     assert "2 clocks" in contents.inspect_source(tmp_path / "log.h5").notes[0]

@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,7 @@ from calibration.data.input_errors import BadData
 from mmrjax.fidelities import outputs
 from mmrjax.model import channels, quantities
 from sweeps.commands import explain
-from tests.commands import read_rig, read_table, text_file
+from tests.commands import ROOT, read_rig, read_table, text_file
 
 #: One of each unit, in SI.
 BY_HAND = {
@@ -49,10 +48,20 @@ def test_per_cent_of_a_slope_are_those_of_its_tangent():
 
 @pytest.mark.parametrize(
     ("written", "column"),
-    [("U/min", "rpm"), ("1/min", "rpm"), ("min-1", "rpm"), ("°/s", "deg_s"), ("Nmm", "mNm"), ("N·m", "Nm"), ("%", "percent")],
+    [("U/min", "rpm"), ("1/min", "rpm"), ("min-1", "rpm"), ("°/s", "deg_s"), ("Nmm", "mNm"), ("N·m", "Nm"), ("%", "percent"),
+     ("RPM", "rpm"), ("Deg/s", "deg_s"), ("N-m", "Nm"), ("N m", "Nm"), ("mN.m", "mNm"), ("torque", "torque"),
+     ("MNm", "MNm"), ("G", "G")],
 )  # fmt: skip
 def test_units_as_people_write_them_are_those_of_columns(written, column):
     assert quantities.unit_in_column(written) == column
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("speed_RPM", "rpm"), ("torque_nm", "Nm"), ("omega_rad_s", "rad_s"), ("phase_a", None), ("torque_kNm", "kNm")],
+)
+def test_unit_at_the_end_of_a_name_may_have_other_capitals(name, unit):
+    assert quantities.unit_at_end(name, ("rpm", "Nm", "kNm", "A", "V", "rad_s", "rad")) == unit
 
 
 # --- a quantity is one row -----------------------------------------------------------------------------------
@@ -129,7 +138,7 @@ for command in commands:
 
 
 def test_a_channel_of_one_row_is_in_tables_sweeps_help_pages_and_json(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", ROW_MORE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )

@@ -34,14 +34,14 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
         count: counter as logged, shape (rows,).
         run: index of the recording of each row, shape (rows,).
     """
-    same = np.diff(run) == 0
-    step = np.where(same, np.diff(count), 0.0)
-    back = np.flatnonzero(step < 0)
-    if not back.size or not (step > 0).any():
+    same_run = np.diff(run) == 0
+    step = np.where(same_run, np.diff(count), 0.0)
+    rows_of_falls = np.flatnonzero(step < 0)
+    if not rows_of_falls.size or not (step > 0).any():
         return count, 0.0
     usual = float(np.median(step[step > 0]))
     for period in PERIODS:
-        across = step[back] + period
+        across = step[rows_of_falls] + period
         is_counter = period < 2**15 or not (count % 1).any()
         if (
             is_counter
@@ -51,11 +51,11 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
             and (across >= 0).all()
         ):
             wraps = np.zeros(len(count))
-            wraps[back + 1] = 1.0
+            wraps[rows_of_falls + 1] = 1.0
             total = np.cumsum(wraps)
-            first = np.zeros(len(count), int)
-            first[1:][~same] = np.flatnonzero(~same) + 1
-            begins = total[np.maximum.accumulate(first)]  # wraps before the recording of each row began
+            first_row_of_run = np.zeros(len(count), int)
+            first_row_of_run[1:][~same_run] = np.flatnonzero(~same_run) + 1
+            begins = total[np.maximum.accumulate(first_row_of_run)]  # wraps before the recording of each row began
             return count + period * (total - begins), period
     return count, 0.0
 
@@ -85,10 +85,10 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     inner = rows[1:-1] if len(rows) > 4 else rows
     if not np.isfinite(usual) or (np.abs(inner - rows_per_stamp) > 1).mean() > ODD:
         return time, 0.0
-    apart = np.where(np.isfinite(step), step, usual) / rows
-    apart = np.minimum(apart, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)
+    row_step = np.where(np.isfinite(step), step, usual) / rows
+    row_step = np.minimum(row_step, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)
     index = np.arange(len(time)) - np.repeat(begins, rows)
-    return np.repeat(stamps, rows) + index * np.repeat(apart, rows), float(rows.mean())
+    return np.repeat(stamps, rows) + index * np.repeat(row_step, rows), float(rows.mean())
 
 
 #: Day assumed for a time without a date, and length of a day [s].
@@ -167,21 +167,21 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
     run = np.zeros(len(clock), int) if run is None else run
     if isinstance(raw, list):
         _add_days_after_midnight(clock, raw, run)
-    first = np.full(len(names), np.inf)
+    start_time = np.full(len(names), np.inf)
     if len(names) > 1:
-        np.minimum.at(first, run, clock)
+        np.minimum.at(start_time, run, clock)
     else:  # in a tenth of the time
-        first[:] = clock.min()
-    if not first.any():
+        start_time[:] = clock.min()
+    if not start_time.any():
         return (clock / factor if notes else raw), notes
-    passed = np.round(clock - first[run], 9) / factor
+    passed = np.round(clock - start_time[run], 9) / factor
     if of_day:
         return passed, (
             *notes,
             f"{name}: {meaning.shown} is a time of day. Time is counted from the first row of each run",
         )
-    run_index = run[np.flatnonzero(first[run])[0]]
-    time_words = f"{first[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
+    run_index = run[np.flatnonzero(start_time[run])[0]]
+    time_words = f"{start_time[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
     return passed, (
         *notes,
         f"{name}: {meaning.shown} begins at {time_words}. Time is counted from the first row of a run. If the run "
@@ -209,11 +209,11 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
 
 def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
     """Adds a day [s] to times without a date after they fall back by more than half a day within their run."""
-    last: dict[int, float] = {}
+    last_time: dict[int, float] = {}
     for k, (x, run_index) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
-        if _is_time_without_date(cells[k]) and run_index in last:
-            clock[k] = x = x + _DAY * max(math.floor((last[run_index] - x) / _DAY + 0.5), 0)
-        last[run_index] = x
+        if _is_time_without_date(cells[k]) and run_index in last_time:
+            clock[k] = x = x + _DAY * max(math.floor((last_time[run_index] - x) / _DAY + 0.5), 0)
+        last_time[run_index] = x
 
 
 def _is_time_without_date(cell: str) -> bool:

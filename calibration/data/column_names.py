@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from calibration.data.input_errors import BadData, allowed_words, parse_number
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
+from mmrjax.model.robot import Robot
 
 #: Ratio to the largest allowed value from which another unit is probable.
 FAR = 2.0
@@ -35,9 +36,9 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
         wrong = [word for word in dict.fromkeys(words) if _allowed_words(meaning.column, word, layout)]
         return np.array(words), np.isin(words, wrong)
     numbers, (low, high) = column_numbers(raw), meaning.limits()
-    beyond = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
-    above = numbers > low if meaning.column in layout.deviation_columns else numbers >= low - beyond * abs(low)
-    refused = ~(above & (numbers <= high + beyond * abs(high)))
+    tolerance = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
+    above = numbers > low if meaning.column in layout.deviation_columns else numbers >= low - tolerance * abs(low)
+    refused = ~(above & (numbers <= high + tolerance * abs(high)))
     if meaning.column != layout.imposed_column and meaning.column in (
         *layout.measured_columns,
         *layout.deviation_columns,
@@ -101,15 +102,15 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
     except ValueError:
         match = _WITH_UNIT.fullmatch(cell)
         return "" if match is None else _unit_hint(match[1], match[2], column_unit, columns_by_unit)
-    far = abs(value) > FAR * max(map(abs, quantity.limits(column_unit)))
-    if far and meaning.column in DUTY:
+    is_far = abs(value) > FAR * max(map(abs, quantity.limits(column_unit)))
+    if is_far and meaning.column in DUTY:
         return (
             "is the command scaled differently? divide it by its maximum, in a log with "
             "[columns] duty = {column, factor}; "
         )
     for unit, column in columns_by_unit.items():
         low, high = quantity.limits(unit)
-        if far and unit != column_unit and low <= value <= high:
+        if is_far and unit != column_unit and low <= value <= high:
             return f"is it in {unit or 'shares of 1'}? then name the column {column}; "
     return ""
 
@@ -226,6 +227,25 @@ def check_header(
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
+def unread_channel_notes(name: str, robot: Robot, unread: Collection[str]) -> Names:
+    """Notes on columns that the robot file assigns to a channel that it does not list.
+
+    Args:
+        unread: columns of the table without a meaning.
+    """
+    notes = []
+    for own_column, logger_column, _ in robot.rig.columns:
+        channel = next((c for c in channels.EVERY if own_column in c.columns()), None)
+        if logger_column in unread and channel is not None:
+            braked = channel.name == "output_torque" and not robot.has_ground
+            notes.append(
+                f"{name}, {logger_column}: not read, because the robot file assigns it to {own_column}, and "
+                f'"channels" does not list {channel.name}. Add it there'
+                + (", or assign the column to load_torque_Nm if a brake sets this torque" if braked else "")
+            )
+    return tuple(notes)
+
+
 def check_has_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
     """Rejects readings of a log without a time column."""
     shown_names = {m.column: m.shown for m in meanings if m is not None}
@@ -282,7 +302,7 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
 
 def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     """Rejects a column whose name or source states a unit other than the one in which it is read."""
-    below = [""] * len(meanings)
+    units_below_header = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
         if meaning is None or meaning.column in WORDS:
             continue
@@ -293,8 +313,8 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
                 f"{arrays.name}, {meaning.shown}: got {unit} in {arrays.units_from}; "
                 f"expected {f'one of {allowed}' if allowed else 'none'}; correct or remove it"
             )
-        below[j] = unit
-    for stated_below, meaning in zip(below, meanings, strict=True):
+        units_below_header[j] = unit
+    for stated_below, meaning in zip(units_below_header, meanings, strict=True):
         if meaning is None or abs(meaning.factor) != 1.0:
             continue
         columns_by_unit = {unit: column for column, unit in meaning.quantity.columns().items()}

@@ -294,8 +294,8 @@ class Layout:
         close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
         if close:
             return next(s for s in pool if s.casefold() == close[0])
-        alone = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
-        return alone[0] if len(alone) == 1 else ""
+        conditions_in_unit = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
+        return conditions_in_unit[0] if len(conditions_in_unit) == 1 else ""
 
     def expected(self, column: str) -> str:
         """Name of the column, and its name in the source if the robot file states one."""

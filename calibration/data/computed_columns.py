@@ -81,13 +81,13 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
         drawn = np.asarray(
             simulate(robot, dataclasses.replace(conditions, load_torque=jnp.asarray(load))).reading[channel]
         )
-        wrong = np.where(np.isfinite(current), current - drawn, 0.0)
-        load = load + rise * np.nan_to_num(wrong)
-    far = np.flatnonzero(~(np.abs(wrong) <= ERROR * np.nanmax(np.abs(current))))
-    if far.size:
+        current_error = np.where(np.isfinite(current), current - drawn, 0.0)
+        load = load + rise * np.nan_to_num(current_error)
+    bad = np.flatnonzero(~(np.abs(current_error) <= ERROR * np.nanmax(np.abs(current))))
+    if bad.size:
         raise BadData(
-            f"{runs.source} row {far[0] + 1}, {LOAD}: it was computed from {channel}, and the file's robot draws "
-            f"{current[far[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
+            f"{runs.source} row {bad[0] + 1}, {LOAD}: it was computed from {channel}, and the file's robot draws "
+            f"{current[bad[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
         )
     return load
 

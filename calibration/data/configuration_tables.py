@@ -271,7 +271,7 @@ def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tup
 
 def _table_states(table: Mapping[str, Any], name: str) -> bool:
     """True if a table states a parameter, given by its dotted name."""
-    head, _, rest = name.partition(".")
-    if not rest:
+    head, _, key = name.partition(".")
+    if not key:
         return head in table
-    return isinstance(table.get(head), dict) and _table_states(table[head], rest)
+    return isinstance(table.get(head), dict) and _table_states(table[head], key)

@@ -108,9 +108,11 @@ def inspect_source(source: str | Path | Any) -> FileContents:
             f"{contents_found.name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the "
             "densest channel"
         )
-    still = {fact.path for fact in facts if fact.least == fact.greatest}
+    constant_signals = {fact.path for fact in facts if fact.least == fact.greatest}
     read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
-    moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first one that changes
+    moving = sorted(
+        read, key=lambda signal: signal.path in constant_signals
+    )  # of several, the first one that changes
     lines = dict(_proposed_columns(moving))
     proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
     return FileContents(
@@ -122,20 +124,20 @@ def _source(source: Any) -> Source:
     if not isinstance(source, str | Path):
         return opening.open_object(source)
     if group := opening.files_of_group(str(source)):
-        first = _source(group[0])
+        first_source = _source(group[0])
         note = f"{source}: {len(group)} files, each a run; these are the signals of {group[0].name}"
-        return dataclasses.replace(first, notes=(note, *first.notes))
-    path, within = opening.split_source(str(source))
+        return dataclasses.replace(first_source, notes=(note, *first_source.notes))
+    path, signal_path = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():
         raise BadData(f"{source}: no such file; expected a file of data, or the folder of a ROS 2 bag")
     form = opening.format_of(path, name)
     if form is not None:
-        return opening.open_signals(path, within, name, form)
+        return opening.open_signals(path, signal_path, name, form)
     table = _signals_of_text(delimited.read_csv_columns(path, name))
     if not table.signals:
         raise BadData(f"{name}: the file is empty; expected a header and rows")
-    return table.below(within) if within else table
+    return table.below(signal_path) if signal_path else table
 
 
 def _signals_of_text(arrays: NamedArrays) -> Source:
@@ -152,8 +154,8 @@ def _signals_of_text(arrays: NamedArrays) -> Source:
 
 def _unit_of_time(name: str) -> str | None:
     """Unit of a clock according to its name, as loggers spell it. None if the name is not that of a clock."""
-    bare = name.casefold().replace("time (", "time_").rstrip(")")
-    return "ms" if bare == "ms_today" else unit_of_clock(bare)
+    plain_name = name.casefold().replace("time (", "time_").rstrip(")")
+    return "ms" if plain_name == "ms_today" else unit_of_clock(plain_name)
 
 
 def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarray, str] | str]) -> SignalFacts:
@@ -191,9 +193,9 @@ def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
         seconds_found = one_clock.clock_seconds(clock)
     except BadData as error:
         return str(error)
-    back = np.flatnonzero(np.diff(seconds_found.time) < 0)
-    if back.size:
-        return f"{clock.name} goes back at sample {back[0] + 2}"
+    rows_of_falls = np.flatnonzero(np.diff(seconds_found.time) < 0)
+    if rows_of_falls.size:
+        return f"{clock.name} goes back at sample {rows_of_falls[0] + 2}"
     return seconds_found.time, seconds_found.unit
 
 
@@ -203,14 +205,14 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     row_signals = [s for s in signals if s.clock is None and not s.refused]
     time_signal = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
     clock = time_signal or next((s for s in row_signals if _is_rising_count(s)), None)
-    rest = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
+    other_signals = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
         unit = _unit_of_time(clock.name) or ("s" if clock.words else one_clock.guessed_unit(clock.load()))
         elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
         line = f'time_{unit} = "{clock.path}"'
         if time_signal is None and elapsed is not None:
-            seconds_per_unit = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
+            seconds_per_unit = proposals.seconds_per_count(other_signals, np.asarray(clock.load(), float))
             question = f"compared with a position, it counts {1 / seconds_per_unit:.3g} per second"
             if math.isnan(seconds_per_unit):
                 seconds_per_unit, question = UNITS[unit], "unit of the counts? give the seconds per count"
@@ -230,7 +232,7 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         clock_seconds = _seconds(signal.clock)
         return None if isinstance(clock_seconds, str) else clock_seconds[0]
 
-    yield from proposals.propose_columns(rest, spelled, seconds)
+    yield from proposals.propose_columns(other_signals, spelled, seconds)
 
 
 def _is_rising_count(signal: Signal) -> bool:

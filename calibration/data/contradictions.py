@@ -68,8 +68,8 @@ def reason_without_stance(robot: Robot) -> str | None:
 def reason_without_levers(robot: Robot, configuration: str) -> str:
     """Reason why a configuration has no levers, empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
-    others = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
-    return "" if configuration in have else f"{configuration} has no levers; {others}"
+    advice = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
+    return "" if configuration in have else f"{configuration} has no levers; {advice}"
 
 
 def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
@@ -89,9 +89,9 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
     levers = robot.running_gear.levers
     low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
     for name in lever_columns:
-        beyond = (runs[name] < low - 1e-9) | (runs[name] > high + 1e-9)
-        if beyond.any():
-            row = int(np.argmax(beyond))
+        out_of_range = (runs[name] < low - 1e-9) | (runs[name] > high + 1e-9)
+        if out_of_range.any():
+            row = int(np.argmax(out_of_range))
             return (
                 row,
                 name,
@@ -123,24 +123,28 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
     if not runs.has(column) or not np.nan_to_num(runs[column]).any() or not robot.knows(CURRENT):
         return
     voltage = runs[column]
-    back = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
-    along = np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back)
+    back_emf = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
+    voltage_forward = (
+        np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back_emf)
+    )
     if column == SUPPLY and (voltage > 0).all():
-        along = np.abs(voltage)
+        voltage_forward = np.abs(voltage)
     read = CURRENTS if robot.knows(VOLTAGE) else ()
     current = next((c for c in read if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
     if current is not None:
         motors = float(robot.sides) if current == "total_current_A" else 1.0
-        along = along - np.nan_to_num(runs[current]) / motors * float(robot.motor.resistance) * np.sign(back)
-    tells = np.abs(back) > LEAST
-    wrong = np.flatnonzero(tells & (along < TOO_SMALL * np.abs(back)))
+        voltage_forward = voltage_forward - np.nan_to_num(runs[current]) / motors * float(
+            robot.motor.resistance
+        ) * np.sign(back_emf)
+    tells = np.abs(back_emf) > LEAST
+    wrong = np.flatnonzero(tells & (voltage_forward < TOO_SMALL * np.abs(back_emf)))
     if wrong.size > (0 if current else MOST_BRAKING * np.sum(tells)):
         row = int(wrong[0])
-        why = "with the wrong sign" if along[row] < 0 else "too small"
+        why = "with the wrong sign" if voltage_forward[row] < 0 else "too small"
         raise BadData(
             f"{runs.source} row {row + 1}, {column}: got {voltage[row]:g} at an imposed {SPEED} of "
             f"{runs[SPEED][row]:g}, {why} for the motors' back-EMF of "
-            f"{float(f'{back[row]:.3g}'):g} V; "
+            f"{float(f'{back_emf[row]:.3g}'):g} V; "
             "check both columns and motor.torque_constant in the robot's file"
         )
 
@@ -152,19 +156,23 @@ def _check_time_order(runs: Runs) -> None:
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
         run_rows = np.flatnonzero(run == name)
-        back = np.flatnonzero(np.diff(time[run_rows]) < 0)
-        if 0 < back.size <= max(SELDOM * len(run_rows), 1):
-            row, was, now = run_rows[back[0] + 1] + 1, time[run_rows[back[0]]], time[run_rows[back[0] + 1]]
+        rows_of_falls = np.flatnonzero(np.diff(time[run_rows]) < 0)
+        if 0 < rows_of_falls.size <= max(SELDOM * len(run_rows), 1):
+            row, old_time, new_time = (
+                run_rows[rows_of_falls[0] + 1] + 1,
+                time[run_rows[rows_of_falls[0]]],
+                time[run_rows[rows_of_falls[0] + 1]],
+            )
             raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} s; "
+                f"{runs.source} row {row}, time_s: goes back from {old_time:g} to {new_time:g} s; "
                 "give each recording its own run_id, or sort the rows"
             )
 
 
 def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
     """Median of the four steps around each step."""
-    wide = np.pad(step, 2, constant_values=np.nan)
-    return np.nanmedian([wide[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
+    padded = np.pad(step, 2, constant_values=np.nan)
+    return np.nanmedian([padded[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 
 
 def _check_angle(runs: Runs) -> None:
@@ -180,10 +188,10 @@ def _check_angle(runs: Runs) -> None:
             (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
         )
         if jumps.size:
-            row, passed = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
-            gap = passed[jumps[0]]
+            row, time_steps = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
+            gap = time_steps[jumps[0]]
             why = "like an angle that wraps; expected an angle that keeps counting beyond one turn"
-            if gap > GAP * np.median(passed):
+            if gap > GAP * np.median(time_steps):
                 why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: jumps by "

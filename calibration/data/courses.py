@@ -69,9 +69,9 @@ def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray
     if not runs.sampled:
         return varies
     _, run = np.unique(runs.run_names, return_inverse=True)
-    first = np.unique(run, return_index=True)[1][run]
+    first_row_of_run = np.unique(run, return_index=True)[1][run]
     for column in (c for c in columns if runs.has(c)):
-        differs = runs[column] != runs[column][first]
+        differs = runs[column] != runs[column][first_row_of_run]
         varies |= np.bincount(run, differs)[run] > 0
     return varies
 

@@ -84,11 +84,11 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
     if content.startswith((b"#", b"%", codecs.BOM_UTF8, b"\xff\xfe", b"\xfe\xff")) or b'"' in content or end < 0:
         return None
     try:
-        first = content[: content.find(b"\n", end + 1)].decode().splitlines()
+        first_lines = content[: content.find(b"\n", end + 1)].decode().splitlines()
     except UnicodeDecodeError:
         return None
-    input_files.check_declared(name, first[0].count(",") + 1)
-    header, row = ([cell_word(cell.strip()) for cell in line.split(",")] for line in (*first, "", "")[:2])
+    input_files.check_declared(name, first_lines[0].count(",") + 1)
+    header, row = ([cell_word(cell.strip()) for cell in line.split(",")] for line in (*first_lines, "", "")[:2])
     if len(header) < 2 or not all(header) or len(header) != len(row) or row_of_units(header, row):
         return None
     import pyarrow as pa
@@ -152,13 +152,13 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
             return content.decode("utf-16"), (f"{name}: is read as UTF-16",)
         return content.decode("utf-8-sig"), ()
     except UnicodeDecodeError as error:
-        wrong = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
+        message = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
     try:
         if not _CONTROLS.search(content):
             return content.decode("cp1252"), (f"{name}: is not in UTF-8, so it is read as Windows-1252",)
     except UnicodeDecodeError:
         pass
-    raise BadData(wrong)
+    raise BadData(message)
 
 
 def drop_comments(lines: Sequence[str]) -> list[str]:
@@ -166,20 +166,20 @@ def drop_comments(lines: Sequence[str]) -> list[str]:
 
     If numbers follow the comments, the last comment with as many cells is the header. A row of units may follow it.
     """
-    first = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
-    below = list(lines[first:])
-    if not first or not below:
-        return below
-    if all(line.endswith(";") for line in below) and "," in below[0]:  # the end of a row in MATLAB
-        below = [line[:-1] for line in below]
-    cells = re.split(_SEPARATOR, below[0])
+    header_row = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
+    lines_below = list(lines[header_row:])
+    if not header_row or not lines_below:
+        return lines_below
+    if all(line.endswith(";") for line in lines_below) and "," in lines_below[0]:  # the end of a row in MATLAB
+        lines_below = [line[:-1] for line in lines_below]
+    cells = re.split(_SEPARATOR, lines_below[0])
     if not any(math.isfinite(cell_number(cell)) or cell.strip().lower() in MISSING for cell in cells):
-        return below
-    above = [line.lstrip("#% ") for line in lines[:first]]
-    alike = [line for line in above if len(re.split(_SEPARATOR, line)) == len(cells)] or above[-1:]
+        return lines_below
+    comments = [line.lstrip("#% ") for line in lines[:header_row]]
+    alike = [line for line in comments if len(re.split(_SEPARATOR, line)) == len(cells)] or comments[-1:]
     split = [[cell.strip() for cell in re.split(_SEPARATOR, line)] for line in alike[-2:]]
     has_units = len(split) == 2 and bool(row_of_units(*split))
-    return [*alike[-1 - has_units :], *below]
+    return [*alike[-1 - has_units :], *lines_below]
 
 
 def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names]:
@@ -229,10 +229,10 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
     for marked, other in ((point, comma), (comma, point)):
         for j, written in marked.items():
             if (other or j in integer_columns) and all(map(_THOUSANDS.fullmatch, written)):
-                beside = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
+                other_cell = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
                 raise BadData(
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
-                    f"{beside or 'whole numbers below a thousand'}; {expectation}"
+                    f"{other_cell or 'whole numbers below a thousand'}; {expectation}"
                 )
     return rows, (f"{note}, and numbers have decimal commas" if comma else f"{note}; read so",)
 

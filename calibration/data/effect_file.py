@@ -113,11 +113,11 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
             raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is already used; choose another")
         library[effect.name] = effect
     for path, effect in own_effects:
-        others = [name for name in library if name != effect.name]
-        if effect.settles_to and effect.settles_to not in others:
+        other_names = [name for name in library if name != effect.name]
+        if effect.settles_to and effect.settles_to not in other_names:
             raise BadConfiguration(
                 f"{_where(path, effect)}, settles_to: got {effect.settles_to}; "
-                f"{allowed_words(effect.settles_to, others)}"
+                f"{allowed_words(effect.settles_to, other_names)}"
             )
     return library
 
@@ -200,8 +200,12 @@ def _check_effect(path: Path, effect: type[Effect]) -> None:
         default = effect()
     except (Exception, SystemExit) as error:
         raise refuse(f": cannot be created without arguments ({error}); give every field a default") from error
-    acting, configurations = default.configurations, effect.configurations
-    if acting != configurations or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
+    default_configurations, configurations = default.configurations, effect.configurations
+    if (
+        default_configurations != configurations
+        or not isinstance(default_configurations, tuple)
+        or not all(isinstance(c, str) for c in default_configurations)
+    ):
         raise refuse(f', configurations: got {configurations!r}; expected a tuple of names such as ("4W2T",)')
     declared = {p.name: p for p in params.walk_parameters(default)}
     amplitudes = [name for name, p in declared.items() if p.spec.amplitude]
@@ -232,12 +236,12 @@ def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signal
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
     zero = jnp.zeros(())
     climbing = State(jnp.asarray(1.5), jnp.asarray(800.0), jnp.asarray(0.6), jnp.asarray(100.0))
-    rest = State(zero, zero, zero, zero)
+    state_at_rest = State(zero, zero, zero, zero)
     # Sums for the turn are computed after both sides' slip and resistance.
     before = "slip" if balance in ROUND else balance
     climbs, points = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
-    still = readable_signals(robot, run, rest, before, channel)
-    return dataclasses.replace(climbs, **TURN), dataclasses.replace(points, **TURN), still
+    signals_at_rest = readable_signals(robot, run, state_at_rest, before, channel)
+    return dataclasses.replace(climbs, **TURN), dataclasses.replace(points, **TURN), signals_at_rest
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
@@ -246,37 +250,41 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
 
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:
         # The robot file checks configurations that the nominal robot does not have.
-        made = dataclasses.replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
-        with_it = dataclasses.replace(robot, effects=(made,))
+        effect_of_amplitude = dataclasses.replace(
+            params.replace(effect(), {"amplitude": amplitude}), configurations=()
+        )
+        with_it = dataclasses.replace(robot, effects=(effect_of_amplitude,))
         return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
 
     for configuration in range(len(robot.configurations)):
-        known, points, rest = (
+        known, points, points_at_rest = (
             dataclasses.replace(s, memory=memory) for s in _test_points(effect.balance, effect.channel, configuration)
         )
         mirrored = dataclasses.replace(known, **{name: -value for name, value in TURN.items()})
         external = dataclasses.replace(known, battery=jnp.zeros(()))
         try:
-            none, once, twice = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
-            late, fed = (term(jnp.asarray(size), s) for s in (points, external))
+            term_at_zero, term_at_size, term_at_double = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
+            term_of_external_supply, fed = (term(jnp.asarray(size), s) for s in (points, external))
             other = term(jnp.asarray(size), mirrored) * (-1 if effect.balance in ROUND else 1)
             slope = jax.grad(lambda a, s=known: jnp.sum(term(a, s)))(jnp.asarray(0.0))
-            at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(rest)
+            at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(points_at_rest)
             memory_rates = []
             if effect.memory_size is not None:
                 memory_rates = [effect().rate(robot, points), effect().settled(robot, known)]
         except (Exception, SystemExit) as error:
             raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
-        if once.shape != ():
-            raise refuse(f": its term has shape {once.shape}; expected a scalar for scalar signals")
-        if not jnp.array_equal(once, late, equal_nan=True):
+        if term_at_size.shape != ():
+            raise refuse(f": its term has shape {term_at_size.shape}; expected a scalar for scalar signals")
+        if not jnp.array_equal(term_at_size, term_of_external_supply, equal_nan=True):
             raise refuse(": its term reads a signal that is computed after its balance; see balances.moving_signals")
-        if float(none) != 0.0:
-            raise refuse(f": its term is {float(none):g} at amplitude 0; expected 0, so that the effect is off")
+        if float(term_at_zero) != 0.0:
+            raise refuse(
+                f": its term is {float(term_at_zero):g} at amplitude 0; expected 0, so that the effect is off"
+            )
         if not math.isfinite(float(slope)):
             raise refuse(f": the derivative of its term at amplitude 0 is {float(slope)}; expected a finite one")
-        bent = abs(float(twice) - 2 * float(once)) > 1e-6 * abs(float(twice))
-        if bent or (float(slope) == 0) != (float(once) == 0):
+        bent = abs(float(term_at_double) - 2 * float(term_at_size)) > 1e-6 * abs(float(term_at_double))
+        if bent or (float(slope) == 0) != (float(term_at_size) == 0):
             raise refuse(
                 ": its term is not proportional to its amplitude; expected amplitude times a function of the signals"
             )
@@ -284,7 +292,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
             raise refuse(": the rate or settled value of its memory is not finite")
         if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(at_rest)):
             raise refuse(": derivatives of its term are not finite at rest, where drive and track start")
-        alike = effect.balance == "sensor" or jnp.allclose(once, other, rtol=1e-9, atol=0.0)
+        alike = effect.balance == "sensor" or jnp.allclose(term_at_size, other, rtol=1e-9, atol=0.0)
         if not alike and effect.driver != THE_SIDE:
             raise refuse(
                 f", driver: got {effect.driver!r} for a term that differs between the sides; expected "

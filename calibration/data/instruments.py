@@ -34,11 +34,11 @@ def common_step(readings: np.ndarray) -> float:
     if levels.size < FEWEST:
         return 0.0
     step, largest = 0.0, float(np.ptp(levels))
-    for apart in np.diff(levels):
-        a, b = float(apart), step
+    for difference in np.diff(levels):
+        a, b = float(difference), step
         while b > ROUNDING * largest:
-            rest = a - b * round(a / b)
-            a, b = b, abs(rest)
+            remainder = a - b * round(a / b)
+            a, b = b, abs(remainder)
         step = a
         if step < SMALLEST * largest:
             return 0.0
@@ -75,14 +75,16 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
     Args:
         columns: columns of the table, in their units.
     """
-    back = any((columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns)
+    runs_backward = any(
+        (columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns
+    )
     inferred = []
     for instrument in instruments:
         channel = channels.find_channel(instrument.channel)
         readings = columns.get(channel.column, np.zeros(0))
         signed, quantum = instrument.signed, instrument.quantum
         if signed is None:
-            signed = not back or bool((readings < 0).any())
+            signed = not runs_backward or bool((readings < 0).any())
         if quantum is None:
             quantum = common_step(readings) * channel.factor
         inferred.append(Instrument(instrument.channel, signed, quantum))

@@ -110,11 +110,11 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):
         of_table5 = rows_of_scaled_adhesion(robot, runs["configuration"], runs["surface"])
-    others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
-    if others:
+    other_surfaces = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
+    if other_surfaces:
         notes.append(
-            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}. Simulate with "
-            f"--surface {others[0]} to use the fitted values"
+            f"the table has runs on {', '.join(other_surfaces)}: the written friction is for {BENCH}. Simulate with "
+            f"--surface {other_surfaces[0]} to use the fitted values"
         )
     return notes
 

@@ -84,8 +84,8 @@ class Posterior:
         kinds = np.asarray(self.kinds)
         theta = xp.where(xp.asarray(kinds == LOG), xp.exp(xp.where(kinds == LOG, u, 0.0)), u)
         theta = xp.where(xp.asarray(kinds == ANGLE), xp.remainder(u + np.pi, 2 * np.pi) - np.pi, theta)
-        followers = [ratio * theta[..., k] for _, k, ratio in self.tied]
-        return xp.concatenate([theta, xp.stack(followers, -1)], -1) if followers else theta
+        tied_values = [ratio * theta[..., k] for _, k, ratio in self.tied]
+        return xp.concatenate([theta, xp.stack(tied_values, -1)], -1) if tied_values else theta
 
     def values(self, normal_scores: Any) -> Any:
         """Parameters [SI] of draws.
@@ -204,7 +204,7 @@ def read_posterior(path: Path | str) -> Posterior:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise BadData(f"{path}: not a readable posterior ({why})") from error
     size = len(posterior)
-    sound = (
+    is_valid = (
         posterior.covariance.shape == (size, size)
         and all(
             np.isfinite(x).all() for x in (posterior.covariance, posterior.mean, posterior.location, posterior.spread)
@@ -215,7 +215,7 @@ def read_posterior(path: Path | str) -> Posterior:
         and np.linalg.eigvalsh(posterior.covariance).min() >= -1e-9 * max(np.abs(posterior.covariance).max(), 1e-300)
         and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
     )
-    if not sound:
+    if not is_valid:
         raise BadData(
             f"{path}: the covariance is invalid, or a number is missing or out of range; write the file again"
         )
@@ -252,10 +252,10 @@ def join_posteriors(parts: Sequence[Posterior], covariance: np.ndarray) -> Poste
         for f in ("mean", "location", "spread", "low", "high", "softness")
     }
     tied: list[tuple[str, int, float]] = []
-    first = 0
+    offset = 0
     for p in parts:
-        tied += [(name, first + k, ratio) for name, k, ratio in p.tied]
-        first += len(p)
+        tied += [(name, offset + k, ratio) for name, k, ratio in p.tied]
+        offset += len(p)
     return Posterior(
         coordinates=tuple(n for p in parts for n in p.coordinates),
         units=tuple(u for p in parts for u in p.units),

@@ -175,13 +175,13 @@ def recognise_preset(names: Sequence[str]) -> str:
     Args:
         names: names of the source's columns, or paths of its signals.
     """
-    best, most = "", OF_A_PRESET - 1
+    best, most_matches = "", OF_A_PRESET - 1
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     for name in PACKAGED:
         preset = find_preset(SEPARATOR.join([name, *(f"{key}=1" for key in numbers_to_state(name))]))
         count = sum(any(_matches_any(pattern, ends) for pattern in column.theirs) for column in preset.columns)
-        if count > most:
-            best, most = name, count
+        if count > most_matches:
+            best, most_matches = name, count
     return best
 
 

@@ -207,10 +207,10 @@ def read_profile(source: str | Path) -> ProfileTable:
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
         return _profile_of_text(file.read_bytes(), str(source))
-    path, within = opening.split_source(str(source))
+    path, signal_path = opening.split_source(str(source))
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged profile; {allowed_words(str(source), PACKAGED)}")
-    table = reading.read_whole_table(path, within)
+    table = reading.read_whole_table(path, signal_path)
     if table is None:
         return _profile_of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
     rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
@@ -220,9 +220,9 @@ def read_profile(source: str | Path) -> ProfileTable:
 def _profile_of_text(content: bytes, name: str) -> ProfileTable:
     text, encoded = delimited.decode_text(name, content)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    settings = _header_settings(name, lines[:above])
-    rows, notes = delimited.split_cells(name, lines[above:])
+    header_row = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    settings = _header_settings(name, lines[:header_row])
+    rows, notes = delimited.split_cells(name, lines[header_row:])
     return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
 
 
@@ -370,20 +370,20 @@ class _CellReader:
         low, high = quantity.limits(unit)
         allowed = f"{low:g} to {high:g}"
         try:
-            written = float(self.text(field, row))
+            number = float(self.text(field, row))
         except ValueError:
             self.refuse(field, row, f"a number, {allowed}")
-        if not math.isfinite(written) or not low <= written <= high:
+        if not math.isfinite(number) or not low <= number <= high:
             self.refuse(field, row, allowed)
-        value = quantity.value(written, unit)
+        value = quantity.value(number, unit)
         return value * quantity.factor if isinstance(quantity, Channel) else value
 
     def held(self, field: str) -> np.ndarray:
         """Numbers of a required column. If values are held between rows, the last row may be empty."""
-        last = len(self) - 1
+        last_row = len(self) - 1
         held_values: list[float] = []
         for row in range(len(self)):
-            ends = row == last and not self.linear and not self.text(field, row)
+            ends = row == last_row and not self.linear and not self.text(field, row)
             held_values.append(held_values[-1] if ends else self.value(field, row))
         return np.array(held_values)
 
@@ -467,9 +467,9 @@ def _check_demands(cells: _CellReader, row: int, before: str, mode: str, own: li
     """Rejects a row with two demands or none, and a ramp between different kinds of demand."""
     if others:
         cell_place = cells.columns[others[0]][0]
-        beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
+        other = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{cells.source} row {row + 1}, {cell_place}: got {cells.text(others[0], row)} in addition to {beside}; "
+            f"{cells.source} row {row + 1}, {cell_place}: got {cells.text(others[0], row)} in addition to {other}; "
             "expected one demand per row"
         )
     pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())

@@ -21,7 +21,10 @@ COMMAND = re.compile(r"(?:^|[^a-z])(?:cmd|command|target|set_?point|ref|referenc
 #: Names of signals that are neither readings nor commands of a drive.
 OTHER = re.compile(
     r"status|flag|error|fault|count|index|stamp|air|wind\b|pitot|latit|longit|altit|gps|ambient|_raw|roll|yaw|gyro|accel"
+    r"|predict|residual|z_?score|fitted"
 )
+#: Names of signals whose unit is that of a sensor's output.
+SENSOR = re.compile(r"encoder|sensor|photo|shunt|adc|therm|gauge")
 #: Quantities that a command may contain, because they are imposed.
 IMPOSED = ("supply_voltage", "duty")
 #: Larger numbers are time stamps or counters. Largest voltage and current without a unit.
@@ -40,10 +43,10 @@ class Meaning(NamedTuple):
 #: The first match wins.
 MEANINGS = tuple(Meaning(quantity, re.compile(pattern)) for quantity, pattern in (
     ("duty", r"duty|pwm|throttle|motor_?(cmd|command)$"),
-    ("supply_voltage", r"(bat|bus|supply|input|pack|dc)[^/]*volt|vbat|vbus|u_?bat|\bvin\b"),
+    ("supply_voltage", r"(?<![a-z])(bat|bus|supply|input|pack|dc)[^/]*volt|vbat|vbus|u_?bat|\bvin\b"),
     ("motor_voltage", r"(motor|phase|winding|terminal)[^/]*(volt|_v\b)"),
     ("supply_voltage", r"volt|\bu\b|^v$"),
-    ("total_current", r"(bat|input|supply|bus|total|dc|pack)[^/]*(cur|amp)|ibat|ibus"),
+    ("total_current", r"(?<![a-z])(bat|input|supply|bus|total|dc|pack)[^/]*(cur|amp)|ibat|ibus"),
     ("motor_current", r"(motor|phase|winding|axis)[^/]*(cur|amp|\bi\b)|i_?mot|\biq\b|\bq[-_](current|a\b)"),
     ("total_current", r"cur|amps?\b|\bi\b"),
     ("output_speed", r"(wheel|output|joint|load)[^/]*(vel|speed|rpm|omega)"),
@@ -139,8 +142,8 @@ def propose_columns(
         best, *others = sorted(group, key=lambda c: (c.signal.clock is None, bool(c.question)))
         question = best.question
         if others:
-            rest = ", ".join(c.signal.path for c in others[:3])
-            question = f"or {rest}: which one is the {quantity.replace('_', ' ')}?"
+            other_paths = ", ".join(c.signal.path for c in others[:3])
+            question = f"or {other_paths}: which one is the {quantity.replace('_', ' ')}?"
         if joint := _joint_name(best.signal, signals):
             question = f"joint {joint}{'; ' * bool(question)}{question}"
         yield best.signal.path, best.line(question)
@@ -171,7 +174,7 @@ def _candidate_of_signal(
     name = _path_words(signal.path)
     matches = [m.quantity for m in MEANINGS if m.pattern.search(name)]
     fitting = [q for q in matches if unit is None or unit in columns[q].values()]
-    if not matches and unit is not None and alone:
+    if not matches and unit is not None and alone and not SENSOR.search(name):
         fitting = [q for q in BY_UNIT if unit in columns[q].values()]
     command = bool(COMMAND.search(name))
     fitting = [q for q in fitting if not OTHER.search(name) and (not command or q in IMPOSED)]
@@ -319,17 +322,17 @@ def _units_of_position_and_rate(
 def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
     """Ratio of a position to the integral of a rate, NaN if the position is not that integral."""
     step = np.diff(time)
-    sound = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
-    if sound.sum() < 3:
+    is_usable = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
+    if is_usable.sum() < 3:
         return math.nan
-    sound &= step <= 5 * np.median(step[sound])
-    distance = np.cumsum(np.where(sound, np.diff(place), 0.0))
-    integral = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
+    is_usable &= step <= 5 * np.median(step[is_usable])
+    distance = np.cumsum(np.where(is_usable, np.diff(place), 0.0))
+    integral = np.cumsum(np.where(is_usable, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
     if not np.any(integral):
         return math.nan
     factor = float(distance @ integral / (integral @ integral))
-    rest = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
-    return factor if rest < INTEGRAL else math.nan
+    relative_error = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
+    return factor if relative_error < INTEGRAL else math.nan
 
 
 def _currents_by_duty(pool: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:

@@ -327,11 +327,17 @@ _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_spe
 def _check_consistent(each: list[Requirement], envelope: Envelope, where: str) -> None:
     for a, b in combinations(each, 2):
         least, most = (a, b) if a.least else (b, a)
-        same = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name)
-        same = same and (a.share, a.tread_mm) == (b.share, b.tread_mm)
+        same_quantity = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name)
+        same_quantity = same_quantity and (a.share, a.tread_mm) == (b.share, b.tread_mm)
         if least.limit is None or most.limit is None:
             continue
-        if same and least.least and not most.least and least.limit > most.limit and a.envelope.meets(b.envelope):
+        if (
+            same_quantity
+            and least.least
+            and not most.least
+            and least.limit > most.limit
+            and a.envelope.meets(b.envelope)
+        ):
             unit = a.quantity.unit
             raise BadConfiguration(
                 f"{where}: {least.name} at least {least.limit:g} {unit} and {most.name} at most {most.limit:g} "

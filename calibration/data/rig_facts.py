@@ -65,44 +65,48 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
     if with_constant:
         per_volt = 1 / constant / RPM
-        odd = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", odd)
+        doubt = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
+        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", doubt)
         idle = float(motor.friction_coulomb) / constant
-        odd = _reason_if_outside(
+        doubt = _reason_if_outside(
             idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current"
         )
-        yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
+        yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", doubt)
     if with_constant and voltage is not None:
         fastest = voltage / constant
-        odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit. Check torque_constant")
-        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
+        doubt = (
+            "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit. Check torque_constant")
+        )
+        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", doubt)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
-        odd = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
-        yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
+        doubt = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
+        yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", doubt)
     if with_constant and with_resistance:
         size = constant**2 / resistance
-        odd = _reason_if_outside(
+        doubt = _reason_if_outside(
             size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor. Check their units"
         )
-        yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
+        yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", doubt)
         if inertia > 0:
             constant_time = inertia / size
             why = "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
-            odd = _reason_if_outside(constant_time, 5e-4, 0.5, why)
+            doubt = _reason_if_outside(constant_time, 5e-4, 0.5, why)
             yield DerivedFact(
-                "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", odd
+                "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", doubt
             )
 
 
 def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
-    odd = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
+    doubt = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
     if ratio >= STAGES and efficiency > EFFICIENCY:
-        odd = f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
+        doubt = (
+            f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
+        )
     if ratio == 1 and efficiency < 0.9:
-        odd = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
-    yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
+        doubt = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
+    yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", doubt)
 
 
 def _output_torque_at(robot: Robot, current: float) -> float:
@@ -124,15 +128,15 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
-    odd = _reason_if_outside(current, 0, 200, f"check {places}, and the gearbox")
+    doubt = _reason_if_outside(current, 0, 200, f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
-            odd = (
+            doubt = (
                 f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move. "
                 f"Check {places}"
             )
-    yield DerivedFact(what, f"{three_digits(current)} A per motor", odd)
+    yield DerivedFact(what, f"{three_digits(current)} A per motor", doubt)
 
 
 def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
@@ -171,30 +175,30 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     load = robot.configurations[name]
     sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
     rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
-    odd = _reason_if_outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
-    yield DerivedFact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", odd)
+    doubt = _reason_if_outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
+    yield DerivedFact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", doubt)
     guide = float(load.track.guide_friction) * float(load.track.guide_share)
     torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
     yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
     grip = math.degrees(math.atan(static))
-    odd = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
+    doubt = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
     yield DerivedFact(
         f"{name}: steepest slope without sliding",
         f"{grip:.0f}°",
-        odd or _reason_if_outside(grip, 5, 60, "check friction.static"),
+        doubt or _reason_if_outside(grip, 5, 60, "check friction.static"),
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
         return
     pull = _output_torque_at(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
-    odd = "" if climb > 0 else "its motors cannot move it. Check mass, ratio, torque_constant and resistance"
+    doubt = "" if climb > 0 else "its motors cannot move it. Check mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
-    yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
+    yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, doubt)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
-    odd = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
+    doubt = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
+    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", doubt)
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
@@ -247,10 +251,12 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
         return ""
     heading = runs.headings.get(column, column)
+    motionless = largest > needed and not any(c.zero_at_rest and runs.has(c.column) for c in runs.channels)
+    held = "Was the shaft held? Then add a column held with 1 in these rows. " * motionless
     return (
         f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
-        f"slowly at {three_digits(needed)} A. Is it in another unit (mA, mN·m)? Then state [columns] {column} = "
-        f'{{column = "{heading}", factor = ...}}'
+        f"slowly at {three_digits(needed)} A. {held}Is it in another unit (mA, mN·m)? Then state [columns] "
+        f'{column} = {{column = "{heading}", factor = ...}}'
     )
 
 
@@ -267,7 +273,7 @@ def _time_steps_of_runs(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarra
 
 def gap_sentence(runs: Runs) -> str:
     """Sentence on the longest time step of a log, if rows may be missing there. Otherwise empty."""
-    worst, told = 0.0, ""
+    worst, sentence = 0.0, ""
     for _, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) else 0.0
         long = steps > LONG * usual
@@ -275,12 +281,12 @@ def gap_sentence(runs: Runs) -> str:
             continue
         k, worst = int(np.argmax(steps)), float(steps.max())
         more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
-        told = (
+        sentence = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
             f"{three_digits(usual)} s is usual{more}. A fit keeps the imposed quantity constant in the gap. If rows "
             'are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
         )
-    return told
+    return sentence
 
 
 #: A clock jitters if the time between rows has at least this relative spread and at most this correlation with the
@@ -296,11 +302,11 @@ def jitter_sentence(runs: Runs) -> str:
     """
     for name, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
-        off = np.clip(steps - usual, -usual, usual)
-        spread = float(np.std(off))
+        deviation = np.clip(steps - usual, -usual, usual)
+        spread = float(np.std(deviation))
         if usual <= 0 or spread <= UNEVEN * usual or (steps > LONG * usual).any():
             continue
-        if float(np.mean(off[1:] * off[:-1])) < TURNS_BACK * spread**2:
+        if float(np.mean(deviation[1:] * deviation[:-1])) < TURNS_BACK * spread**2:
             run = f" of run {name}" if name else ""
             return (
                 f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
@@ -354,15 +360,15 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
     limit = float(np.median(np.abs(predicted[top])))
-    beyond = read & (np.abs(drive) > limit / REACHES)
+    limited = read & (np.abs(drive) > limit / REACHES)
     # If the voltage from these rows still rises, the driver does not limit it.
-    if beyond.sum() < ROWS_INNER or np.std(np.abs(predicted[beyond])) > FITS * limit:
+    if limited.sum() < ROWS_INNER or np.std(np.abs(predicted[limited])) > FITS * limit:
         return ""
-    row = int(np.flatnonzero(beyond)[0])
+    row = int(np.flatnonzero(limited)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
         f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
-        f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log. The driver limits "
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The driver limits "
         f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
@@ -381,12 +387,12 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     if robot.rig.imposed != "voltage" or not robot.knows(VOLTAGE) or column is None:
         return ""
     ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
-    reached = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
-    read, is_shown = runs[column], np.isfinite(runs[column]) & (reached > 0)
+    highest = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
+    read, is_shown = runs[column], np.isfinite(runs[column]) & (highest > 0)
     is_shown &= np.abs(np.nan_to_num(read)) > 0
     if not is_shown.any():
         return ""
-    share = float(np.median(np.abs(read[is_shown]) / reached[is_shown]))
+    share = float(np.median(np.abs(read[is_shown]) / highest[is_shown]))
     braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
@@ -394,7 +400,7 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     heading, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
     return (
         f"{runs.source} row {row + 1}, {heading}: got {three_digits(abs(read[row]))} rpm, but with the file's "
-        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {heading} "
+        f"torque constant the motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} "
         f"and {supply}, and motor.torque_constant"
     )
 
@@ -412,13 +418,13 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    torque_at_zero, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
-    stall = np.maximum(torque_at_zero + (made - torque_at_zero) * current, 0.0)
+    torque_at_zero, torque_per_ampere = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
+    stall = np.maximum(torque_at_zero + (torque_per_ampere - torque_at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
-    beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
-    if not braked.any() or beyond.sum() <= braked.sum() / 2:
+    exceeds_stall = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
+    if not braked.any() or exceeds_stall.sum() <= braked.sum() / 2:
         return ""
-    row, heading = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
+    row, heading = int(np.flatnonzero(exceeds_stall)[0]), runs.headings.get(LOAD, LOAD)
     return (
         f"{runs.source} row {row + 1}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
         f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{heading}"'
@@ -457,9 +463,9 @@ def held_sentence(runs: Runs) -> str:
             for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
                 moves = abs(readings[begin]) > MOVES * np.nanmax(np.abs(readings), initial=0.0)
                 if moves and end - begin > HELD * len(rows) and np.ptp(drive[rows[begin:end]]) > HELD * range_ > 0:
-                    column, last = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
+                    column, last_row = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
-                        f"{runs.source} rows {rows[begin] + 1} to {last}, {column}: the same reading while "
+                        f"{runs.source} rows {rows[begin] + 1} to {last_row}, {column}: the same reading while "
                         f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated. Empty "
                         "these cells to use the other rows"
                     )
@@ -477,8 +483,13 @@ def swapped_sentence(runs: Runs) -> str:
             power = np.nan_to_num(runs[imposed][rows] * readings)
             total = np.cumsum(power) / max(float(np.abs(power).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
-            first, rest = total[turn], total[-1] - total[turn]
-            if channel.zero_at_rest and channel.settled and first * rest < 0 and min(abs(first), abs(rest)) > SWAPPED:
+            sum_before, sum_after = total[turn], total[-1] - total[turn]
+            if (
+                channel.zero_at_rest
+                and channel.settled
+                and sum_before * sum_after < 0
+                and min(abs(sum_before), abs(sum_after)) > SWAPPED
+            ):
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
@@ -528,7 +539,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
     priors = {name: sd for name, _, sd in robot.rig.priors}
     origins = []
     for p in params.walk_parameters(robot):
-        head, _, rest = p.name.partition(".")
+        head, _, key = p.name.partition(".")
         is_own_configuration = head in robot.configurations
         is_shown = (
             p.name in names_in_file or is_own_configuration or p.name.startswith(("motor.friction", "gearbox."))
@@ -547,7 +558,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
         elif head == BATTERY and not robot.knows([p.name]):
             why = "not stated: an example value. Results on the battery depend on it"
         else:
-            why = _reason_of_default(p.name, rest if is_own_configuration else "")
+            why = _reason_of_default(p.name, key if is_own_configuration else "")
         origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return origins
 

@@ -307,15 +307,15 @@ def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Nam
     turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
     voltage = rig.shows_voltage
-    hot = "winding_temperature" in rig.channels
+    has_temperature = "winding_temperature" in rig.channels
     conditions: tuple[tuple[str, Any], ...] = (
         ("controller.kp", rig.follows_goal),
         ("gearbox.ratio", True),
         ("gearbox.efficiency_load", True),
         ("motor.torque_constant", current or voltage),
-        ("motor.resistance", voltage or hot),
-        ("motor.resistance_thermal_winding", hot),
-        ("motor.resistance_thermal_housing", hot),
+        ("motor.resistance", voltage or has_temperature),
+        ("motor.resistance_thermal_winding", has_temperature),
+        ("motor.resistance_thermal_housing", has_temperature),
         (WHEELBASE, turns),
     )
     return tuple(name for name, is_needed in conditions if is_needed)

@@ -527,10 +527,10 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         if table.startswith("rig."):  # the start of a table's runs is no property of the robot
             continue
         was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
-        same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
-        same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
-        same &= inherits or parameter.name not in robot.rig.stated
-        if same and (not inherits or table == "rig"):
+        is_unchanged = value == was and not parameter.name.startswith(always) and parameter.name not in needed
+        is_unchanged &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
+        is_unchanged &= inherits or parameter.name not in robot.rig.stated
+        if is_unchanged and (not inherits or table == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
         origin = f"; {spec.source}" if value == was else origin
@@ -554,8 +554,8 @@ def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tu
     for name, (_, _, unit, meaning) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = value(robot, name)
-        beside = key == "capacity_curve" and part in stated  # otherwise it would follow from the capacity
-        if rating is not None and (inherits or beside or rating != value(nothing, name)):
+        must_state = key == "capacity_curve" and part in stated  # otherwise it would follow from the capacity
+        if rating is not None and (inherits or must_state or rating != value(nothing, name)):
             stated = stated | {part}
             yield part, f"{key} = {rating!r}  # [{unit}] {meaning if inherits else meaning.partition(';')[0]}"
     for name, meaning in SWITCHES.items():

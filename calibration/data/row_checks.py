@@ -61,8 +61,12 @@ def reading_period(values: np.ndarray) -> float:
     rows = usual if abs(near.mean() - usual) < 0.25 and (near == usual).mean() > 0.5 else float(near.mean())
     if usual < APART or (gaps < usual - 1.5).mean() > SOONER or (usual < 3 and (gaps < APART).mean() > SOONER):
         return 0.0
-    off = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
-    return rows if (off <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps) else 0.0
+    distance_to_multiple = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
+    return (
+        rows
+        if (distance_to_multiple <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps)
+        else 0.0
+    )
 
 
 def drop_repeated_readings(
@@ -150,11 +154,11 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     for values in columns.values():
         if not again.size:
             return is_distinct, ()
-        now, before = values[again], values[again - 1]
-        same = now == before
+        values_after, values_before = values[again], values[again - 1]
+        is_equal = values_after == values_before
         if values.dtype.kind == "f":
-            same |= np.isnan(now) & np.isnan(before)
-        again = again[same]
+            is_equal |= np.isnan(values_after) & np.isnan(values_before)
+        again = again[is_equal]
     is_distinct[again] = False
     row_words = (
         f"row {again[0] + 1} is"
@@ -214,9 +218,9 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
             f"{name}: column {other} is missing although {side_columns[0]} is present; give the command of both sides"
         )
     if side_columns and set(columns) & {"duty", "mode"}:
-        beside = min(set(columns) & {"duty", "mode"})
+        extra = min(set(columns) & {"duty", "mode"})
         raise BadData(
-            f"{name}: column {beside} in addition to {side_columns[0]}, which already gives the command of both "
+            f"{name}: column {extra} in addition to {side_columns[0]}, which already gives the command of both "
             "sides; keep one"
         )
 
@@ -236,16 +240,16 @@ def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot
     if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
         return columns_left, ()
     step = np.diff(time)
-    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
+    shortest_step, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
     constant = windings if clamped else time_constant(robot)
-    if not math.inf > apart >= CONSTANTS_APART * constant or not (
-        clamped or _are_separate_settings(columns, layout, apart)
+    if not math.inf > shortest_step >= CONSTANTS_APART * constant or not (
+        clamped or _are_separate_settings(columns, layout, shortest_step)
     ):
         return columns_left, ()
     for column in (*TIME, "run_id"):
         columns_left.pop(column, None)
-    note = f"rows are {three_digits(apart)} s or more apart, mostly at different settings"
+    note = f"rows are {three_digits(shortest_step)} s or more apart, mostly at different settings"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
     why = "the output is held in every row" if clamped else f"{note}{settle}"
     return columns_left, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
@@ -271,21 +275,21 @@ def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bo
     if not all(c.settled for c in present) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
         return False
     drive = columns[SUPPLY] * columns.get("duty", 1.0)
-    others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+    other_settings = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
 
     def left(readings: np.ndarray, k: int) -> float:
-        return _unexplained_squares(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+        return _unexplained_squares(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *other_settings)])
 
     return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in present)
 
 
 def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
-    """Sum of squared residuals of the readings, fitted by a linear function of the settings."""
+    """Sum of squared residuals of the readings after a linear fit over the settings."""
     a = np.stack([np.ones(len(readings)), *settings], 1)
-    sound = np.isfinite(readings)
-    if sound.sum() < 3:
+    is_finite = np.isfinite(readings)
+    if is_finite.sum() < 3:
         return 0.0
-    a, readings = a[sound], readings[sound]
+    a, readings = a[is_finite], readings[is_finite]
     return float(np.sum((readings - a @ np.linalg.lstsq(a, readings, rcond=None)[0]) ** 2))
 
 
@@ -404,7 +408,7 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
         against = np.flatnonzero(forward & (readings < -doubt))
         if against.size:
             row = int(against[0])
-            alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
+            alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
             raise BadData(
                 f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at {imposed[row]:g} {unit}; only "
                 "this drives the motors, so the reading should have its sign; use one sign convention in all "
@@ -412,8 +416,10 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             )
         if wrong.size:
             row = int(wrong[0])
-            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
-            hint = alone if layout.crosses_zero else ""
+            unsigned_advice = (
+                f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
+            )
+            hint = unsigned_advice if layout.crosses_zero else ""
             raise BadData(
                 f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
                 f"{imposed[row]:g} {unit}; expected readings with their signs, negative in reverse{hint}"
@@ -457,8 +463,8 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
             )
     alike: dict[tuple[Any, ...], list[int]] = {}
     settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
-    told = [columns[column].tolist() for column in settled]
-    for row, cells in enumerate(zip(*told, strict=True), 1):
+    values_of_columns = [columns[column].tolist() for column in settled]
+    for row, cells in enumerate(zip(*values_of_columns, strict=True), 1):
         alike.setdefault(cells, []).append(row)
     if copied := [rows for rows in alike.values() if len(rows) > 1]:
         others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""

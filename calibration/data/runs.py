@@ -181,6 +181,9 @@ def runs_of_arrays(
         "is assumed to show only the magnitude, so magnitudes are compared" for i in unsigned
     ))  # fmt: skip
     notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
+    if measured and robot is not None:
+        unread = {c for c, m in zip(header, meanings, strict=True) if m is None}
+        notes = (*notes, *column_names.unread_channel_notes(name, robot, unread))
     headings = {m.column: m.shown for m in meanings if m is not None}
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
@@ -233,16 +236,16 @@ def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
         said: messages, at least the first `LISTED`.
         count: number of rejected cells.
     """
-    first, *others = said
-    if not others:
-        return first
-    more, repeats = list[str](), {first.partition(";")[2]}
-    for sentence in others[: LISTED - 1]:
+    first_message, *other_messages = said
+    if not other_messages:
+        return first_message
+    more, repeats = list[str](), {first_message.partition(";")[2]}
+    for sentence in other_messages[: LISTED - 1]:
         cell_message, _, cure = sentence.removeprefix(f"{name} ").partition(";")
         more.append(cell_message if cure in repeats else f"{cell_message};{cure}")
         repeats.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
-    return f"{first}; also {'; '.join(more)}{rest}"
+    return f"{first_message}; also {'; '.join(more)}{rest}"
 
 
 def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
@@ -265,10 +268,10 @@ def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tu
     meant = {c.casefold(): c for c in layout.configurations}
     if len(meant) < len(layout.configurations):  # the names differ only in capitals
         return cells, []
-    others = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
-    odd = {c: meant[c.casefold()] for c in others if c.casefold() in meant}
-    notes = [f"{name}: configuration {c} is read as {right}" for c, right in odd.items()]
-    return [odd.get(c, c) for c in cells] if odd else cells, notes
+    unknown_names = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
+    renamed = {c: meant[c.casefold()] for c in unknown_names if c.casefold() in meant}
+    notes = [f"{name}: configuration {c} is read as {right}" for c, right in renamed.items()]
+    return [renamed.get(c, c) for c in cells] if renamed else cells, notes
 
 
 def _values_without_role(raw: Raw) -> np.ndarray:
@@ -289,10 +292,10 @@ def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: 
         "describe the load as a vehicle"
     )
     if isinstance(raw, np.ndarray):
-        acts = np.flatnonzero(np.nan_to_num(raw.astype(float)) != 0)[:1].tolist()
+        nonzero_rows = np.flatnonzero(np.nan_to_num(raw.astype(float)) != 0)[:1].tolist()
     else:
-        acts = [row for row, cell in enumerate(raw) if cell.strip("0.-") != ""][:1]
-    for row in acts:
+        nonzero_rows = [row for row, cell in enumerate(raw) if cell.strip("0.-") != ""][:1]
+    for row in nonzero_rows:
         raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {column_texts(raw[row : row + 1])[0]}; {why}")
 
 

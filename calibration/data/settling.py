@@ -275,9 +275,9 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
     levels: list[np.ndarray] = []
     divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
     for rows in rows_by_run:
-        far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
-        gaps += [int(rows[k]) for k in far]
-        for part in np.split(rows, far + 1):
+        rows_of_gaps = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
+        gaps += [int(rows[k]) for k in rows_of_gaps]
+        for part in np.split(rows, rows_of_gaps + 1):
             found_in = [part]
             for driver in divided_by:
                 found_in = [x for level in found_in for x in _levels_of(runs, driver, level, shortest, drift, step)]
@@ -333,14 +333,18 @@ def _settled_signals_of_log(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
     """Returns the readings of each channel of settled runs. If only an angle is measured, its rate."""
-    none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
+    no_angle, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
     signals = []
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
-            off = find_glitches(runs[c.column], levels, width, _step_of_instrument(runs, c, runs[c.column]), drift)
-            readings = np.where(off, np.nan, runs[c.column])
+            is_glitch = find_glitches(
+                runs[c.column], levels, width, _step_of_instrument(runs, c, runs[c.column]), drift
+            )
+            readings = np.where(is_glitch, np.nan, runs[c.column])
             signals.append(
-                Signal(c, readings, none, _step_of_instrument(runs, c, readings), _reading_size(readings), off)
+                Signal(
+                    c, readings, no_angle, _step_of_instrument(runs, c, readings), _reading_size(readings), is_glitch
+                )
             )
     have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
@@ -348,12 +352,14 @@ def _settled_signals_of_log(
             smoothed_values = np.full(len(runs), np.nan)
             readings = np.full(len(runs), np.nan)
             read = next(c for c in runs.channels if c.column == angle)
-            off = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
+            is_glitch = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
             for rows in each:
-                smoothed_values[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
+                smoothed_values[rows] = np.where(is_glitch[rows], np.nan, runs[angle][rows] * factor)
                 readings[rows] = _recent_rate(runs["time_s"][rows], smoothed_values[rows], half)
             signals.append(
-                Signal(channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), off)
+                Signal(
+                    channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), is_glitch
+                )
             )
     if not signals:
         raise BadData(f"{runs.source}: no channel has readings that can be used for settled runs")
@@ -391,17 +397,17 @@ def find_glitches(
         # A level is padded with its end values: if it were mirrored, a start would appear as a glitch.
         ends = np.full(pad, np.median(x[:PART])), np.full(pad, np.median(x[-PART:]))
         middle = median_filter(np.concatenate([ends[0], x, ends[1]]), size)[pad : pad + len(x)]
-        apart = np.abs(x - middle)
-        scatter = 1.4826 * median_filter(apart, min(5 * size, len(x)) | 1, mode="reflect")
+        deviation = np.abs(x - middle)
+        scatter = 1.4826 * median_filter(deviation, min(5 * size, len(x)) | 1, mode="reflect")
         grain = max(step, float(np.diff(np.unique(x)).min())) if np.ptp(x) > 0 else step  # coarse despite the file
         noise = FAR * np.maximum(scatter, grain)
         if drift is None:
-            off = apart > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
+            is_far = deviation > np.maximum(noise, 0.5 * size * np.median(np.abs(np.diff(x))))
         else:
             allowed = np.maximum(noise, np.maximum(drift * np.abs(middle), FINE * largest))
-            off = (apart > allowed) & (np.abs(middle) > STILL * largest)
-        off[:size] &= ~binary_opening(off[:size], np.ones(PART))
-        is_glitch[rows] = off
+            is_far = (deviation > allowed) & (np.abs(middle) > STILL * largest)
+        is_far[:size] &= ~binary_opening(is_far[:size], np.ones(PART))
+        is_glitch[rows] = is_far
     return is_glitch
 
 
@@ -425,8 +431,8 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
 def _recent_rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
     """Rate over the last `2 * half` samples, so that samples after a level do not affect its end."""
     k = np.arange(len(x))
-    before, now = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
-    return (x[now] - x[before]) / (time[now] - time[before])
+    first_row, last_row = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
+    return (x[last_row] - x[first_row]) / (time[last_row] - time[first_row])
 
 
 def _check_alive(runs: Runs, signal: Signal) -> None:
@@ -449,13 +455,13 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
         return is_stuck
     for rows in each:
         readings = signal.shown[rows]
-        same = np.diff(readings) == 0
-        if not len(same) or same.mean() > CHANCE:
+        repeats = np.diff(readings) == 0
+        if not len(repeats) or repeats.mean() > CHANCE:
             limits = (np.nanmin(readings), np.nanmax(readings))  # coarse steps, or at its limit
-            inside = same & ~np.isin(readings[1:], limits)
-            if not len(same) or inside.mean() > CHANCE:
+            repeats_inside = repeats & ~np.isin(readings[1:], limits)
+            if not len(repeats) or repeats_inside.mean() > CHANCE:
                 continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], repeats.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
             if high - low >= STUCK and readings[low] != 0:
                 is_stuck[rows[low : high + 1]] = True
@@ -567,11 +573,12 @@ def _settled_end(
     ends = [(s, *finite_means[s.channel.name][:2]) for s in moving]
     if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
-    acting = inertia.get(str(runs["configuration"][rows[0]]))
+    inertia_of_configuration = inertia.get(str(runs["configuration"][rows[0]]))
     lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
     if (
-        acting is not None
-        and (accelerates := _acceleration_reason(acting, finite_means, lasts, imposed, drift)) is not None
+        inertia_of_configuration is not None
+        and (accelerates := _acceleration_reason(inertia_of_configuration, finite_means, lasts, imposed, drift))
+        is not None
     ):
         return out(*accelerates)
     values_by_channel = {s.channel.name: finite_means.get(s.channel.name, (math.nan,) * 3) for s in signals}
@@ -593,10 +600,10 @@ def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, s
     shorter parts drift less.
     """
     parts = _level_parts(time[rows], shortest)
-    first = _first_steady(signals, rows, parts, drift)
-    last = max(len(parts) - 3, first)
+    first_part = _first_steady(signals, rows, parts, drift)
+    last_part = max(len(parts) - 3, first_part)
     ends: list[tuple[float, _End]] = []
-    for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
+    for k in sorted({first_part, *np.linspace(first_part, last_part, TRIES).astype(int).tolist()}):
         end_rows = rows[parts[k][0] :]
         end_means = {s.channel.name: _segment_mean(s, time[end_rows], end_rows) for s in signals}
         left_over = max(_certain_change(s, *end_means[s.channel.name]) for s in signals)
@@ -671,16 +678,18 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
     quarters = [q[np.isfinite(q)] for q in quarters]
     if min(map(len, quarters)) < PART:
         return 0.0
-    first, before, last = np.diff([float(np.mean(q)) for q in quarters]).tolist()
+    first_change, middle_change, last_change = np.diff([float(np.mean(q)) for q in quarters]).tolist()
     place = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
-    rest = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
-    standard_error = SDS * math.sqrt(2 * _correlation_time(rest) / len(rest)) * float(np.std(rest))
-    earlier, later = (before, last) if abs(last) >= standard_error else (first, before)
+    noise = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
+    standard_error = SDS * math.sqrt(2 * _correlation_time(noise) / len(noise)) * float(np.std(noise))
+    earlier, later = (
+        (middle_change, last_change) if abs(last_change) >= standard_error else (first_change, middle_change)
+    )
     if abs(later) < standard_error or earlier * later <= 0:
         return 0.0
     fades = min(later / earlier, 0.9)
-    last = abs(last) if abs(last) >= standard_error else min(abs(later) * fades, standard_error)
-    return last * fades / (1 - fades) / _scale_of(signal, mean)
+    last_change = abs(last_change) if abs(last_change) >= standard_error else min(abs(later) * fades, standard_error)
+    return last_change * fades / (1 - fades) / _scale_of(signal, mean)
 
 
 def _reading_size(shown: np.ndarray) -> float:
@@ -706,20 +715,20 @@ def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
 def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
     """First part from which on every channel's mean stays at its final value."""
     ends = parts[-3:]
-    first = len(parts) - len(ends)
+    first_part = len(parts) - len(ends)
     means = np.array([[_plain(s.shown[rows[low:high]]) for low, high in parts] for s in signals])
     tail = np.array([_plain(s.shown[rows[ends[0][0] :]]) for s in signals])
     noise = np.array([_noise_of_mean(s, rows, ends) for s in signals])
     large = np.array([s.largest for s in signals])
     tolerance = np.maximum(0.5 * drift * np.abs(tail), FINE * large)
-    for k in range(first - 1, -1, -1):
-        apart = np.abs(means[:, k] - tail)
+    for k in range(first_part - 1, -1, -1):
+        difference = np.abs(means[:, k] - tail)
         count = parts[k][1] - parts[k][0]
         scatter = noise * math.sqrt(1 / max(count, 1) + 1 / (len(rows) - ends[0][0]))
-        if np.any(apart > tolerance + SDS * scatter):
+        if np.any(difference > tolerance + SDS * scatter):
             break
-        first = k
-    return first
+        first_part = k
+    return first_part
 
 
 def _plain(x: np.ndarray) -> float:
@@ -745,11 +754,11 @@ def _correlation_time(x: np.ndarray) -> float:
     power = float(np.mean(x**2))
     if len(x) < 4 or power <= 0:
         return 1.0
-    most = min(len(x) // 3, 500)
-    wide = np.fft.rfft(x, 2 * len(x))
-    rho = np.fft.irfft(np.abs(wide) ** 2)[:most] / (len(x) * power)
+    longest_lag = min(len(x) // 3, 500)
+    spectrum = np.fft.rfft(x, 2 * len(x))
+    rho = np.fft.irfft(np.abs(spectrum) ** 2)[:longest_lag] / (len(x) * power)
     total = 1.0
-    for k in range(1, most - 1, 2):
+    for k in range(1, longest_lag - 1, 2):
         pair = rho[k] + rho[k + 1]
         if pair <= 0:
             break
@@ -767,19 +776,21 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
     if len(signal.angle):
         angle = signal.angle[rows][finite]
         slope = float(t @ (angle - angle.mean()) / (t @ t))
-        rest = angle - angle.mean() - slope * t
-        sd = math.sqrt(float(np.mean(rest**2)) * _correlation_time(rest) / float(t @ t))
+        residual = angle - angle.mean() - slope * t
+        sd = math.sqrt(float(np.mean(residual**2)) * _correlation_time(residual) / float(t @ t))
         bend = float(t @ (x - x.mean()) / (t @ t))
         return slope, max(sd, 1e-9 * abs(slope)), bend * float(np.ptp(t))
     mean = float(x.mean())
     slope = float(t @ (x - mean) / (t @ t))
-    rest = x - mean - slope * t
-    spread = float(np.std(rest))
-    sd = spread * math.sqrt(_correlation_time(rest) / len(x))
+    residual = x - mean - slope * t
+    spread = float(np.std(residual))
+    sd = spread * math.sqrt(_correlation_time(residual) / len(x))
     if signal.step > 0:  # without noise all readings round the same way; noise makes the error of their mean smaller
         # Two readings do not show how often noise moves one to the other.
-        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
-        rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
+        noise_in_steps = (
+            max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
+        )
+        rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * noise_in_steps) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
 
@@ -848,14 +859,14 @@ def _check_signs(found: Settled) -> None:
     layout, runs = found.runs.layout, found.runs
     for signal in (s for s in found.signals if runs.turns_round(s.channel)):
         channel = signal.channel
-        least = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
-        clear = [s for s in found.kept if abs(s.mean[channel.name]) > least[id(s)]]
-        back, ahead = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
-        wrong = [s for s in ahead if s.mean[channel.name] < 0]
-        is_reversed = bool(wrong) and len(wrong) == len(ahead)
-        if back and all(s.mean[channel.name] > 0 for s in back) and not is_reversed:
+        smallest_signed = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
+        clear = [s for s in found.kept if abs(s.mean[channel.name]) > smallest_signed[id(s)]]
+        backward, forward = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
+        wrong = [s for s in forward if s.mean[channel.name] < 0]
+        is_reversed = bool(wrong) and len(wrong) == len(forward)
+        if backward and all(s.mean[channel.name] > 0 for s in backward) and not is_reversed:
             raise BadData(
-                f"{_place_text(found, back[0], channel)}; expected readings with their signs, negative in "
+                f"{_place_text(found, backward[0], channel)}; expected readings with their signs, negative in "
                 f"reverse; or set [instruments.{channel.name}] signed = false in the rig's file, if it shows "
                 "only the magnitude"
             )
@@ -888,23 +899,18 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
         for one, other in ((a, b) for k, a in enumerate(turns) for b in list(turns)[k + 1 :]):
             if not (turns[one] > 0 and turns[other] > 0):
                 continue
-            off = turns[one] / turns[other]
-            unit = next((word for word, x in UNITS.items() if abs(math.log(off / x)) < NEAR), None)
+            ratio = turns[one] / turns[other]
+            unit = next((word for word, x in UNITS.items() if abs(math.log(ratio / x)) < NEAR), None)
             if unit is not None:
-                column = (
-                    angles[one] if one in angles and not _direct(runs, one) else channels.find_channel(one).column
-                )
+                column = channels.find_channel(one).column
+                if one in angles and not runs.has(column):
+                    column = angles[one]
                 raise BadData(
-                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times the value "
+                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {ratio:.4g} times the value "
                     f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
                     f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
-                    f"{{column = ..., factor = {1 / off:.3g}}} in the rig's file"
+                    f"{{column = ..., factor = {1 / ratio:.3g}}} in the rig's file"
                 )
-
-
-def _direct(runs: Runs, channel: str) -> bool:
-    """True if a channel is read directly instead of from the rate of an angle."""
-    return runs.has(channels.find_channel(channel).column)
 
 
 def _nothing_settled_message(found: Settled, loop: str) -> str:
@@ -942,7 +948,7 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
             f"needs at least {FEWEST}; {direct}log them more often"
         )
     imposed = found.runs.layout.imposed_column
-    others = {
+    message_of_reason = {
         "idle": f"{imposed} is about zero, so nothing drives the motors. Log rows in which they are driven, or, if "
         "another column has the command, name that one under [columns] in the rig file",
         "rest": "no level shows motion above the noise. Use larger commands",
@@ -952,7 +958,7 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
         "mean",
         "undriven": "the driver brakes or coasts in every row. Log rows in which it drives the motors",
     }
-    return f"{source} {rows}, no settled segment: {others[why]}"
+    return f"{source} {rows}, no settled segment: {message_of_reason[why]}"
 
 
 # --- properties of the robot that settling needs ---
@@ -965,8 +971,8 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
     """
     readings = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
-        none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
-        state = State(none, jnp.ones(()), jnp.asarray(turns), none)
+        zero, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
+        state = State(zero, jnp.ones(()), jnp.asarray(turns), zero)
         speeds = {c.name: _reading(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
         readings[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
     return readings
@@ -975,12 +981,12 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, if known."""
     constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
-    found = {}
+    inertias = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         at_motor = inertia_at_motor(robot, load)
-        none, one = jnp.zeros(()), jnp.ones(())
+        zero, one = jnp.zeros(()), jnp.ones(())
         rolling = float(load.radius) / ratio
-        states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
+        states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)  # of 1 A, and of 1 rad/s
         currents, speeds = (
             {c.name: _reading(robot, k, c, state) for c in settled_channels(robot)} for state in states
         )
@@ -990,8 +996,8 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
         currents[""] = 1.0  # of the imposed one
         if is_known and speed and at_motor > 0 and constant > 0:
             per_rate = at_motor / constant * currents[current] / speeds[speed]
-            found[name] = Inertia(speed, current, per_rate, least=1e-3)
-    return found
+            inertias[name] = Inertia(speed, current, per_rate, least=1e-3)
+    return inertias
 
 
 def _reading(robot: Robot, configuration: int, channel: Channel, state: State) -> float:

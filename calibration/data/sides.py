@@ -63,9 +63,9 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
         )
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
-    beyond = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
-    if beyond.any():
-        side, row = (int(k[0]) for k in np.nonzero(beyond))
+    exceeds_supply = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
+    if exceeds_supply.any():
+        side, row = (int(k[0]) for k in np.nonzero(exceeds_supply))
         raise BadData(
             f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
             f"expected no more than {SUPPLY}, or remove that column: the larger of the two side voltages is then "
@@ -113,16 +113,16 @@ def _refuse_against(
     Args:
         shown: values of the columns in every row.
     """
-    told = np.isfinite(readings) & (np.abs(drive) > CLEAR * np.max(np.abs(drive), initial=0.0))
-    against = told & (readings * drive < 0)
-    if told.sum() < FEWEST or against.sum() <= MOSTLY * told.sum():
+    counts = np.isfinite(readings) & (np.abs(drive) > CLEAR * np.max(np.abs(drive), initial=0.0))
+    against = counts & (readings * drive < 0)
+    if counts.sum() < FEWEST or against.sum() <= MOSTLY * counts.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
     got, at = (" and ".join(f"{float(f'{x[row]:.4g}'):g}" for x in sides) for sides in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
         f"{runs.source} row {row + 1}, {column}: got {got} although the left and right sides are driven at {at} "
-        f"{unit} (as in {against.sum()} of {told.sum()} rows); expected {expected}"
+        f"{unit} (as in {against.sum()} of {counts.sum()} rows); expected {expected}"
     )
 
 
@@ -140,7 +140,7 @@ def unsigned_current_channels(columns: Columns, layout: Layout) -> tuple[Instrum
         channel = channels.find_channel(f"motor_current_{side}")
         if channel.column in columns:
             readings = columns[channel.column]
-            back = np.isfinite(readings) & (drive < -CLEAR * np.max(np.abs(drive)))
-            if back.sum() >= FEWEST - 1 and (readings[back] > 0).all() and not (readings < 0).any():
+            is_backward = np.isfinite(readings) & (drive < -CLEAR * np.max(np.abs(drive)))
+            if is_backward.sum() >= FEWEST - 1 and (readings[is_backward] > 0).all() and not (readings < 0).any():
                 unsigned.append(Instrument(channel.name, signed=False))
     return tuple(unsigned)

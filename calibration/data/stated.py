@@ -92,8 +92,8 @@ def example_numbers(text: str) -> dict[str, str]:
 
 def example_sd(value: float, sd: float) -> float:
     """Sd of an example number that was not replaced. Exact numbers stay exact."""
-    least = EXAMPLE_SHARE * abs(value) or EXAMPLE_ZERO * sd
-    return max(sd, float(f"{least:.12g}")) if sd else 0.0
+    smallest_sd = EXAMPLE_SHARE * abs(value) or EXAMPLE_ZERO * sd
+    return max(sd, float(f"{smallest_sd:.12g}")) if sd else 0.0
 
 
 @functools.cache

@@ -73,10 +73,10 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
         ]
         if not own_names or (len(labels) == 1 and not present) or (configuration not in members and not present):
             continue
-        stays = configuration in members and len(own_names) < len(labels)
+        is_kept = configuration in members and len(own_names) < len(labels)
         pattern = members[configuration] if configuration in members else members[present[0]]
         names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own_names))
-        if configuration in members and not stays:  # replaces the configuration
+        if configuration in members and not is_kept:  # replaces the configuration
             members = {
                 n: m for key, value in members.items()
                 for n, m in (
@@ -85,7 +85,7 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
             }  # fmt: skip
         else:
             members |= {n: members.get(n, pattern) for n in names}
-        first = configuration if stays else names[0]
+        first = configuration if is_kept else names[0]
         leaders |= {n: first for n in names if n != first}
     rig = dataclasses.replace(robot.rig, surfaces=tuple(leaders.items()))
     with_surfaces = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
@@ -116,11 +116,11 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
     """
     names_found: list[str] = []
     for name in names:
-        configuration, _, rest = name.partition(".")
-        gone = configuration not in robot.configurations and configuration in (
+        configuration, _, key = name.partition(".")
+        is_replaced = configuration not in robot.configurations and configuration in (
             runs["configuration"] if runs.has("surface") else ()
         )
-        if not gone:
+        if not is_replaced:
             names_found.append(name)
             continue
         surface_names = runs["surface"][runs["configuration"] == configuration]
@@ -129,5 +129,5 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
             for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in surface_names)
             if n in robot.configurations
         ]
-        names_found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]
+        names_found += [f"{n}.{key}" for n in (on if key.startswith((GROUND, "*")) else on[:1])]
     return names_found

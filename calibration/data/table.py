@@ -117,8 +117,8 @@ class Runs:
                 "read the table with robot=, set to this robot"
             )
         own_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
-        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
-        remaining_columns = {name: values for name, values in self.columns.items() if name in others}
+        other_columns = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
+        remaining_columns = {name: values for name, values in self.columns.items() if name in other_columns}
         return dataclasses.replace(
             self,
             columns={name: values for name, values in self.columns.items() if name not in remaining_columns},
@@ -229,9 +229,9 @@ class Runs:
         for name in np.unique(names):
             rows = names == name
             if name not in robot.configurations:
-                first = int(np.flatnonzero(rows)[0]) + 1
+                first_row = int(np.flatnonzero(rows)[0]) + 1
                 raise BadData(
-                    f"{self.source} row {first}, configuration: got {name}; expected one of these; "
+                    f"{self.source} row {first_row}, configuration: got {name}; expected one of these; "
                     f"{allowed_words(str(name), robot.configurations)}"
                 )
             configuration_index[rows] = robot.configurations.index(str(name))
@@ -286,8 +286,8 @@ class Runs:
             c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)
         }
         set_values["duty"] = np.where(is_undriven, 0.0, set_values.get("duty", 1.0))
-        follows = imposed and not robot.rig.follows_goal
-        set_values["voltage"] = np.zeros(len(self)) if battery or follows else self[SUPPLY]
+        sets_motor_speed = imposed and not robot.rig.follows_goal
+        set_values["voltage"] = np.zeros(len(self)) if battery or sets_motor_speed else self[SUPPLY]
         if robot.rig.follows_goal:
             set_values["goal"] = self[column] * factor
         elif imposed:

@@ -60,9 +60,9 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
     if names is None:
         either = ", or ".join(" and ".join(names) for names in wanted)
         raise BadData(f"{path.name}: got columns {', '.join(header) or 'none'}; expected {either}")
-    for others in wanted:
-        if conflicting := [name for name in others if name in header and name not in names]:
-            ours = ", ".join(name for name in names if name not in others)
+    for other_names in wanted:
+        if conflicting := [name for name in other_names if name in header and name not in names]:
+            ours = ", ".join(name for name in names if name not in other_names)
             raise BadData(
                 f"{path.name}: got columns {', '.join(conflicting)} and {ours}; expected one kind, remove the other"
             )
@@ -94,18 +94,22 @@ def read_terrain(path: Path) -> Terrain:
         outline = terrain.polyline(x - x[0], z - z[0])
     except ValueError as error:
         raise BadData(f"{path.name}: {error}") from error
-    across, up = np.abs(np.diff(x)), np.abs(np.diff(z))
-    largest, wall = max(np.ptp(x), np.ptp(z)), np.max(up, where=up > across, initial=0.0)
+    across, rise = np.abs(np.diff(x)), np.abs(np.diff(z))
+    largest, wall = max(np.ptp(x), np.ptp(z)), np.max(rise, where=rise > across, initial=0.0)
     if SMALLEST <= largest <= LARGEST and wall <= WALL:
         return outline
-    wrong, other, word = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm", "millimetres"
+    fault, other, other_unit = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm", "millimetres"
     if largest < SMALLEST:
-        wrong, other, word = f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm", "m", "metres"
+        fault, other, other_unit = (
+            f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm",
+            "m",
+            "metres",
+        )
     elif largest <= LARGEST:
-        wrong = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
+        fault = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
     # too small in mm, or too large in m
-    hint = "" if other == unit else f"; is the file in {word}? Then name its columns x_{other} and z_{other}"
-    raise BadData(f"{path.name}: {wrong}{hint}")
+    hint = "" if other == unit else f"; is the file in {other_unit}? Then name its columns x_{other} and z_{other}"
+    raise BadData(f"{path.name}: {fault}{hint}")
 
 
 def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> LeverSequence:
@@ -150,12 +154,12 @@ def lever_start_refusal(robot: Robot, angle: float) -> str:
     """Reason why levers cannot begin at an angle [deg] on level ground, empty if they can."""
     gear = robot.running_gear
     axle = robot.radius_pulley + gear.grouser_height
-    above = float(roller_clearance(axle, gear, jnp.radians(angle)))
-    if above >= -ON_GROUND:
+    clearance = float(roller_clearance(axle, gear, jnp.radians(angle)))
+    if clearance >= -ON_GROUND:
         return ""
     least = -float(np.degrees(np.arcsin((axle - gear.levers.roller) / gear.lever_length)))
     return (
-        f"at {angle:.4g} deg they begin {-1000 * above:.0f} mm below the ground; expected at least {least:.1f} "
+        f"at {angle:.4g} deg they begin {-1000 * clearance:.0f} mm below the ground; expected at least {least:.1f} "
         "deg, at which they touch it (a sequence may press them down later)"
     )
 
@@ -164,5 +168,5 @@ def lever_angle_refusal(robot: Robot, angle: float) -> str:
     """Reason why levers cannot reach an angle [deg], empty if they can."""
     levers = robot.running_gear.levers
     least, most = (float(np.degrees(np.asarray(x))) for x in (levers.angle_least, levers.angle_most))
-    within = least - 1e-6 <= angle <= most + 1e-6
-    return "" if within else f"got {angle:g} deg; expected {least:.4g} to {most:.4g} deg, the range of the levers"
+    is_within = least - 1e-6 <= angle <= most + 1e-6
+    return "" if is_within else f"got {angle:g} deg; expected {least:.4g} to {most:.4g} deg, the range of the levers"

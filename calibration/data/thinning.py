@@ -55,14 +55,14 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
         )
     if len(runs) <= most:
         return runs
-    apart, kept_rows = -(-len(runs) // most), []
+    rows_per_kept, kept_rows = -(-len(runs) // most), []
     read = np.isfinite(runs.measured())
     if runs.sampled:
         ordered = list(runs.rows_by_run().values())
     else:
         ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
     for rows in ordered:
-        kept_rows.append(rows[_evenly_spaced_rows(read[rows], apart)])
+        kept_rows.append(rows[_evenly_spaced_rows(read[rows], rows_per_kept)])
     return dataclasses.replace(runs.where(np.sort(np.concatenate(kept_rows))), log=runs.whole)
 
 

@@ -28,19 +28,19 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
         return runs
     columns, notes = dict(runs.columns), list(runs.notes)
     drive = runs[SUPPLY] * (runs["duty"] if runs.has("duty") else 1.0)
-    beyond = _beyond_limit(runs, np.abs(drive))
-    unread = _turning_mask(runs, robot, drive) & ~beyond
+    is_limited = _beyond_limit(runs, np.abs(drive))
+    unread = _turning_mask(runs, robot, drive) & ~is_limited
     for channel in (c for c in runs.channels if runs.has(c.column)):
         not_read = unread & (runs[channel.column] == 0) & channel.zero_at_rest
-        columns[channel.column] = np.where(beyond | not_read, np.nan, runs[channel.column])
+        columns[channel.column] = np.where(is_limited | not_read, np.nan, runs[channel.column])
         if not_read.any():
             rows = rows_text(np.flatnonzero(not_read).tolist(), *SHOWN)
             notes.append(
                 f"{runs.source}, {channel.column}: 0 in {rows} although the current is that of a turning motor. "
                 "These readings are treated as missing"
             )
-    if beyond.any():
-        rows = rows_text(np.flatnonzero(beyond).tolist(), *SHOWN)
+    if is_limited.any():
+        rows = rows_text(np.flatnonzero(is_limited).tolist(), *SHOWN)
         notes.append(
             f"{runs.source}, {rows}: the readings no longer change while the command rises, so the supply or the "
             "driver is at a limit. These rows are set aside"
@@ -70,21 +70,23 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
     If the supply voltage falls over them, the supply is at its limit in all of them. Otherwise the smallest of these
     commands may just reach the limit.
     """
-    beyond = np.zeros(len(runs), bool)
+    is_limited = np.zeros(len(runs), bool)
     command, supply = (np.abs(runs["duty"]), np.abs(runs[SUPPLY])) if runs.has("duty") else (drive, drive)
-    drawn = [runs["total_current_A"][:, None]] if runs.has("total_current_A") else []
-    others = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
-    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in others):
-        return beyond
+    supply_current = [runs["total_current_A"][:, None]] if runs.has("total_current_A") else []
+    other_conditions = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
+    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in other_conditions):
+        return is_limited
     order = np.argsort(-command, kind="stable")
-    for shown in (np.abs(x)[order] for x in (*drawn, runs.measured())):
-        same = np.all(np.isnan(shown) | (np.abs(shown - shown[0]) <= ALIKE * np.abs(shown[0])), axis=1)
-        top = order[: int(np.argmin(same))]
+    for magnitudes in (np.abs(x)[order] for x in (*supply_current, runs.measured())):
+        is_equal = np.all(
+            np.isnan(magnitudes) | (np.abs(magnitudes - magnitudes[0]) <= ALIKE * np.abs(magnitudes[0])), axis=1
+        )
+        top = order[: int(np.argmin(is_equal))]
         levels = np.unique(command[top])
-        if len(levels) < 2 or levels[-1] < RISE * levels[0] or not np.isfinite(shown[0]).any():
+        if len(levels) < 2 or levels[-1] < RISE * levels[0] or not np.isfinite(magnitudes[0]).any():
             continue
         if supply[top].min() < (1 - FALLS) * supply[top].max() and supply[top[0]] == supply[top].min():
-            beyond[top] = True
+            is_limited[top] = True
         elif len(levels) > 2 and drive[top].max() > RISE * drive[top].min():
-            beyond[top[command[top] > levels[0]]] = True
-    return beyond
+            is_limited[top[command[top] > levels[0]]] = True
+    return is_limited

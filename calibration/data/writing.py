@@ -140,25 +140,25 @@ def replacing(path: Path) -> Iterator[Path]:
         with naming_file(path):
             yield path
         return
-    aside = path.with_name(f".{path.stem[:100]}.writing{path.suffix}")
+    temporary = path.with_name(f".{path.stem[:100]}.writing{path.suffix}")
     try:
         with naming_file(path):
-            yield aside
+            yield temporary
             if path.exists():
-                shutil.copymode(path, aside)
-            aside.replace(path)
+                shutil.copymode(path, temporary)
+            temporary.replace(path)
     except OSError as error:
-        if error.filename == str(aside):
+        if error.filename == str(temporary):
             error.filename = str(path)
         raise
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
     """Writes a text file."""
-    with replacing(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -197,9 +197,9 @@ def write_table(path: Path, columns: Columns, tables: str = "csv") -> None:
     if tables == "parquet":
         from pyarrow import parquet
 
-        with replacing(path.with_suffix(".parquet")) as aside:
-            parquet.write_table(to_arrow(columns), aside)
-    with replacing(path) as aside, aside.open("w", newline="", encoding="utf-8") as stream:
+        with replacing(path.with_suffix(".parquet")) as temporary:
+            parquet.write_table(to_arrow(columns), temporary)
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         _write_rows(stream, columns)
 
 

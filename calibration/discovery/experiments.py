@@ -4,10 +4,11 @@ Alternatives are hypotheses that explain the same table equally well. Each predi
 with the covariance S = diag(sd²) + J C Jᵀ. The first term is the variance of the instruments. The second is, to first
 order, the covariance of the fitted coordinates. C = (JᵀJ)⁻¹ is over readings and priors of the table (Chaloner and
 Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). The separation of two alternatives A, B is
-√(dᵀ S⁻¹ d), d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for discriminating
-between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ,
-where σ is their separation. So the probability that the false one is refuted is Φ((σ² - refuted) / 2σ). The proposal
-is expected to separate most of all pairs. If one experiment is not enough, two are proposed.
+√(dᵀ S⁻¹ d), d = y_A - y_B. Of S for A and S for B, the one with the smaller separation is used (Hunter and Reiner,
+Designs for discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the
+other is larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is Φ((σ² -
+refuted) / 2σ). The proposal is expected to separate most of all pairs. If one experiment is not enough, two are
+proposed.
 """
 
 from __future__ import annotations

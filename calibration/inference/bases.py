@@ -153,19 +153,19 @@ def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
-    """Balances of `among` that a robot has. For None, all of them."""
+    """Balances of `among` that a robot has. None: all of them."""
     if robot is None:
         return tuple(among)
     return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot. For None, those of the packaged robot."""
+    """Channels of a robot. None: those of the packaged robot."""
     return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> Names:
-    """Columns of conditions over which a robot's curves are defined. For None, those of the packaged robot."""
+    """Columns of conditions over which a robot's curves are defined. None: those of the packaged robot."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
@@ -179,7 +179,7 @@ class CurveScope:
 
     @classmethod
     def of(cls, robot: Robot | None) -> CurveScope:
-        """All balances and conditions of a robot that travels straight. For None, of the packaged robot."""
+        """All balances and conditions of a robot that travels straight. None: those of the packaged robot."""
         return cls(balances_of(robot), axes_of(robot))
 
     def over(self, columns: Columns) -> CurveScope:
@@ -266,8 +266,10 @@ def condition_polynomials(
     """Polynomials in all conditions, for each configuration. Arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
-    along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
-    spans = [scale_to_unit_range(x, weight) for x in along]
+    values_in_travel = (
+        in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes
+    )
+    spans = [scale_to_unit_range(x, weight) for x in values_in_travel]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)
@@ -336,9 +338,9 @@ def window_families(
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
-                first = low + k * size / 2
-                inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
-                offered.append((axis, x, counts & inside & (not sorted_runs)))
+                window_start = low + k * size / 2
+                is_inside = (x >= window_start) & ((x < window_start + size) | (k == round(2 / share) - 2))
+                offered.append((axis, x, counts & is_inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
             continue
@@ -349,9 +351,9 @@ def window_families(
         offered += [(condition, x, counts & (x == level)) for level in levels]
         offered += [(condition, x, np.zeros_like(counts))] * (MOST_LEVELS - len(levels))
     shapes = [
-        (inside.astype(float), str(Window(axis, float(x[inside].min()), float(x[inside].max()))))
-        for axis, x, inside in offered
-        if FEWEST <= inside.sum() <= 0.5 * counts.sum()
+        (is_inside.astype(float), str(Window(axis, float(x[is_inside].min()), float(x[is_inside].max()))))
+        for axis, x, is_inside in offered
+        if FEWEST <= is_inside.sum() <= 0.5 * counts.sum()
     ]
     if not shapes:
         return ()
@@ -392,13 +394,13 @@ def order_collinearity(
         return 1.0
     _, configuration = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
     conditions = (*(axes_of(None) if axes is None else axes), *(["duty"] if "duty" in columns else []))
-    others = [c for c in conditions if c != VARIABLES["slope"]]
-    values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
+    other_conditions = [c for c in conditions if c != VARIABLES["slope"]]
+    values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in other_conditions)], 1)
     _, group_index = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
-    _, cell = np.unique(values, axis=0, return_inverse=True)
-    few = cell.max() + 1 <= FEW_CELLS * len(x)
+    _, cell_index = np.unique(values, axis=0, return_inverse=True)
+    few = cell_index.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
-    level = cell.ravel() if few else group_index.ravel()
+    level = cell_index.ravel() if few else group_index.ravel()
     spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
     polynomials = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
     for span in spans:  # a sorted table's order is the rank

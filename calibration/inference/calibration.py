@@ -335,9 +335,11 @@ def _search(
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, best_member)
     tell(progress_remark("derivatives"))
-    about = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
-    off = population.unreliable_derivatives(posed, members, everyone.z[best_member], about.jacobian, about.sd)
-    names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
+    identifiability_there = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
+    unreliable = population.unreliable_derivatives(
+        posed, members, everyone.z[best_member], identifiability_there.jacobian, identifiability_there.sd
+    )
+    names = tuple(n for n, apart in zip(posed.coordinates.names, unreliable, strict=True) if apart)
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
     edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
     searched = population.PopulationSearch(everyone, best_member, names, slope, left, edge)

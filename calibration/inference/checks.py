@@ -151,7 +151,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
         x, y = np.asarray(runs[one.column], float), np.asarray(runs[other.column], float)
         if (line := line_through(x, y)) is not None:
             copies.add(other.name)
-            same = one.unit_si == other.unit_si
+            same_unit = one.unit_si == other.unit_si
             copied.append(
                 Remark(
                     "copied",
@@ -160,7 +160,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
                     other=one.column,
                     intercept=line[0],
                     slope=line[1],
-                    tied=same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest),
+                    tied=same_unit or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest),
                 )
             )
     return copied
@@ -196,8 +196,8 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
     remarks += [*unused_notes(runs), *unexplained_torque_notes(runs)]
     remarks += check_ranges(runs, robot)
     if not (runs.sampled or runs.turns):
-        same = nothing_varies(runs, robot, noise)
-        remarks += [same] if same is not None else copied_channels(runs, robot)
+        constant_conditions = nothing_varies(runs, robot, noise)
+        remarks += [constant_conditions] if constant_conditions is not None else copied_channels(runs, robot)
     return [*remarks, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
 
 
@@ -247,10 +247,10 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
         if is_complete
         else f"{count_noun(readings, 'reading')} in {rows}"
     )
-    least = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
+    needed_words = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
     problem_words = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(
-        f"{runs.source}: {have} {problem_words}; at least {least} are needed{f', or {cure}' if names else ''}"
+        f"{runs.source}: {have} {problem_words}; at least {needed_words} are needed{f', or {cure}' if names else ''}"
     )
 
 

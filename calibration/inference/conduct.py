@@ -48,10 +48,16 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     for k, channel in enumerate(runs.channels):
         squares = np.nan_to_num(off[:, k]) ** 2
         sums = {rows.tobytes(): (float(squares[rows].sum()), int(rows.sum())) for rows in both}
-        most, count = max(sums.values())
-        if 0 < count <= FEW_ROWS * len(runs) and most >= MOST_ERROR * squares.sum() > 0:
+        largest_sum, count = max(sums.values())
+        if 0 < count <= FEW_ROWS * len(runs) and largest_sum >= MOST_ERROR * squares.sum() > 0:
             notes.append(
-                Remark("after_steps", channel=channel.name, share=most / squares.sum(), rows=count, total=len(runs))
+                Remark(
+                    "after_steps",
+                    channel=channel.name,
+                    share=largest_sum / squares.sum(),
+                    rows=count,
+                    total=len(runs),
+                )
             )
     return notes or _time_shift_remarks(runs, off)
 
@@ -95,8 +101,10 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
     measured = np.isfinite(speed)
     slow = measured & np.isfinite(steady) & (speed < SLOW * steady)
     early = (lasts < UNDER_WAY) & (slow | ~measured)
-    slides = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
-    slides &= ~np.isin(names, runs.run_names[rows_of_varying_runs(runs)])  # their settled ends are only parts of them
+    is_sliding = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
+    is_sliding &= ~np.isin(
+        names, runs.run_names[rows_of_varying_runs(runs)]
+    )  # their settled ends are only parts of them
     remarks: list[Remark] = []
     if early.any():
         slow_and_early = slow & early
@@ -108,10 +116,10 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
         remarks.append(
             Remark("ends_early", runs=_run_names(names, early), lasts=float(lasts[early].max()), share=share)
         )
-    if slides.any():
-        share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
-        remarks.append(Remark("never_grips", runs=_run_names(names, slides), share=share))
-    if slides.any() and (slides | early).all():
+    if is_sliding.any():
+        share = max(float(np.median(speed[is_sliding] / movers[is_sliding])), 0.0)
+        remarks.append(Remark("never_grips", runs=_run_names(names, is_sliding), share=share))
+    if is_sliding.any() and (is_sliding | early).all():
         remarks.append(Remark("no_grip"))
     return remarks
 

@@ -65,7 +65,6 @@ def parameter_estimates(
     point, sd = np.asarray(z), np.asarray(about.sd)
     value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
-    median = coordinates.value(np.zeros_like(point))
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
@@ -91,7 +90,7 @@ def parameter_estimates(
             meaning=fields[name].spec.meaning,
             prior=PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
-                float(median[k]),
+                float(coordinates.stated[k]),
                 _float_pair(wide[k]),
                 sources.get(name, fields[name].spec.source),
             ),
@@ -151,11 +150,11 @@ def hold_out_errors(
     percent, unreachable = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
-        inside = held.block == k
-        alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
+        is_in_block = held.block == k
+        values_of_block = [np.where(is_in_block[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = BlockErrors(
-            _channel_errors(posed.channels, alone[0], measured, sd, alone[1]),
-            _row_numbers(inside & unreachable),
+            _channel_errors(posed.channels, values_of_block[0], measured, sd, values_of_block[1]),
+            _row_numbers(is_in_block & unreachable),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
@@ -201,6 +200,6 @@ def chi_square(
 
 def condition_columns(observe: type[Observer], runs: Runs) -> Columns:
     """Columns that identify the rows: run, conditions, surface."""
-    others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
-    columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")
+    other_axes = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
+    columns = ("run_id", *other_axes, "configuration", *runs.axes, *DRIVING, "surface")
     return {column: runs[column] for column in columns if runs.has(column)}

@@ -164,17 +164,18 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     else:
         delay = 0.0
     if level:
-        most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
-        limited = Remark("feedforward_limit", level=level, current=most)
+        largest_current = None if log.current is None else float(np.nanmax(np.abs(log.current)))
+        limited = Remark("feedforward_limit", level=level, current=largest_current)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-    fitted_windows = _select_windows(windows, windows["demand"] < level) if level else windows
-    values, covariance, _ = _fit_constants(fitted_windows, mechanism)
+    if level:
+        windows = {key: x[windows["demand"] < level] for key, x in windows.items()}
+    values, covariance, _ = _fit_constants(windows, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
     spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
     if mechanism == "simple":
-        remarks += _direction_remarks(fitted_windows)
+        remarks += _direction_remarks(windows)
     remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
@@ -196,12 +197,12 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         remarks.append(Remark("feedforward_gains_delayed", delay=tolerances_used.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
     figures = {
-        "run": fitted_windows["run"],
-        "voltage_V": fitted_windows["u"] / fitted_windows["T"],
-        "velocity": fitted_windows["x"] / fitted_windows["T"],
-        "acceleration": fitted_windows["dv"] / fitted_windows["T"],
-        "direction": fitted_windows["s"] / fitted_windows["T"],
-        "quasistatic": fitted_windows["quasistatic"],
+        "run": windows["run"],
+        "voltage_V": windows["u"] / windows["T"],
+        "velocity": windows["x"] / windows["T"],
+        "acceleration": windows["dv"] / windows["T"],
+        "direction": windows["s"] / windows["T"],
+        "quasistatic": windows["quasistatic"],
     }
     return Feedforward(
         mechanism, log.unit, constants, spread, gains, tolerances_used, delay, lag, missing, figures, tuple(remarks)
@@ -298,22 +299,25 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
     """
     windows: list[dict[str, object]] = []
     step, speeds = _median_time_step(log), np.asarray(log.velocity)
-    least = MOVES * np.nanmax(np.abs(speeds))
+    smallest_speed = MOVES * np.nanmax(np.abs(speeds))
     count = max(FEWEST, round(WINDOW / step))
     for rows in _rows_of_runs(log):
         t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
         voltage_integral = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
         path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
         instants = t - delay
-        rests = not abs(v[0]) >= least  # a test begins without voltage
+        rests = not abs(v[0]) >= smallest_speed  # a test begins without voltage
         driven = np.interp(instants, t, voltage_integral) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
         driven += np.maximum(instants - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
         ramp = _is_ramp(_driven_voltages(u))
         for a in range(len(t) - count):
             b = a + count
-            inside = v[a : b + 1]
-            if np.any(np.sign(inside) != np.sign(inside[0])) or np.abs(inside).min() <= least:
+            speeds_inside = v[a : b + 1]
+            if (
+                np.any(np.sign(speeds_inside) != np.sign(speeds_inside[0]))
+                or np.abs(speeds_inside).min() <= smallest_speed
+            ):
                 continue
             length = t[b] - t[a]
             if length > 3 * WINDOW and length > 2 * count * step:
@@ -321,7 +325,7 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
             c, s = (length * np.mean(f(place[a : b + 1])) for f in (np.cos, np.sin))
             windows.append({
                 "run": log.run[rows[0]], "row": rows[a], "count": count, "u": driven[b] - driven[a],
-                "x": path[b] - path[a], "T": length, "s": np.sign(inside[0]) * length, "dv": v[b] - v[a],
+                "x": path[b] - path[a], "T": length, "s": np.sign(speeds_inside[0]) * length, "dv": v[b] - v[a],
                 "cos": c, "sin": s, "quasistatic": ramp,
             })  # fmt: skip
     keys = ("run", "row", "count", "u", "x", "T", "s", "dv", "cos", "sin", "quasistatic")
@@ -339,10 +343,6 @@ def _is_ramp(driven: np.ndarray) -> bool:
     return bool(len(size) and size.std() > 0.1 * size.mean())
 
 
-def _select_windows(windows: Columns, kept: np.ndarray) -> Columns:
-    return {key: x[kept] for key, x in windows.items()}
-
-
 def _regression_matrix(w: Columns, mechanism: str) -> np.ndarray:
     more = {"simple": (), "elevator": (w["T"],), "arm": (w["cos"], w["sin"])}[mechanism]
     return np.stack([w["u"], -w["s"], -w["x"], *(-x for x in more)], axis=1)
@@ -355,15 +355,15 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
     """
     matrix = _regression_matrix(w, mechanism)
     solved, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
-    rest = w["dv"] - matrix @ solved
+    acceleration_error = w["dv"] - matrix @ solved
     inverse = np.linalg.pinv(matrix.T @ matrix)
     leverage = np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
-    scored = matrix * (rest / np.maximum(1 - leverage, 0.05))[:, None]
+    scored = matrix * (acceleration_error / np.maximum(1 - leverage, 0.05))[:, None]
     middle = scored.T @ scored
     for lag in range(1, w["count"][0] + 1):  # weights of Newey and West (1987)
         near = (w["row"][lag:] - w["row"][:-lag] == lag) & (w["run"][lag:] == w["run"][:-lag])
-        beside = (scored[lag:] * near[:, None]).T @ scored[:-lag]
-        middle += (1 - lag / (w["count"][0] + 1)) * (beside + beside.T)
+        lagged_product = (scored[lag:] * near[:, None]).T @ scored[:-lag]
+        middle += (1 - lag / (w["count"][0] + 1)) * (lagged_product + lagged_product.T)
     spread = inverse @ middle @ inverse
     b, kA = solved[0], 1 / solved[0]
     names = [solved[1] / b, solved[2] / b, kA]
@@ -379,7 +379,7 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
         names = [*names, kG]
         jacobian = [*jacobian, (c * size[3] + s * size[4]) / kG - np.eye(len(solved))[0] * kG / b]
     derivatives = np.array(jacobian)
-    return np.array(names), derivatives @ spread @ derivatives.T, float(rest @ rest)
+    return np.array(names), derivatives @ spread @ derivatives.T, float(acceleration_error @ acceleration_error)
 
 
 def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
@@ -393,17 +393,17 @@ def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, C
     shifts = [*np.arange(-8, 8) / 8, *np.arange(2, 2 * LONGEST / step) / 2]
     for delay in step * np.array(sorted(shifts, key=abs)):
         windows = _motion_windows(log, float(delay))
-        plain = _fit_constants(windows, mechanism)[2]
+        misfit = _fit_constants(windows, mechanism)[2]
         level, bend, cost = _slope_change(windows, mechanism)
-        trials += [(plain, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
+        trials += [(misfit, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
     count = 0.5 * len(trials[0][2]["u"]) / trials[0][2]["count"][0]
 
     def penalised(trial: tuple[float, float, Columns, float, float]) -> float:
         cost, delay, _, level, bend = trial
         if level and abs(bend) < 0.3:
             return np.inf
-        late = CERTAIN if delay > LATE * step else 3.0 * (delay != 0)
-        return float(count * np.log(cost) + late + 2 * CERTAIN * (level > 0))
+        penalty = CERTAIN if delay > LATE * step else 3.0 * (delay != 0)
+        return float(count * np.log(cost) + penalty + 2 * CERTAIN * (level > 0))
 
     return min(trials, key=penalised)[1:]
 
@@ -413,7 +413,7 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
 
     A negative change is less acceleration (a current limit), a positive one more (slipping wheels). Sets `demand`.
     """
-    values, _, plain = _fit_constants(w, mechanism)
+    values, _, misfit = _fit_constants(w, mechanism)
     level, bend, cost, material = 0.0, 0.0, np.inf, False
     for _ in range(3):
         demanded_slope = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
@@ -421,8 +421,8 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
         trials = []
         for share in np.linspace(0.15, 0.9, 16):
             limit = share * w["demand"].max()
-            above = w["demand"] > limit
-            if above.sum() >= 3 and (~above).sum() >= WINDOWS:
+            above_limit = w["demand"] > limit
+            if above_limit.sum() >= 3 and (~above_limit).sum() >= WINDOWS:
                 hinge = np.sign(demanded_slope) * np.maximum(w["demand"] - limit, 0) * w["T"]
                 matrix = np.column_stack([_regression_matrix(w, mechanism), hinge])
                 slope = np.linalg.lstsq(matrix, w["dv"], rcond=None)[0]
@@ -430,8 +430,8 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
         if not trials:
             break
         cost, level, slope = min(trials, key=lambda x: x[0])
-        above = w["demand"] > level
-        material = plain - cost > LEAST**2 * np.sum(w["dv"][above] ** 2)
+        above_limit = w["demand"] > level
+        material = misfit - cost > LEAST**2 * np.sum(w["dv"][above_limit] ** 2)
         bend, values = float(slope[-1] / slope[0]), slope[1:] / slope[0]
     return level, bend, cost if material else np.inf
 
@@ -445,6 +445,6 @@ def _direction_remarks(w: Columns) -> Iterator[Remark]:
 
 def _battery_remarks(log: DriveLog) -> Iterator[Remark]:
     if log.battery is not None and np.isfinite(log.battery).any():
-        rest, low = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
-        if low < 0.9 * rest:
-            yield Remark("feedforward_sag", rest=rest, low=low)
+        highest, lowest = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
+        if lowest < 0.9 * highest:
+            yield Remark("feedforward_sag", rest=highest, low=lowest)

@@ -108,10 +108,10 @@ def predict_identifiability(
     posed = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
     z = jnp.zeros(len(names))
     observation = optimizers.observe_at(posed, z)
-    reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
+    is_reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
         np.asarray(observation.status)
     )
-    data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
+    data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(is_reached, float)[:, None])
     about = identifiability.analyse_identifiability(posed, z, data)
     is_prior_bound = identifiability.held_by_prior(about.sd)
     fields = priors.parameters_by_name(robot)
@@ -151,17 +151,19 @@ def _separating_columns(
     Each sample is assumed to have such a reading, and its sensitivity is simulated.
     """
     channels, rig = posed.base.channels, posed.base.rig
-    wide = dataclasses.replace(posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE)))
-    columns = {**{c.column: np.zeros(len(runs)) for c in wide.channels}, **runs.columns}
-    layout = dataclasses.replace(runs.layout, channels=wide.channels)
+    robot_with_all_channels = dataclasses.replace(
+        posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE))
+    )
+    columns = {**{c.column: np.zeros(len(runs)) for c in robot_with_all_channels.channels}, **runs.columns}
+    layout = dataclasses.replace(runs.layout, channels=robot_with_all_channels.channels)
     table = dataclasses.replace(runs, columns=columns, layout=layout)
-    sd = np.ones((len(runs), len(wide.channels)))
-    problem = observers.pose_problem(table, wide, posed.coordinates, sd)
-    found = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
-    shown, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in found)
+    sd = np.ones((len(runs), len(robot_with_all_channels.channels)))
+    problem = observers.pose_problem(table, robot_with_all_channels, posed.coordinates, sd)
+    linearised = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
+    readings, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in linearised)
     covariances = {}
-    for k, channel in enumerate(wide.channels):
-        size = channel.sd_share * np.sqrt(np.mean(shown[:, k] ** 2))
+    for k, channel in enumerate(robot_with_all_channels.channels):
+        size = channel.sd_share * np.sqrt(np.mean(readings[:, k] ** 2))
         if channel not in channels and size > 0:
             rows = np.concatenate([about.jacobian, slopes[:, k] / size, np.eye(len(about.sd))])
             covariances[channel.column] = np.linalg.inv(rows.T @ rows)

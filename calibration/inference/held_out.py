@@ -67,10 +67,10 @@ def hold_out_blocks(
         active: active effects, for a problem with slots.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
-    out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
+    masks_with_padding = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     active_sets = None if active is None else [active] * len(masks)
     optima, observations = fit_from_each_start(
-        problem, [start] * len(masks), [weight * ~m[:, None] for m in out], active_sets
+        problem, [start] * len(masks), [weight * ~m[:, None] for m in masks_with_padding], active_sets
     )
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
@@ -94,7 +94,7 @@ def predict_unseen(
     if not problem.observe.long:
         return hold_out_blocks(problem, start, masks, active)
     rows, start_values = len(masks[0]), np.asarray(start)
-    out = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
+    masks_with_padding = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
     data = problem.data
     residual, jacobian, observation = problem.observe.at(problem, start_values, active)
     residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
@@ -105,9 +105,9 @@ def predict_unseen(
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
     unreachable = problem.observe.unreachable(np.asarray(observation.status))
     reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
-    block, z = np.full(rows, -1), np.tile(start_values, (len(out), 1))
+    block, z = np.full(rows, -1), np.tile(start_values, (len(masks_with_padding), 1))
     promised = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
-    for k, mask in enumerate(out):
+    for k, mask in enumerate(masks_with_padding):
         kept_residuals = np.concatenate(
             [np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)]
         )
@@ -117,4 +117,4 @@ def predict_unseen(
         held_rows = mask[:rows]
         reading[held_rows] = np.where(unreachable[:, None], np.nan, read + per_unit @ step)[:rows][held_rows]
         status[held_rows], block[held_rows] = np.asarray(observation.status)[:rows][held_rows], k
-    return HeldOutFits(reading, status, block, z, np.ones(len(out), bool))
+    return HeldOutFits(reading, status, block, z, np.ones(len(masks_with_padding), bool))

@@ -195,8 +195,8 @@ def profile_likelihoods(
     centre, size = np.asarray(z), len(about.names)
     steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
     pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
-    along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
-    starts = centre + along[:, None, :] * (pinned - centre[:, None])[..., None]
+    direction_of = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
+    starts = centre + direction_of[:, None, :] * (pinned - centre[:, None])[..., None]
     pinned_names = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     pins = Pin(jnp.asarray(pinned_names.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
     profiles = _profiles(problem, data, pins.at, pins)

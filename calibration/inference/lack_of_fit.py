@@ -218,10 +218,10 @@ def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> flo
     remain.
     """
     parameters = fit.jacobian.shape[1]
-    wide = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
-    size = np.linalg.norm(wide, axis=0)
-    wide = wide[:, size > 0] / size[size > 0]
-    projected = wide - fit.taken @ (fit.taken.T @ wide)
+    padded_columns = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
+    size = np.linalg.norm(padded_columns, axis=0)
+    padded_columns = padded_columns[:, size > 0] / size[size > 0]
+    projected = padded_columns - fit.taken @ (fit.taken.T @ padded_columns)
     directions, scale, _ = np.linalg.svd(projected, full_matrices=False)
     directions = directions[:, scale > CLEAR]
     terms, freedom = directions.shape[1], float(fit.freedom.sum())
@@ -230,8 +230,8 @@ def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> flo
     explained = float(np.sum((directions.T @ np.concatenate([fit.whitened.ravel(), fit.z])) ** 2))
     if known:
         return float(chdtrc(terms, explained))
-    rest = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
-    return float(fdtrc(terms, freedom - terms, explained / terms / rest))
+    unexplained = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
+    return float(fdtrc(terms, freedom - terms, explained / terms / unexplained))
 
 
 def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:
@@ -272,11 +272,11 @@ def _autocorrelation_test(fit: Residuals) -> tuple[float, AdequacyFinding] | Non
         return None
     run = runs.run_names
     order = np.lexsort((runs[observe.axis], run))
-    follows = run[order][1:] == run[order][:-1]
+    is_same_run = run[order][1:] == run[order][:-1]
     tests = []
     for k, channel in enumerate(fit.runs.channels):
         e, ok = residual[order, k], counts[order, k]
-        is_consecutive = follows & ok[1:] & ok[:-1]
+        is_consecutive = is_same_run & ok[1:] & ok[:-1]
         power = float(np.sum(e[ok] ** 2))
         if is_consecutive.sum() >= 20 and power > 0:
             r = float(np.sum(e[1:][is_consecutive] * e[:-1][is_consecutive])) / power

@@ -98,13 +98,13 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
         better = values < lowest
         return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, values, lowest)
 
-    still = jnp.zeros(jacobian.shape[1])
+    zero_step = jnp.zeros(jacobian.shape[1])
 
     def has_changed(carry: tuple) -> Array:
         turns, active, before, _, _ = carry
         return (turns == 0) | (turns < TURNS) & jnp.any(active != before)
 
-    start = jnp.asarray(0), height > 0, height > 0, still, jnp.asarray(jnp.inf)
+    start = jnp.asarray(0), height > 0, height > 0, zero_step, jnp.asarray(jnp.inf)
     return jax.lax.while_loop(has_changed, iterate, start)[3]
 
 
@@ -168,8 +168,8 @@ class OneSidedTrustRegion(optx.ClassicalTrustRegion):
         """Predicted change of the objective by a step, negative or 0. A mixed step whose prediction is a rise counts
         as 0.
         """
-        ahead = half_squares(f_info.residual + f_info.jacobian @ y_diff, f_info.one_sided)
-        return jnp.minimum(ahead - f_info.as_min(), 0.0)
+        predicted_objective = half_squares(f_info.residual + f_info.jacobian @ y_diff, f_info.one_sided)
+        return jnp.minimum(predicted_objective - f_info.as_min(), 0.0)
 
 
 def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
@@ -281,21 +281,21 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         corrected = state.slope
         if self.rough:
             least = jnp.finfo(y.dtype).tiny
-            along, length = corrected @ state_after_step, jnp.maximum(state_after_step @ state_after_step, least)
-            missed = linearised.residual - before.residual - along
+            projection, length = corrected @ state_after_step, jnp.maximum(state_after_step @ state_after_step, least)
+            missed = linearised.residual - before.residual - projection
             near = (state.steps > 0) & (linearised.as_min() < TELLING * before.as_min())
             corrected = jnp.where(near, corrected + jnp.outer(missed, state_after_step) / length, corrected)
-            half = jnp.minimum(region.step_size, length / jnp.maximum(along @ along, least))
+            half = jnp.minimum(region.step_size, length / jnp.maximum(projection @ projection, least))
             region = _select(accepted | state.mixed, region, dataclasses.replace(region, step_size=half))
         slope = jnp.where(accepted, linearised.jacobian, corrected)
         y, best, aux = _select(accepted, (state.ahead, linearised, aux), (y, state.found, state.aux))
         ahead_of = dataclasses.replace(best, jacobian=slope)
         stride, _ = self.descent.step(region.step_size, self.descent.query(y, ahead_of, ahead_of))
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
-        ahead = y + jnp.where(mixed, mixed_step(stride, state_after_step, stride - state.stride), stride)
+        next_y = y + jnp.where(mixed, mixed_step(stride, state_after_step, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
         is_over = has_converged | (rejected >= PATIENCE)
-        new = SearchState(best, slope, aux, stride, ahead, mixed, region, state.steps + 1, rejected, is_over)
+        new = SearchState(best, slope, aux, stride, next_y, mixed, region, state.steps + 1, rejected, is_over)
         return y, new, aux
 
     def _is_small(self, y: Z, moved: Z, found: SolverLinearisation, before: SolverLinearisation) -> Array:

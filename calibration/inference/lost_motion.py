@@ -54,9 +54,9 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
     )
     radius = float(load.radius) if channel.name == "position" else 1.0
     if turning:
-        _, late, sd, explained = _fit_lost_angle(curved, bent, np.stack([integral, faster, reversed_], 1))
-        if late > SURE * sd and explained > EXPLAINED:
-            stiffness, width = float(load.inertia) * radius / late, late * np.sqrt(np.mean(bent**2))
+        _, delay, sd, explained = _fit_lost_angle(curved, bent, np.stack([integral, faster, reversed_], 1))
+        if delay > SURE * sd and explained > EXPLAINED:
+            stiffness, width = float(load.inertia) * radius / delay, delay * np.sqrt(np.mean(bent**2))
     if not (is_lost or stiffness):
         return []
     return [

@@ -168,9 +168,9 @@ def search_one_by_one(
         optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
         return optima, start.status, end.status
 
-    first = points[0]
+    first_point = points[0]
     for _ in range(len(points)):
-        z = first
+        z = first_point
         for round_ in range(1, ROUNDS + 1):
             posed, optima, feasible = _search_until_feasible(posed, z[None], step)
             z = np.asarray(optima.z[0])
@@ -191,7 +191,7 @@ def search_one_by_one(
         if not optima.cost[k] < optima.cost[0] - AGREE * (1 + optima.cost[0]):
             k = 0
             break
-        first = np.asarray(optima.z[k])
+        first_point = np.asarray(optima.z[k])
     return MultistartResult(
         posed, _pick_member(optima, k), _outcome_of_searches(optima, np.concatenate(feasibles)), shares
     )

@@ -154,8 +154,8 @@ def _optimum_at(
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
-    ahead = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
-    decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
+    residual_after_step = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
+    decrement = half_squares(r, held_rows) - half_squares(residual_after_step, held_rows)
     pinned_offset = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(pinned_offset**2)
     return Optimum(
@@ -450,26 +450,26 @@ def _search_with_states(
     problem: Problem, members: SearchMember, max_steps: int, places: int
 ) -> tuple[Optimum, SearchState]:
     """Results of `search_refilling`, with the state of the solver at the end of each search."""
-    count, most = len(members.start), np.asarray(max_steps)
+    count, step_limit = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
-    first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
-    idle = _placeholder_searches(problem, first)
+    first_members = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
+    idle = _placeholder_searches(problem, first_members)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
     go_on = _continue_searches_separately if problem.observe.apart else go_on
 
     def search_on_core(core: int) -> dict[int, Any]:
-        assigned, at = SearchQueue(range(core, count, cores), places), idle
+        assigned, states = SearchQueue(range(core, count, cores), places), idle
         while assigned:
             fresh = np.isin(np.arange(places), assigned.fill())
             own_members = jax.tree.map(lambda x: x[assigned.member], members)
             running = int(assigned.taken.sum())
             enough = places - running + (max(1, places // 4) if assigned.waiting else running)
-            at, results = go_on(problem, own_members, fresh, at, np.asarray(enough), most)
-            assigned.leave(*jax.device_get((at[1].over, (results, at[1]))))
+            states, results = go_on(problem, own_members, fresh, states, np.asarray(enough), step_limit)
+            assigned.leave(*jax.device_get((states[1].over, (results, states[1]))))
         return assigned.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step
-        go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
+        go_on(problem, first_members, np.zeros(places, bool), idle, np.asarray(0), step_limit)
     with Threads(cores) as pool:
         results_by_member = {
             k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()
@@ -560,7 +560,7 @@ def search_rollout(
     """
     pin, solver = no_pin(start.shape[0]), _least_squares_solver(data, long=True)
     size = adhesion_penalty_slice(data).stop + start.shape[0]
-    progress, first, last = _initial_progress(solver, start, size, None), None, None
+    progress, first_result, last_result = _initial_progress(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         ahead = progress[1].ahead
@@ -568,18 +568,18 @@ def search_rollout(
         r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
             r, jacobian, observation = linearise_rollout(problem, ahead, data)
-        first = observation if first is None else first
+        first_result = observation if first_result is None else first_result
         progress = _linearised_step(solver, progress, r, jacobian)
         done = bool(progress[1].over)
         if progress[1].rejected == 0:
-            best, last = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
+            best, last_result = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
         if done:
             break
-    assert best is not None and first is not None and last is not None
-    return best, first, last
+    assert best is not None and first_result is not None and last_result is not None
+    return best, first_result, last_result
 
 
 #: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the
@@ -728,14 +728,14 @@ def search_with_solver(
     Returns:
         The end of each search, and the observations at its start and at its end.
     """
-    most = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
+    step_limit = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
 
     def residual(z: Z, args: Any) -> Array:
         r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
         return with_derivative(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
-        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
+        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=step_limit, throw=False)
         z, pin = solved.value, no_pin(start.size)
         r, jacobian, observation = _evaluate_residuals(problem, data, pin, z)
         r, jacobian = mask_uncomputed(r, jacobian, data)

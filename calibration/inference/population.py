@@ -118,8 +118,8 @@ Objective = Callable[[np.ndarray, MemberObservations], Float[np.ndarray, " membe
 
 def problem_hash(posed: Problem) -> str:
     """Hash of the data, base robot, coordinates and model of a problem."""
-    arrays, rest = eqx.partition(posed, eqx.is_array_like)
-    digest = hashlib.sha256(str(rest).encode())
+    arrays, static_parts = eqx.partition(posed, eqx.is_array_like)
+    digest = hashlib.sha256(str(static_parts).encode())
     for leaf in jax.tree.leaves(arrays):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()[:16]
@@ -159,8 +159,12 @@ class MemberRunner:
     def __init__(self, posed: Problem, file: Path | None = None, together: int | None = None) -> None:
         self._together = together or TOGETHER[jax.default_backend() != "cpu"]
         # The noise is excluded, because it may be estimated again during the search.
-        bare = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
-        self._posed, self._file, self._own = posed, file, problem_hash(dataclasses.replace(posed, data=bare))
+        data_without_noise = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
+        self._posed, self._file, self._own = (
+            posed,
+            file,
+            problem_hash(dataclasses.replace(posed, data=data_without_noise)),
+        )
         self._kept: dict[bytes, tuple[np.ndarray, ...]] = {}
         if file is not None and file.exists():
             self._load(file)
@@ -180,10 +184,10 @@ class MemberRunner:
         z = np.array([np.frombuffer(key) for key in self._kept])
         arrays: Json = dict(zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True))
         try:
-            with replacing(self._file) as aside, aside.open("wb") as out:
-                np.savez(out, **arrays, identity=np.array(self._own))
-                out.flush()
-                os.fsync(out.fileno())
+            with replacing(self._file) as temporary, temporary.open("wb") as stream:
+                np.savez(stream, **arrays, identity=np.array(self._own))
+                stream.flush()
+                os.fsync(stream.fileno())
         except OSError as error:
             raise BadConfiguration(f"--members {self._file}: cannot be written: {error.strerror}") from None
 
@@ -288,10 +292,14 @@ def run_evolution(
             minutes = (time.perf_counter() - start_time) / 60
             tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
-        now = members.run(points, advance)
+        generation = members.run(points, advance)
         z = points if rows is None else np.concatenate([z, points])
-        rows = now if rows is None else MemberObservations(*map(np.concatenate, zip(rows, now, strict=True)))
-        cost = np.concatenate([cost, objective(points, now)])
+        rows = (
+            generation
+            if rows is None
+            else MemberObservations(*map(np.concatenate, zip(rows, generation, strict=True)))
+        )
+        cost = np.concatenate([cost, objective(points, generation)])
         own_cost = cost[-size:]
         search.tell(
             [
@@ -299,7 +307,7 @@ def run_evolution(
                 for d, c in zip(sample, np.where(np.isfinite(own_cost), own_cost, MISSING**2), strict=True)
             ]
         )
-        failed = int(np.sum(members.lost(now).any(-1)))
+        failed = int(np.sum(members.lost(generation).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
         tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
         population = Population(z, *rows, cost, tuple(progress))
@@ -323,13 +331,13 @@ def local_regression(
     z, reading = found.z[finite], found.reading[finite]
     number = min(len(z), MEMBERS_EACH * (z.shape[1] + 1))
     spread = np.linalg.pinv(np.cov(z.T).reshape(z.shape[1], -1))
-    apart = z - found.z[at]
-    near = np.argsort(np.einsum("ij,jk,ik->i", apart, spread, apart), kind="stable")[:number]
+    offsets = z - found.z[at]
+    near = np.argsort(np.einsum("ij,jk,ik->i", offsets, spread, offsets), kind="stable")[:number]
     scale = np.asarray(posed.data.weight / posed.data.sd)
     reading_changes = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
-    design = np.column_stack([np.ones(number), apart[near]])
+    design = np.column_stack([np.ones(number), offsets[near]])
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
-    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
+    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(offsets[near]) + 1e-12)])
     slope = np.linalg.solve(design.T @ design + ridge, design.T @ reading_changes)
     unexplained = reading_changes - design @ slope
     return slope[1:].T, float(np.sqrt(np.mean(unexplained**2)))
@@ -349,9 +357,9 @@ def unreliable_derivatives(
     ahead, behind = np.split(np.where(scale > 0, rows.reading * scale, 0.0), 2)
     differences = ((ahead - behind) / (2 * STEP)).reshape(len(z), -1)  # per posterior sd
     derivatives = jacobian.T * sd[:, None]
-    off = np.linalg.norm(derivatives - differences, axis=1)
+    error_norms = np.linalg.norm(derivatives - differences, axis=1)
     size = np.maximum(np.linalg.norm(differences, axis=1), np.linalg.norm(derivatives, axis=1))
-    return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
+    return ~np.isfinite(error_norms) | ((error_norms > APART * size) & (error_norms > 1.0))
 
 
 def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, ReachedBound]:

@@ -132,14 +132,19 @@ class Coordinates(eqx.Module):
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     @property
+    def stated(self) -> np.ndarray:
+        """Stated value of each parameter [SI]. `value` at 0 differs from it within `SOFTNESS` of a bound."""
+        location = np.asarray(self.location)
+        return np.where(self.scale, np.exp(np.where(self.scale, location, 0.0)), location)
+
+    @property
     def prior_sd(self) -> np.ndarray:
         """Prior sd of each parameter [SI], as written in files.
 
         For a log-normal prior with median m it is m √(e^s² - 1), as for "m ± sd" in a file.
         """
         arrays = jax.tree.map(np.asarray, self)
-        size = np.exp(np.where(arrays.scale, arrays.location, 0.0))
-        return np.where(arrays.scale, size * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
+        return np.where(arrays.scale, self.stated * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Derivative dθ/dz [SI]."""
@@ -212,10 +217,12 @@ def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) 
     Args:
         idle: endings of the names of parameters that the data do not show.
     """
-    others = set(robot.configurations) - set(configurations)
+    other_configurations = set(robot.configurations) - set(configurations)
     fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
     own_names = [
-        n for n, _, sd in robot.rig.priors if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *others}
+        n
+        for n, _, sd in robot.rig.priors
+        if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *other_configurations}
     ]
     return _drive_names(
         robot, (n for n in own_names if _leading_parameter(robot, n) is None and not n.endswith(idle))
@@ -282,7 +289,7 @@ def loop_parameter_names(
         if c in present
         for name in (
             *friction_names(robot, c),
-            *_radius_name(robot, c),
+            *([f"{c}.radius"] if robot.shows_travel else []),
             *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
         )
     ]
@@ -305,20 +312,15 @@ def _leading_parameter(robot: Robot, name: str) -> str | None:
     """Parameter of another configuration to which this one is tied, because the configurations differ only by their
     surface.
     """
-    configuration, _, rest = name.partition(".")
+    configuration, _, key = name.partition(".")
     leader = dict(robot.rig.surfaces).get(configuration)
-    return None if leader is None or rest.startswith(GROUND) else f"{leader}.{rest}"
+    return None if leader is None or key.startswith(GROUND) else f"{leader}.{key}"
 
 
 def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
     """True if a load has a parameter of this name that is not zero."""
     field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0
-
-
-def _radius_name(robot: Robot, configuration: str) -> Names:
-    """Name of a configuration's radius, unless no channel shows the travel of its shaft."""
-    return (f"{configuration}.radius",) if robot.shows_travel else ()
 
 
 #: Parameters of the drive that act only on the voltage.
@@ -388,9 +390,9 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
         BadConfiguration: there is no such parameter. The message names the option and the choices.
     """
     if word.endswith(".*"):
-        below = [n for n in everything if n.startswith(word[:-1])]
-        if below:
-            return below
+        names_below = [n for n in everything if n.startswith(word[:-1])]
+        if names_below:
+            return names_below
         groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
         raise BadConfiguration(f"{option} {word}: no parameters below it; {allowed_words(word, groups)}")
     if word not in everything:
@@ -402,8 +404,8 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
 
 def _similar_names(word: str, everything: list[str]) -> list[str]:
     """Names to suggest for an unknown one: those with the same last part, or of the same group, or all."""
-    last = word.rsplit(".", 1)[-1]
-    near = [n for n in everything if last and (n.endswith(f".{last}") or last in n)]
+    last_part = word.rsplit(".", 1)[-1]
+    near = [n for n in everything if last_part and (n.endswith(f".{last_part}") or last_part in n)]
     return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
 
 
@@ -481,8 +483,10 @@ def parameter_coordinates(
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
     wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
-    apart = {c for pair in robot.rig.surfaces for c in pair}
-    of_surfaces = {n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in apart}
+    surface_configurations = {c for pair in robot.rig.surfaces for c in pair}
+    of_surfaces = {
+        n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in surface_configurations
+    }
     wide |= {n: share for n, share in of_surfaces.items() if share is not None}
     if not robot.rig.inherits:
         wide = {n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)} | wide

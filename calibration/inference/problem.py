@@ -151,8 +151,8 @@ class Problem(eqx.Module):
             r = self.signed(observation, data)
             return (r, residual), (r, observation, signals)
 
-        wide = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
-        (slope, residual_slope), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
+        x_and_unknowns = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
+        (slope, residual_slope), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(x_and_unknowns)
         by_row = slope[: rows * count].reshape(rows, count, -1)
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals

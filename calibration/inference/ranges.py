@@ -45,7 +45,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     """Rejects readings that no similar robot gives under these conditions. Returns remarks on other doubts.
 
     The readings of each channel are compared with steady travel of the robot, and of the robot with a tenth and four
-    times its friction. The median factor between readings and that range decides. Of histories, only settled ends are
+    times its friction. The median factor between readings and that range decides. In histories, only settled ends are
     compared.
 
     Raises:
@@ -73,9 +73,9 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     factors = {c: _range_factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
     remarks: list[Remark] = []
     for k, (channel, factor) in enumerate(factors.items()):
-        off = max(factor, 1 / factor)
+        ratio = max(factor, 1 / factor)
         unknown = not robot.rig.inherits and channel.name in OF_TORQUE
-        if off <= (FAR if unknown else SAID):
+        if ratio <= (FAR if unknown else SAID):
             continue
         units = _possible_units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (
@@ -97,7 +97,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
             ),
             imposed=runs.layout.imposed_column,
         )
-        if off > REFUSED:
+        if ratio > REFUSED:
             raise BadData(f"{runs.source}, {describe(remark)}")
         remarks.append(remark)
     return [
@@ -132,8 +132,8 @@ def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.nda
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
         if not channel.directed or runs.layout.magnitude(channel.name):
             continue
-        off, reversed_rms = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
-        if reversed_rms * NEARER < off:
+        rms, reversed_rms = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
+        if reversed_rms * NEARER < rms:
             heading = runs.headings.get(channel.column, channel.column)
             remarks.append(
                 Remark(
@@ -141,7 +141,7 @@ def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.nda
                     source=runs.source,
                     column=channel.column,
                     theirs=heading,
-                    off=off / channel.factor,
+                    off=rms / channel.factor,
                     turned=reversed_rms / channel.factor,
                 )
             )
@@ -230,9 +230,9 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
     own_mass = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
     factor = float(np.median(runs["total_mass_kg"] / (own_mass + runs["payload_kg"])))
     if max(factor, 1 / factor) > REFUSED:
-        off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
+        ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
-            f"{runs.source}, total_mass_kg: about {float(f'{off:.2g}'):g} times too {size} for this robot "
+            f"{runs.source}, total_mass_kg: about {float(f'{ratio:.2g}'):g} times too {size} for this robot "
             f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check the "
             "unit, kg, and the "
             "mass in the robot's file"
@@ -259,8 +259,8 @@ def _slope_unit_remark(runs: Runs, measured: np.ndarray, possible: np.ndarray, r
     if sum(len(g) - 1 for g in several) < 3:
         return
     x, y = (np.concatenate([v[g, k] - np.mean(v[g, k]) for g in several]) for v in (possible, measured))
-    follows = float(x @ y / math.sqrt(max(float((x @ x) * (y @ y)), 1e-300)))
+    correlation = float(x @ y / math.sqrt(max(float((x @ x) * (y @ y)), 1e-300)))
     rise = float(x @ y / max(float(x @ x), 1e-300))
     for unit, size in SLOPES.items():
-        if follows > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
+        if correlation > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
             yield Remark("slopes_in", unit=unit, rise=rise)

@@ -40,15 +40,17 @@ def _noise_remarks(found: CalibrationResult) -> Iterator[Remark]:
 def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
     if not found.converged:
         yield Remark("unsettled", names=found.undetermined)
-    apart = {n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None}
-    if apart:
-        worst = max(apart, key=apart.__getitem__)
+    distance_in_sds = {
+        n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None
+    }
+    if distance_in_sds:
+        worst = max(distance_in_sds, key=distance_in_sds.__getitem__)
         yield Remark(
             "beside_steady",
-            inside=sum(a < Z95 for a in apart.values()),
-            total=len(apart),
+            inside=sum(a < Z95 for a in distance_in_sds.values()),
+            total=len(distance_in_sds),
             furthest=worst,
-            sds=apart[worst],
+            sds=distance_in_sds[worst],
         )
     if not found.profiled:
         yield Remark("not_profiled")
@@ -63,13 +65,15 @@ def _status_remarks(found: CalibrationResult) -> Iterator[Remark]:
 
 
 def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
-    if near_prior := tuple(name for name in found.undetermined if name not in far):
+    far_names = {
+        name for name, p in found.parameters.items() if abs(p.shift) > FAR
+    }  # these get a remark of their own
+    if near_prior := tuple(name for name in found.undetermined if name not in far_names):
         yield Remark("held_by_prior", names=near_prior)
     if pairs := found.together:
         yield Remark("only_together", pairs=pairs)
     for name, p in found.parameters.items():
-        if name in far:
+        if name in far_names:
             yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="calibration")
     for name, p in found.parameters.items():
         if p.at_bound:
@@ -94,9 +98,9 @@ def _block_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for kind, block_errors in found.held_out.items():
         if block_errors.unreachable_rows:
             yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
-    for kind, others in found.held_out_alike.items():
-        if others:
-            yield Remark("same_predictions", kind=kind, others=others)
+    for kind, similar_kinds in found.held_out_alike.items():
+        if similar_kinds:
+            yield Remark("same_predictions", kind=kind, others=similar_kinds)
     for kind, block_errors in found.held_out.items():
         if not all(block.converged for block in block_errors.blocks.values()):
             yield Remark("block_not_converged", kind=kind)

@@ -41,11 +41,13 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
     pairs = [pair for rows in rows_of_same_conditions(runs) for pair in itertools.pairwise(rows)]
     if len(pairs) < FEWEST:
         return noise, []
-    first, second = np.array(pairs).T
-    apart = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(noise.sd[first], noise.sd[second])
+    first_rows, second_rows = np.array(pairs).T
+    difference_in_sds = np.abs(runs.measured()[first_rows] - runs.measured()[second_rows]) / np.hypot(
+        noise.sd[first_rows], noise.sd[second_rows]
+    )
     factors, notes = dict[str, float](), list[Remark]()
     for k, channel in enumerate(noise.channels):
-        deviations = apart[np.isfinite(apart[:, k]), k]
+        deviations = difference_in_sds[np.isfinite(difference_in_sds[:, k]), k]
         if len(deviations) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
             continue
         median = float(np.median(deviations))
@@ -65,5 +67,8 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
 
 def _median_tail(median: float, count: int) -> float:
     """Probability that the median magnitude of `count` standard normal numbers is at least `median`."""
-    beyond, least = math.erfc(median / math.sqrt(2)), (count + 1) // 2
-    return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(least, count + 1))
+    tail_probability, needed_count = math.erfc(median / math.sqrt(2)), (count + 1) // 2
+    return sum(
+        math.comb(count, k) * tail_probability**k * (1 - tail_probability) ** (count - k)
+        for k in range(needed_count, count + 1)
+    )

@@ -566,13 +566,13 @@ def _coarser_columns(
                 total += in_cell.sum() * (residual[in_cell].mean() - residual[in_level].mean()) ** 2
         return total
 
-    coarser, all_of_it, counts = [], between(words), whole.counts[:, k]
+    coarser, whole_chi2, counts = [], between(words), whole.counts[:, k]
     for name, cells in whole.runs.extras.items():
         if name == column or _is_numeric(cells[counts]):
             continue
         coarse = _column_as_words(cells[counts])
-        if len(np.unique(coarse)) > 1 and _determines(words, coarse) and all_of_it > 0:
-            share = between(coarse) / all_of_it
+        if len(np.unique(coarse)) > 1 and _determines(words, coarse) and whole_chi2 > 0:
+            share = between(coarse) / whole_chi2
             coarser += [(name, float(share))] if share >= MOSTLY else []
     return tuple(sorted(coarser, key=lambda one: -one[1]))
 

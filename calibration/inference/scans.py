@@ -52,8 +52,8 @@ class Scan:
 
     def interval(self) -> tuple[float, float]:
         """Smallest interval that contains all points within 95 % (a rise of up to 3.84 σ²)."""
-        inside = np.flatnonzero(2 * (self.cost - self.cost.min()) <= Z95**2)
-        return self._crossing(inside[0], -1), self._crossing(inside[-1], 1)
+        places_inside = np.flatnonzero(2 * (self.cost - self.cost.min()) <= Z95**2)
+        return self._crossing(places_inside[0], -1), self._crossing(places_inside[-1], 1)
 
     def _crossing(self, k: int, side: int) -> float:
         """Coordinate between point k (inside) and the next one at which the rise is 3.84, or the end point."""
@@ -66,13 +66,13 @@ class Scan:
 
     def open(self) -> tuple[bool, bool]:
         """True for each end of the interval that may lie beyond the scanned range."""
-        inside = 2 * (self.cost - self.cost.min()) <= Z95**2
-        return bool(inside[0]), bool(inside[-1])
+        is_inside = 2 * (self.cost - self.cost.min()) <= Z95**2
+        return bool(is_inside[0]), bool(is_inside[-1])
 
     def parts(self) -> int:
         """Number of separate parts of the 95 % region."""
-        inside = 2 * (self.cost - self.cost.min()) <= Z95**2
-        return int(np.sum(inside & ~np.concatenate([[False], inside[:-1]])))
+        is_inside = 2 * (self.cost - self.cost.min()) <= Z95**2
+        return int(np.sum(is_inside & ~np.concatenate([[False], is_inside[:-1]])))
 
     def sd(self) -> float:
         """Standard deviation of the coordinate, with exp(-rise / 2) as its density."""
@@ -117,8 +117,8 @@ def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan
 
 def _scan_at(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
-    cost, others = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
-    return _sorted_scan(at, np.asarray(cost), np.asarray(others))
+    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
+    return _sorted_scan(at, np.asarray(cost), np.asarray(other_coordinates))
 
 
 def _join_scans(one: Scan, two: Scan) -> Scan:
@@ -172,8 +172,8 @@ def search_lower_minima(
         lower = found
         for k, scan in looked.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
-                alone = np.where(np.arange(len(z)) == k, scan.at[j], z)
-                end = search(min((scan.others[j], alone), key=objective))
+                start = np.where(np.arange(len(z)) == k, scan.at[j], z)
+                end = search(min((scan.others[j], start), key=objective))
                 lower = min(lower, end, key=lambda f: float(f[0].cost))
         if not float(lower[0].cost) < cost_here - WORTH:
             break

@@ -87,8 +87,8 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
             _noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()
         ]
         enough = [e for e in channel_noises if e is not None and e.freedom >= FEWEST]
-        first = next((e for e in enough if e.axis == FIRST), None)
-        noises.append(first or max(enough, key=lambda e: e.freedom, default=None))
+        preferred = next((e for e in enough if e.axis == FIRST), None)
+        noises.append(preferred or max(enough, key=lambda e: e.freedom, default=None))
     return tuple(noises)
 
 
@@ -97,11 +97,11 @@ def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
 
     Voltages that differ only by the sag of the supply are one level.
     """
-    others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
-    level = {c: voltage_levels(runs[c]) if c == SUPPLY else runs[c] for c in others}
+    other_columns = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
+    level = {c: voltage_levels(runs[c]) if c == SUPPLY else runs[c] for c in other_columns}
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
     keys: list[tuple] = [
-        (*(str(level[c][row]) for c in others), *(float(np.sign(runs[c][row])) for c in driving))
+        (*(str(level[c][row]) for c in other_columns), *(float(np.sign(runs[c][row])) for c in driving))
         for row in range(len(runs))
     ]
     together: dict[tuple, list[int]] = {}
@@ -120,9 +120,9 @@ def voltage_levels(voltage: np.ndarray) -> np.ndarray:
     """
     levels = np.unique(voltage)
     gaps = np.diff(levels)
-    for apart in (np.inf, *np.unique(gaps)[::-1]):  # from one group to many
-        groups = np.split(levels, np.flatnonzero(gaps >= apart) + 1)
-        if all(np.ptp(g) <= min(SAG * np.abs(g).max(), apart / 3) for g in groups):
+    for smallest_gap in (np.inf, *np.unique(gaps)[::-1]):  # from one group to many
+        groups = np.split(levels, np.flatnonzero(gaps >= smallest_gap) + 1)
+        if all(np.ptp(g) <= min(SAG * np.abs(g).max(), smallest_gap / 3) for g in groups):
             ends = np.array([g[-1] for g in groups])
             return ends[np.searchsorted(ends, voltage)]
     return voltage
@@ -142,22 +142,22 @@ def _noise_of_channel(
     if not rows_used:
         return None
     difference = weights @ np.nan_to_num(measured)
-    least = float(display_step(measured, channel) / np.sqrt(12))
+    smallest_sd = float(display_step(measured, channel) / np.sqrt(12))
     forms = []
     for in_share in (False, True) if np.ptp(sizes) else (False,):
         scale = weights.multiply(sizes[None]) if in_share else weights
         spread = np.sqrt(scale.power(2).sum(1))
         unit, scale = difference / spread, sparse.csr_array(scale.multiply(1 / spread[:, None]))
-        sound, size = _sound_differences(unit, JUMP if axis == TIME else WRONG)
-        scale, count = scale[sound], int(sound.sum())
+        is_valid, size = _sound_differences(unit, JUMP if axis == TIME else WRONG)
+        scale, count = scale[is_valid], int(is_valid.sum())
         together = scale @ scale.T
         freedom = count**2 / float(together.power(2).sum())
-        likely = -freedom * float(np.mean(np.log(np.maximum(size * spread[sound], np.finfo(float).tiny))))
+        likely = -freedom * float(np.mean(np.log(np.maximum(size * spread[is_valid], np.finfo(float).tiny))))
         forms.append((likely, size, freedom))
     likely, size, freedom = np.array(forms).T
     probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
     floor, *share = (np.sqrt(probability) * size * (probability > NEGLIGIBLE)).tolist()
-    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, least)
+    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, smallest_sd)
 
 
 def _differences_from_neighbours(
@@ -173,8 +173,8 @@ def _differences_from_neighbours(
         rows = rows[np.isfinite(measured[rows])]
         rows = rows[np.argsort(x[rows], kind="stable")]
         before, middle, after = rows[:-2], rows[1:-1], rows[2:]
-        wide = x[after] - x[before]
-        share = np.where(wide > 0, (x[after] - x[middle]) / np.where(wide > 0, wide, 1.0), 0.5)
+        span = x[after] - x[before]
+        share = np.where(span > 0, (x[after] - x[middle]) / np.where(span > 0, span, 1.0), 0.5)
         k = np.tile(np.arange(len(middle)), 3)
         weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
         second_differences = k, np.concatenate([before, middle, after])
@@ -194,8 +194,8 @@ def _sound_differences(unit: np.ndarray, limit: float) -> tuple[np.ndarray, floa
     share = np.sqrt(1 - 2 * limit * density / (2 * ndtr(limit) - 1))
     size = 1.4826 * float(np.median(np.abs(unit)))
     for _ in range(CUTS):
-        sound = np.abs(unit) <= limit * size
-        if np.mean(~sound) > MOST:
+        is_valid = np.abs(unit) <= limit * size
+        if np.mean(~is_valid) > MOST:
             return np.ones(len(unit), bool), float(np.sqrt(np.mean(unit**2)))
-        size = float(np.sqrt(np.mean(unit[sound] ** 2)) / share)
-    return sound, size
+        size = float(np.sqrt(np.mean(unit[is_valid] ** 2)) / share)
+    return is_valid, size

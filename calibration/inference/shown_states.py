@@ -167,9 +167,9 @@ class LogPoints(eqx.Module):
 
     def imposed(self, delay: Scalar) -> Conditions:
         """Conditions at another delay, limited to `reach`. Can be differentiated."""
-        conditions, late = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
+        conditions, shift = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
         for name, drift in self.drift.items():
-            conditions = with_condition(conditions, name, getattr(conditions, name) + late * drift)
+            conditions = with_condition(conditions, name, getattr(conditions, name) + shift * drift)
         return conditions
 
 
@@ -239,10 +239,10 @@ def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
         length: length of the window [s].
     """
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
-    inside = (share > 0) & (share < 1)
+    is_inside = (share > 0) & (share < 1)
     rise = np.pi / length
     derivatives = s**8, 8 * rise * s**7 * c, 8 * rise**2 * s**6 * (7 * c**2 - s**2)
-    return tuple(np.where(inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
+    return tuple(np.where(is_inside, x, 0.0) for x in derivatives)  # type: ignore[return-value]
 
 
 def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -261,12 +261,14 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
         times = time[begin:end]
         duration = times[-1] - times[0]
         window_length = min(length, duration)
-        for first in times[0] + np.linspace(
+        for window_start in times[0] + np.linspace(
             0.0, duration - window_length, int((duration - window_length) / (APART * window_length)) + 1
         ):
-            low, high = np.searchsorted(times, (first - 1e-9, first + window_length + 1e-9))
+            low, high = np.searchsorted(times, (window_start - 1e-9, window_start + window_length + 1e-9))
             if high - low >= FEWEST - 1:
-                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / window_length))
+                windows.append(
+                    (np.arange(begin + low, begin + high), (times[low:high] - window_start) / window_length)
+                )
     return windows
 
 
@@ -289,23 +291,23 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
 
 def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
     """Slope at each point of a cubic through the `count` points around it, within its segment."""
-    out = np.zeros(len(time))
+    slopes = np.zeros(len(time))
     starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
     for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
-        wide = min(count, end - begin)
-        if wide < FEWEST // 2:
-            out[begin:end] = np.gradient(values[begin:end], time[begin:end]) if wide > 1 else 0.0
+        width = min(count, end - begin)
+        if width < FEWEST // 2:
+            slopes[begin:end] = np.gradient(values[begin:end], time[begin:end]) if width > 1 else 0.0
             continue
-        low = np.clip(np.arange(begin, end) - wide // 2, begin, end - wide)
-        for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * wide // 1_000_000):
-            near, row_index = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
+        low = np.clip(np.arange(begin, end) - width // 2, begin, end - width)
+        for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * width // 1_000_000):
+            near, row_index = low[part][:, None] + np.arange(width), (begin + part)[:, None]
             away = time[near] - time[row_index]
             scale = np.abs(away).max()
             powers = (away / scale)[:, :, None] ** np.arange(4)
             normal = np.einsum("nwi,nwj->nij", powers, powers)
             rise = np.einsum("nwi,nw->ni", powers, values[near] - values[row_index])
-            out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
-    return out
+            slopes[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
+    return slopes
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
@@ -345,8 +347,12 @@ class _LogArrays:
         readings, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
         if plan.angle:
             lag = slope_rows(time, readings, sd)[0] // 2
-            apart = time[lag:] - time[:-lag]
-            return time[lag:], (readings[lag:] - readings[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
+            time_difference = time[lag:] - time[:-lag]
+            return (
+                time[lag:],
+                (readings[lag:] - readings[:-lag]) / time_difference,
+                1.5 * sd / float(np.median(time_difference)),
+            )
         return time, readings, sd
 
     def length(self) -> float:
@@ -376,24 +382,24 @@ class _LogArrays:
         begin = np.flatnonzero(np.r_[True, np.diff(stretch) != 0])[: len(rows)]
         place = np.arange(len(rows)) - begin[stretch] if len(rows) else stretch
         block = np.cumsum((place % size == 0) | broken) - 1
-        first, count = np.unique(block, return_index=True, return_counts=True)[1:]
+        first_row, count = np.unique(block, return_index=True, return_counts=True)[1:]
 
         def mean(x: np.ndarray) -> np.ndarray:
-            return np.add.reduceat(x, first, axis=0) / (count if x.ndim == 1 else count[:, None])
+            return np.add.reduceat(x, first_row, axis=0) / (count if x.ndim == 1 else count[:, None])
 
         middle = 0.5 * (times[1:] + times[:-1])
         inner = ~broken[1:]
         low = np.r_[times[:1], np.where(inner, middle, times[1:])]
         high = np.r_[np.where(inner, middle, times[:-1]), times[-1:]]
-        last = first + count - 1
-        cell = np.stack([low[first] - EDGE * self.step, high[last] + EDGE * self.step], 1)
+        last_row = first_row + count - 1
+        cell = np.stack([low[first_row] - EDGE * self.step, high[last_row] + EDGE * self.step], 1)
         return {
-            "row": rows[first + count // 2],
+            "row": rows[first_row + count // 2],
             "time": mean(times),
             "shown": mean(self.measured[rows]),
             "sd": np.sqrt(mean(self.sd[rows] ** 2) / count[:, None]),
             "cell": cell,
-            "stretch": np.where(count == size, stretch[first], -1),
+            "stretch": np.where(count == size, stretch[first_row], -1),
         }
 
     def course(self, cells: list[np.ndarray]) -> ImposedCourse:
@@ -444,25 +450,25 @@ def points_and_windows(
     for name, x in mean.items():
         conditions = with_condition(conditions, name, x)
     time, readings, sd = joined["time"], joined["shown"], joined["sd"]
-    since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
+    time_steps = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
-    apart = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
+    stretch_index = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
     wide, noise, rate = FEWEST, 0.0, np.zeros(len(run))
     if plan.angle:
         longest = max(log.each, key=len)
         angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
         wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
         wide = max(FEWEST, wide // size | 1)
-        rate = local_slopes(time, readings[:, plan.motion], apart, wide)
+        rate = local_slopes(time, readings[:, plan.motion], stretch_index, wide)
     way, speed = _travel_directions(problem, plan, conditions, readings, sd, rate, noise)
     usable = (way != 0) & (joined["stretch"] >= 0)
-    piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
+    piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(stretch_index) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
         rate = local_slopes(time, readings[:, plan.motion], piece, wide)
-    turned_angle = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
-    none = np.zeros(len(run))
-    arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], since, time, joined["row"]
-    late = none + delay, none + log.step, drift
+    turned_angle = np.cumsum(np.where(time_steps > 0, 0.5 * (speed + np.roll(speed, 1)) * time_steps, 0.0))
+    zeros = np.zeros(len(run))
+    arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], time_steps, time, joined["row"]
+    late = zeros + delay, zeros + log.step, drift
     windows = [
         _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))
         for r in range(len(parts))
@@ -481,8 +487,8 @@ def _weight_windows(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, 
         length = (time[rows[-1]] - time[rows[0]]) / max(share[-1] - share[0], 1e-12)
         index[k, :n] = rows
         values[3, k, :n] = np.gradient(time[rows])
-        plain = np.array(window_function(share, length)) * values[3, k, :n]
-        values[:3, k, :n] = _exact_weights(plain, share, length)
+        weights = np.array(window_function(share, length)) * values[3, k, :n]
+        values[:3, k, :n] = _exact_weights(weights, share, length)
     return RunWindows(run, index, *values)
 
 
@@ -535,15 +541,15 @@ def _travel_directions(
         noise: standard deviation of `rate`.
     """
     if plan.imposed == "motor_speed":
-        speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
+        speed, offset = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))
     else:
-        robot, none = problem.base, jnp.zeros(())
+        robot, zero = problem.base, jnp.zeros(())
         chassis = robot.configurations.members[0]
-        rolling = State(none, robot.gearbox.ratio, chassis.radius, none, distance=chassis.radius)
+        rolling = State(zero, robot.gearbox.ratio, chassis.radius, zero, distance=chassis.radius)
         per = 1 / float(
             problem.channels[plan.motion].read(robot, balances.begin_signals(robot, Conditions(0), rolling))
         )
         speed = per * (rate if plan.angle else shown[:, plan.motion])
-        off = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
-    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * off)
+        offset = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
+    limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * offset)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed

@@ -39,9 +39,11 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
     """
     simulated, measured = np.broadcast_arrays(simulated, measured)
     is_compared = np.isfinite(simulated) & np.isfinite(measured)
-    off, size = (np.sqrt(np.sum(np.square(x), 0, where=is_compared)) for x in (simulated - measured, measured))
+    error_rms, measured_rms = (
+        np.sqrt(np.sum(np.square(x), 0, where=is_compared)) for x in (simulated - measured, measured)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(off / size)
+        return np.asarray(error_rms / measured_rms)
 
 
 def root_mean_square(errors: np.ndarray) -> float:
@@ -91,12 +93,12 @@ def channel_errors(
         percent: percentage errors of the same shape. None: `sized_error`.
     """
     percent = sized_error(simulated, measured) if percent is None else percent
-    off = simulated - measured
+    errors = simulated - measured
     answer = {}
     for k, channel in enumerate(shown):
         answer[channel.name] = {
             **error_summary(percent[:, k]),
-            "rms_sigma": root_mean_square(off[:, k] / sd[:, k]),
-            "rms": root_mean_square(off[:, k]) / channel.factor,
+            "rms_sigma": root_mean_square(errors[:, k] / sd[:, k]),
+            "rms": root_mean_square(errors[:, k]) / channel.factor,
         }
     return answer

@@ -88,11 +88,11 @@ def _describe_inputs(inputs: UncertainInputs, idle: np.ndarray) -> dict[str, Inp
     slope = inputs.slope[inputs.places]
     uniform = np.arange(len(inputs)) >= len(inputs.parameters)
     sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
-    along = correlated_directions(inputs)
+    directions = correlated_directions(inputs)
     p = len(inputs.parameters)
     rows = {q: np.tile(inputs.centre, (len(inputs), 1)) for q in (-1, 0, 1)}
     for side in (-1, 1):
-        rows[side][:, :p] += side * Z95 * along[:, :p]
+        rows[side][:, :p] += side * Z95 * directions[:, :p]
         for k in range(p, len(inputs)):
             rows[side][k] = inputs.centre
             rows[side][k, k] = 0.5 + side * 0.475
@@ -119,8 +119,8 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
     elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)
     # A condition's score is uniform in 0..1, with variance 1/12.
     weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
-    along = correlated_directions(study.inputs)
-    squared_changes = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
+    directions = correlated_directions(study.inputs)
+    squared_changes = (scores @ directions.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
     variance = np.sum(scores**2 * weight, 1)
     linear = squared_changes / np.where(variance > 0, variance, 1.0)[:, None]
     finite = np.isfinite(value)
@@ -129,7 +129,7 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
     if part is None:
         nothing = np.zeros(points)
         return OutputStudy(
-            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, (), nothing, finite
+            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, nothing, finite
         )
     return OutputStudy(
         row,
@@ -142,7 +142,6 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
         part.overall,
         part.at_points,
         part.second,
-        part.convergence,
         part.lost,
         part.studied,
     )

@@ -60,12 +60,12 @@ def local_derivatives(study: Study) -> LocalDerivatives:
         finite = np.isfinite(answer.values[name])[:, None]
         derivative[name] = np.where(finite, _derivatives_by_input(inputs, derivatives), np.nan)
         by_score[name] = np.where(finite, derivatives @ inputs.slope, np.nan)
-    along = correlated_directions(inputs)
+    directions = correlated_directions(inputs)
     p = len(inputs.parameters)
     ends = []
     for side in (-1, 1):
         scores = np.tile(centre[:, None], (1, d, 1))
-        scores[:, :p] += side * Z95 * along[:p]
+        scores[:, :p] += side * Z95 * directions[:p]
         for k in range(p, d):
             scores[:, k, k] = 0.5 + side * 0.475
         rows = scores.reshape(-1, d)

@@ -61,20 +61,22 @@ def known_outputs(robot: Robot) -> dict[str, Quantity]:
 
 def default_outputs(robot: Robot, turns: bool) -> Names:
     """Names of the outputs that are studied by default: every channel, and those defined for the robot's load."""
-    beside: Names = DEFAULT
+    further_outputs: Names = DEFAULT
     if turns:
-        apart = {row.name for row in derived.OF_STRAIGHT}
+        straight_only = {row.name for row in derived.OF_STRAIGHT}
         return (
             *channels.channel_names(robot.channels),
-            *(n for n in DEFAULT if n not in apart),
+            *(n for n in DEFAULT if n not in straight_only),
             derived.OF_TURNS[0].name,
         )
     if not robot.has_ground:
-        beside = ("power_supply",)
+        further_outputs = ("power_supply",)
     elif robot.rig.imposed == "motor_speed":  # no slope stalls it
-        beside = tuple(name for name in DEFAULT if name != "steepest_slope")
+        further_outputs = tuple(name for name in DEFAULT if name != "steepest_slope")
     outputs = known_outputs(robot)
-    return tuple(n for n in (*channels.channel_names(robot.channels), *beside) if robot.knows(outputs[n].rests_on))
+    return tuple(
+        n for n in (*channels.channel_names(robot.channels), *further_outputs) if robot.knows(outputs[n].rests_on)
+    )
 
 
 def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
@@ -162,9 +164,9 @@ class Model:
         self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions
     ) -> ModelOutputs:
         """Outputs of one source, see `sources`."""
-        made = self._call_in_chunks(self._function(source), self.chunk(source, len(values)), values, conditions)
-        codes = made.pop(STATUS).astype(int)
-        return ModelOutputs(made, {source: codes})
+        results = self._call_in_chunks(self._function(source), self.chunk(source, len(values)), values, conditions)
+        codes = results.pop(STATUS).astype(int)
+        return ModelOutputs(results, {source: codes})
 
     def joined(self, parts: Mapping[str, ModelOutputs]) -> ModelOutputs:
         """Outputs of all sources, in order."""
@@ -185,9 +187,9 @@ class Model:
         columns: Columns = {}
         for source in self.sources:
             size = self.chunk(source, len(values), differentiated=True)
-            made = self._call_in_chunks(self._function(source, differentiated=True), size, values, conditions)
-            made.pop(STATUS)
-            columns |= made
+            results = self._call_in_chunks(self._function(source, differentiated=True), size, values, conditions)
+            results.pop(STATUS)
+            columns |= results
         return {o.name: columns[o.name] for o in self.outputs}
 
     def _function(self, source: str, differentiated: bool = False) -> Callable[..., dict[str, Array]]:
@@ -236,11 +238,11 @@ def _outputs(
 ) -> dict[str, Array]:
     """Outputs of a source, NaN if the run did not converge, and statuses."""
     if source in fidelities.TABLE:
-        made = evaluate_points(variation, source, values, conditions, options, names)
+        results = evaluate_points(variation, source, values, conditions, options, names)
     else:
-        made = _derived(variation, source, names, values, conditions)
-    solved = is_done(made[STATUS])
-    return {name: x if name == STATUS else jnp.where(solved, x, jnp.nan) for name, x in made.items()}
+        results = _derived(variation, source, names, values, conditions)
+    solved = is_done(results[STATUS])
+    return {name: x if name == STATUS else jnp.where(solved, x, jnp.nan) for name, x in results.items()}
 
 
 def _derived(
@@ -248,8 +250,8 @@ def _derived(
 ) -> dict[str, Array]:
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
     compute = derived.compute_function(source)
-    made = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
-    return {name: made[name] for name in (*names, STATUS)}
+    results = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
+    return {name: results[name] for name in (*names, STATUS)}
 
 
 _values = compiled(_outputs)

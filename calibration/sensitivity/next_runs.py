@@ -61,10 +61,10 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
     while improved:
         improved = False
         for place in range(count):
-            others = run_indices[:place] + run_indices[place + 1 :]
-            best = _best_candidate(information, others)
-            if _log_determinant(information, [*others, best]) > _log_determinant(information, run_indices) + 1e-9:
-                run_indices = [*others, best]
+            other_runs = run_indices[:place] + run_indices[place + 1 :]
+            best = _best_candidate(information, other_runs)
+            if _log_determinant(information, [*other_runs, best]) > _log_determinant(information, run_indices) + 1e-9:
+                run_indices = [*other_runs, best]
                 improved = True
     ordered: list[int] = []
     for _ in range(count):  # chosen runs, the most informative first
@@ -136,8 +136,8 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     """
     points, conditions = candidates.points, candidates.conditions
     outputs_known = known_outputs(study.robot)
-    shown = tuple(outputs_known[c.name] for c in study.robot.channels)
-    model = dataclasses.replace(study.model, outputs=shown, fidelity="steady", options={})
+    channel_outputs = tuple(outputs_known[c.name] for c in study.robot.channels)
+    model = dataclasses.replace(study.model, outputs=channel_outputs, fidelity="steady", options={})
     p = len(study.inputs.parameters)
     if not p:
         return None
@@ -145,16 +145,16 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     values = np.array(study.values_at(rows))
     # A condition that a candidate states replaces its range in the study. The others are in the middle of their
     # range.
-    first = len(study.inputs.columns) - len(study.inputs.conditions)
+    first_condition = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):
         condition_value = getattr(conditions, name)
         if condition_value is not None:
-            values[:, first + j] = np.asarray(condition_value)
+            values[:, first_condition + j] = np.asarray(condition_value)
     answer = model(values, conditions)
     derivatives = model.derivatives(values, conditions)
     inner = study.inputs.slope[:, :p]
-    jacobian = np.stack([derivatives[o.name] @ inner for o in shown], 1)
-    reading = np.stack([answer.values[o.name] for o in shown], 1)
+    jacobian = np.stack([derivatives[o.name] @ inner for o in channel_outputs], 1)
+    reading = np.stack([answer.values[o.name] for o in channel_outputs], 1)
     finite = np.isfinite(reading).all(1)
     if not finite.any():
         return None

@@ -52,14 +52,14 @@ def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEs
         NaN if the denominator is 0: without variance there are no shares.
     """
     count = len(numerator)
-    below = float(np.mean(denominator))
+    mean_denominator = float(np.mean(denominator))
     shape = (-1,) + (1,) * (numerator.ndim - 1)
-    if not below > 0:
+    if not mean_denominator > 0:
         nothing = np.full(numerator.shape[1:], np.nan)
         return IntervalEstimate(nothing, nothing, nothing)
-    above = np.mean(numerator, 0)
-    value = above / below
-    error = (numerator - above - value * (denominator - below).reshape(shape)) / below
+    mean_numerator = np.mean(numerator, 0)
+    value = mean_numerator / mean_denominator
+    error = (numerator - mean_numerator - value * (denominator - mean_denominator).reshape(shape)) / mean_denominator
     sd = np.sqrt(np.sum(error**2, 0) / (count * (count - 1)))
     width = float(stats.t.ppf(0.5 + LEVEL / 2, count - 1)) * sd
     return IntervalEstimate(value, value - width, value + width)

@@ -129,7 +129,6 @@ class OutputStudy:
         overall: indices of each input over all points: name → estimates of shape (inputs,).
         at_points: indices at each point: name → estimates of shape (points, inputs).
         second: second-order indices over all points, shape (inputs, inputs). None if not computed.
-        convergence: main index after increasing numbers of model evaluations.
         lost: share of base points without a value, at each point, shape (points,).
         studied: True for points that could be studied.
     """
@@ -145,7 +144,6 @@ class OutputStudy:
     overall: dict[str, IntervalEstimate]
     at_points: dict[str, IntervalEstimate]
     second: IntervalEstimate | None
-    convergence: tuple[tuple[int, IntervalEstimate], ...]
     lost: np.ndarray
     studied: np.ndarray
 
@@ -247,7 +245,7 @@ class SensitivityResult:
     def importance(self) -> np.ndarray:
         """Largest share of the variance that each input causes, over all outputs and points, shape (inputs,). Shares
         at single points count with the upper ends of their intervals."""
-        most = np.zeros(len(self.inputs))
+        largest_share = np.zeros(len(self.inputs))
         for study in self.outputs.values():
             ends = [study.overall_share]
             if study.at_points:
@@ -256,8 +254,8 @@ class SensitivityResult:
                     ends.append(np.nanmax(np.where(np.isfinite(main.high), main.high, 0.0), axis=0))
             shares = np.where(np.isfinite(study.share), study.share, 0.0)
             ends.append(shares.max(0, initial=0.0))
-            most = np.maximum(most, np.max(np.stack(ends), 0))
-        return np.clip(most, 0.0, 1.0)
+            largest_share = np.maximum(largest_share, np.max(np.stack(ends), 0))
+        return np.clip(largest_share, 0.0, 1.0)
 
     @property
     def negligible(self) -> Names:
@@ -305,14 +303,6 @@ class SensitivityResult:
                     name: interactions(study, names)
                     for name, study in self.outputs.items()
                     if study.second is not None
-                },
-                "convergence": {
-                    name: [
-                        {"evaluations": count, "indices": _estimates_by_input(names, {"index": estimate})}
-                        for count, estimate in study.convergence
-                    ]
-                    for name, study in self.outputs.items()
-                    if study.convergence
                 },
                 **entries_of(self, "negligible", "statuses", "statuses_sampled=sampled"),
                 "next_runs": None if self.next_runs is None else _next_runs_json(self.next_runs, names),

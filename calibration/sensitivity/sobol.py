@@ -21,8 +21,6 @@ from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate, rat
 
 #: Fewest points of a replicate.
 FEWEST = 4
-#: Numbers of replicates for which convergence is shown.
-STAGES = (4, 8, 16, REPLICATES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,8 +151,8 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
         ba = values_by_block[..., d + 1 : 2 * d + 1]
         # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
         mixed = np.einsum("rnj,rnk->rjk", ba, ab)
-        alone = np.einsum("rn,rn->r", a, b)[:, None, None]
-        closed = weight * (mixed - alone)
+        square_of_means = np.einsum("rn,rn->r", a, b)[:, None, None]
+        closed = weight * (mixed - square_of_means)
         second = (closed + np.swapaxes(closed, 1, 2)) / 2
     return VarianceTerms(
         variance=weight * np.sum(a**2 + b**2, 1) / 2,
@@ -178,17 +176,11 @@ class SobolIndices:
     variance: float
 
 
-def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> SobolIndices:
-    """Sobol indices from the parts of the variance. `replicates`: only this many of the first replicates."""
-    replicate_slice = slice(replicates)
-    variance, first = terms.variance[replicate_slice], terms.first[replicate_slice]
-    second = None
+def indices_of_terms(terms: VarianceTerms) -> SobolIndices:
+    """Sobol indices from the parts of the variance."""
+    variance, first, second = terms.variance, terms.first, None
     if terms.second is not None:
-        beyond = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
-        second = ratio_estimate(beyond, variance)
+        second = ratio_estimate(terms.second - first[:, :, None] - first[:, None, :], variance)
     return SobolIndices(
-        ratio_estimate(first, variance),
-        ratio_estimate(terms.total[replicate_slice], variance),
-        second,
-        float(variance.mean()),
+        ratio_estimate(first, variance), ratio_estimate(terms.total, variance), second, float(variance.mean())
     )

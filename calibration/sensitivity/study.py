@@ -101,14 +101,14 @@ class Study:
                     sampled[source, mark] = self.model.of_source(source, values, conditions)
                 parts[source] = sampled[source, mark]
             answer = self.model.joined(parts)
-            self._count(answer, len(values), began)
+            self._count_evaluations(answer, len(values), began)
             if time.perf_counter() - self.told > SILENCE:
                 self.told = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
                 self.tell(progress_remark("evaluations", self.evaluations, rate))
             yield k, answer.values
 
-    def _count(self, answer: ModelOutputs, rows: int, began: float) -> None:
+    def _count_evaluations(self, answer: ModelOutputs, rows: int, began: float) -> None:
         self.seconds += time.perf_counter() - began
         self.evaluations += rows
         for source, codes in answer.statuses.items():

@@ -131,7 +131,7 @@ def default_input_names(
     """
     absent = [name for name in robot.configurations if name not in configurations]
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
-    out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
+    excluded = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     by_name = priors.parameters_by_name(robot)
     left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
@@ -143,7 +143,7 @@ def default_input_names(
     return tuple(
         name
         for name, p in by_name.items()
-        if not name.startswith(out) and name not in left_out and p.spec.prior_sd(float(p.value)) > 0
+        if not name.startswith(excluded) and name not in left_out and p.spec.prior_sd(float(p.value)) > 0
     )
 
 

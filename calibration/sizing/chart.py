@@ -79,19 +79,19 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     payload, slope = np.linspace(0, most[0], POINTS), np.linspace(0, most[1], POINTS)
     e = asked.envelope
     base = sheet.envelope_points(robot, Requirement("speed_m_s", 0.0, True, e))
-    first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
+    robot_and_point = jax.tree.map(lambda x: np.asarray(x)[-1], base)
     s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
     speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
     power_needed = np.zeros(len(p))
     for r in speeds:
         v = r.envelope
-        inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
-        power_needed = np.where(inside, np.maximum(power_needed, r.limit or 0.0), power_needed)
+        is_required = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
+        power_needed = np.where(is_required, np.maximum(power_needed, r.limit or 0.0), power_needed)
     robot = params.without_weak_types(robot)
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None
     for charge in e.charge:
-        points = jax.tree.map(lambda x: jnp.full(len(p), x), first)
+        points = jax.tree.map(lambda x: jnp.full(len(p), x), robot_and_point)
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )

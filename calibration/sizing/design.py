@@ -224,7 +224,7 @@ def _demand_margin(
     states = {key: x[rows] for key, x in found.items()}
     points = jax.tree.map(lambda x: x[rows], asked.points)
     travels = jnp.min(jnp.minimum(states["left"], 1.0))
-    above = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
+    cell_voltage_ratio = jnp.min(jnp.minimum(states["cell"] / ratings.voltage_cutoff, 1.0))
     r = d.requirement
     if r is None:
         most = {
@@ -240,15 +240,15 @@ def _demand_margin(
         share = 1 - jnp.asarray(robot.configurations[asked.configuration].mass) / _positive_limit(r)
         return -share if r.least else share
     if r.name == "slope_deg":
-        return jnp.minimum(travels, above)
+        return jnp.minimum(travels, cell_voltage_ratio)
     if r.name == "payload_kg":
-        hot = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(ratings.temperature)))
+        heat_margin = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(ratings.temperature)))
         torque = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
-        return jnp.min(jnp.stack([travels, above, hot, torque]))
+        return jnp.min(jnp.stack([travels, cell_voltage_ratio, heat_margin, torque]))
     if r.name == "endurance_min":
         return _endurance_margin(r, robot, ratings, states)
     if r.limit is None:  # ratings of the parts, required of every design
-        return jnp.minimum(travels, above)
+        return jnp.minimum(travels, cell_voltage_ratio)
     if r.name not in states:  # not a quantity of straight travel
         found_here = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
         counts = jnp.where(found_here.outcome == CONVERGED, 1.0, -1.0)
@@ -258,7 +258,7 @@ def _demand_margin(
     share = jnp.min(value / _positive_limit(r) - 1) if r.least else jnp.min(1 - value / _positive_limit(r))
     if r.name == "winding_C":
         share = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(_positive_limit(r))))
-    return jnp.min(jnp.stack([share, travels, above]))
+    return jnp.min(jnp.stack([share, travels, cell_voltage_ratio]))
 
 
 def _positive_limit(r: Requirement) -> float:
@@ -281,5 +281,5 @@ def _endurance_margin(r: Requirement, robot: Robot, ratings: Ratings, at: Mappin
     motors = (at["battery"] - battery.current_other) * r.share
     current = jnp.asarray(battery.current(motors)).reshape(-1, NODES + 1)
     time = capacity_used * jnp.sum(weights / current[:, :NODES], axis=1)
-    travels, above = jnp.min(jnp.minimum(at["left"], 1.0)), jnp.min(at["cell"] / ratings.voltage_cutoff)
-    return jnp.min(jnp.stack([jnp.min(time) / limit - 1, travels, above]))
+    travels, cell_voltage_ratio = jnp.min(jnp.minimum(at["left"], 1.0)), jnp.min(at["cell"] / ratings.voltage_cutoff)
+    return jnp.min(jnp.stack([jnp.min(time) / limit - 1, travels, cell_voltage_ratio]))

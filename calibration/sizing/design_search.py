@@ -173,9 +173,11 @@ def _descend(
             best, at_best = jnp.where(better, f, best), jnp.where(better, x, at_best)
             slope = jnp.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0)
             change, state = adam.update(slope, state)
-            follows = (k + 1) % EVERY == 0
-            multipliers = jnp.where(follows, jnp.clip(multipliers - weight * (g - 1e-3), 0.0, 1e3), multipliers)
-            weight = jnp.where(follows, jnp.minimum(weight * GROWTH, HEAVIEST), weight)
+            updates_multipliers = (k + 1) % EVERY == 0
+            multipliers = jnp.where(
+                updates_multipliers, jnp.clip(multipliers - weight * (g - 1e-3), 0.0, 1e3), multipliers
+            )
+            weight = jnp.where(updates_multipliers, jnp.minimum(weight * GROWTH, HEAVIEST), weight)
             return (jnp.clip(x + change, low, high), state, multipliers, weight, best, at_best), None
 
         x = d.continuous
@@ -279,21 +281,21 @@ def size_robot(
     choice = enumerate_choices(robot, problem, part_options)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
     tell(progress_remark("designs"))
-    drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
-    is_feasible = drawn.g.max(axis=0) >= 0
+    random_designs = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
+    is_feasible = random_designs.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, is_feasible, strict=True) if not k)
     search = _DesignSearch(problem, choice, is_feasible, columns)
     weights = search.weights(starts)
     tell(progress_remark("descents", starts))
-    free = search.descend(drawn, weights)
+    free = search.descend(random_designs, weights)
     tell(progress_remark("whole"))
-    real = search.buildable_designs(drawn, free, weights)
+    real = search.buildable_designs(random_designs, free, weights)
     tell(progress_remark("refined", REFINED))
     # The best of these are refined with free ratio and fractions of a cell, because no search may have started from
     # their parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first_objective_weights(len(top)), np.ones(3))
-    evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
+    evaluated = len(random_designs.rows) + starts * STEPS + search.evaluated
 
     def found(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
         margins = np.where(is_feasible, designs.g[k], np.nan)
@@ -449,13 +451,16 @@ def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, cou
     start_indices: list[int] = []
     of_motor: dict[str, int] = {}
     of_choice: dict[int, int] = {}
-    for least in (True, False):
+    for for_each_motor in (True, False):
         for k in order:
             c = int(rows[k])
             name = motor[c]
-            if len(start_indices) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
+            if len(start_indices) == count or (for_each_motor and of_motor.get(name, 0) >= OF_MOTOR):
                 continue
-            if of_choice.get(c, 0) >= OF_CHOICE or k in start_indices[: len(start_indices) if not least else 0]:
+            if (
+                of_choice.get(c, 0) >= OF_CHOICE
+                or k in start_indices[: len(start_indices) if not for_each_motor else 0]
+            ):
                 continue
             start_indices.append(int(k))
             of_motor[name], of_choice[c] = of_motor.get(name, 0) + 1, of_choice.get(c, 0) + 1
@@ -487,11 +492,11 @@ def _refine_designs(
     box = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     x, width, count = x.copy(), 0.25 if free.sum() == 1 else 0.05, 0
     for _ in range(ROUNDS):
-        tried = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
-        n = tried.shape[1]
-        f, g = evaluate_designs(problem, choice, np.repeat(rows, n), tried.reshape(-1, 3))
+        candidates = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
+        n = candidates.shape[1]
+        f, g = evaluate_designs(problem, choice, np.repeat(rows, n), candidates.reshape(-1, 3))
         cost = _cost(f, g, kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
-        x = tried[np.arange(len(rows)), np.argmin(cost, axis=1)]
+        x = candidates[np.arange(len(rows)), np.argmin(cost, axis=1)]
         width, count = width * SHRINK, count + len(f)
     return x, count
 
@@ -500,7 +505,7 @@ def _nearest_buildable(
     choice: ChoiceSpace, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Designs near the given ones with gear ratios from data sheets and whole cells: the two nearest of each."""
-    made: dict[tuple, tuple] = {}
+    buildable: dict[tuple, tuple] = {}
     for k in order:
         drive = choice.options.drives[choice.drive[rows[k]]]
         ratios = sorted(drive.ratios, key=lambda r: abs(math.log(r) - x[k, 0]))[:2]
@@ -509,8 +514,8 @@ def _nearest_buildable(
             ratios, {max(1, math.floor(parallel + 1e-6)), max(1, math.ceil(parallel - 1e-6))}
         ):
             key = (int(rows[k]), ratio, p)
-            made.setdefault(key, (rows[k], [math.log(ratio), x[k, 1], math.log(p)], weights[k]))
-    choices, points, w = zip(*made.values(), strict=True)
+            buildable.setdefault(key, (rows[k], [math.log(ratio), x[k, 1], math.log(p)], weights[k]))
+    choices, points, w = zip(*buildable.values(), strict=True)
     return np.array(choices), np.array(points), np.array(w)
 
 

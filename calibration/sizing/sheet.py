@@ -166,16 +166,16 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
     name = _configuration_name(robot, e)
     on_tracks = float(robot.configurations[name].on_tracks) > 0.5
 
-    def same(x: float) -> Float[Array, " points"]:
+    def at_all_points(x: float) -> Float[Array, " points"]:
         return jnp.full(len(payload), x, float)
 
     return EnvelopePoint(
         configuration=jnp.full(len(payload), robot.configurations.index(name)),
-        adhesion=same(adhesion_ratio(e.surface, on_tracks)),
-        adhesion_lateral=same(lateral_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
-        charge=jnp.asarray(charge), charge_end=same(e.charge_end), share=same(requirement.share),
+        adhesion=at_all_points(adhesion_ratio(e.surface, on_tracks)),
+        adhesion_lateral=at_all_points(lateral_ratio(e.surface, on_tracks)), battery=at_all_points(float(e.battery)),
+        charge=jnp.asarray(charge), charge_end=at_all_points(e.charge_end), share=at_all_points(requirement.share),
         slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(warm),
-        tread=same(MM * requirement.tread_mm),
+        tread=at_all_points(MM * requirement.tread_mm),
     )  # fmt: skip
 
 
@@ -405,15 +405,15 @@ def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[P
     The direction follows from the derivative at the worst corner. The nearest value that meets the requirement at
     every corner is found by a coarse search and bisection. Each result is verified.
     """
-    now, names = _present_values(held), held.names
-    worst = int(np.argmin(held.over(now[None])[2][0]))
+    present_values, names = _present_values(held), held.names
+    worst = int(np.argmin(held.over(present_values[None])[2][0]))
     point = jax.tree.map(lambda x: x[worst], held.at)
     slopes = np.asarray(
         _quantity_gradient(
             _robot_without_ratings(held.robot),
             ratings(held.robot),
             names,
-            jnp.asarray(now),
+            jnp.asarray(present_values),
             point,
             _computed_name(held.requirement),
         )
@@ -426,19 +426,19 @@ def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[P
             bounds, unit = (1.0, 100.0), "-"
         else:
             bounds, unit = by_name[name].spec.bounds, by_name[name].spec.unit
-        if now[k] <= 0:
+        if present_values[k] <= 0:
             continue
-        low, high = max(bounds[0], REACH[0] * now[k]), min(bounds[1], REACH[1] * now[k])
+        low, high = max(bounds[0], REACH[0] * present_values[k]), min(bounds[1], REACH[1] * present_values[k])
         uphill = slopes[k] if np.isfinite(slopes[k]) else 0.0
         if outcome.margin is not None and uphill == 0:
             continue  # no influence
         # Without a value the derivative is not informative, so both directions are tried.
         ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
-        options = [v for end in ends if (v := _nearest_value(held, name, now[k], end)) is not None]
+        options = [v for end in ends if (v := _nearest_value(held, name, present_values[k], end)) is not None]
         if options:
-            after = min(options, key=lambda v: abs(math.log(v / now[k])))
+            after = min(options, key=lambda v: abs(math.log(v / present_values[k])))
             sense = 1 if held.requirement.least else -1
-            changes.append(ParameterChange(name, float(now[k]), after, unit, float(sense * slopes[k])))
+            changes.append(ParameterChange(name, float(present_values[k]), after, unit, float(sense * slopes[k])))
     return changes
 
 
@@ -462,14 +462,14 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
     good = np.flatnonzero(meets(ladder))
     if not good.size:
         return None
-    first = int(good[0])
+    first_place = int(good[0])
     if name == CELLS:
-        return float(ladder[first])
-    a, b = (begin if first == 0 else ladder[first - 1]), ladder[first]
+        return float(ladder[first_place])
+    a, b = (begin if first_place == 0 else ladder[first_place - 1]), ladder[first_place]
     for _ in range(3):
         finer = steps(a, b, ROWS)
-        inside = np.flatnonzero(meets(finer))
-        k = int(inside[0]) if inside.size else len(finer) - 1
+        places_that_meet = np.flatnonzero(meets(finer))
+        k = int(places_that_meet[0]) if places_that_meet.size else len(finer) - 1
         a, b = (a if k == 0 else finer[k - 1]), finer[k]
     # Rounded to few digits, away from `begin`. Each rounded value is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):

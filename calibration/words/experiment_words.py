@@ -35,8 +35,8 @@ SMALL = 0.1
 
 def join_torques(values: Sequence[float]) -> str:
     """«0, 0.2 and 0.4 N·m». In mN·m where all are below `SMALL`."""
-    size, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
-    return join_amounts([menu.round_significant(size * v, 3) for v in values], unit)
+    factor, unit = (1e3, "mN·m") if max(map(abs, values)) < SMALL else (1.0, "N·m")
+    return join_amounts([menu.round_significant(factor * v, 3) for v in values], unit)
 
 
 def join_slopes(angles: Sequence[float]) -> str:
@@ -231,10 +231,10 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
 
 def _of_level(what: SimpleNamespace) -> dict[str, str]:
     """Advice by variable, for an imposed speed or current of the motors."""
-    within = what.within
-    level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
-    of_speed = within.imposed == "motor_speed"
-    most = max(within.levels, default=within.motor_speed if of_speed else within.current)
+    within_words = what.within
+    level = "Repeat on the level, unladen," if within_words.has_ground else "Repeat"
+    of_speed = within_words.imposed == "motor_speed"
+    most = max(within_words.levels, default=within_words.motor_speed if of_speed else within_words.current)
     name, levels = ("motor speed", (most / RPM, "rpm")) if of_speed else ("motor current", (most, "A"))
     turning = f"with the {name}{_up_to(levels[0], what.runs, levels[1])}"
     words = {
@@ -244,9 +244,9 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
         "payload": f"Repeat at one {name} and slope with the payload from 0 to {what.payload:g} kg",
         "time": f"Repeat at one {name} for ten minutes from a cold start, and again at once while everything is warm",
     }
-    if not within.has_ground:
+    if not within_words.has_ground:
         words["current"] = (
-            f"{level} at one {name} with {_brake(what)}" if any(within.torques) else words["speed_motor"]
+            f"{level} at one {name} with {_brake(what)}" if any(within_words.torques) else words["speed_motor"]
         )
     return words
 

@@ -15,10 +15,10 @@ def feedforward_statement(found: Feedforward) -> str:
 
 
 def _limit(level: float, current: float | None) -> str:
-    most = "" if current is None else f" The current reaches {current:.3g} A."
+    peak = "" if current is None else f" The current reaches {current:.3g} A."
     return (
         f"A current limit was reached: above {level:.2g} V of accelerating voltage the acceleration no longer "
-        f"increases.{most} Those windows are left out. Lower the voltage of the dynamic test, or raise the limit."
+        f"increases.{peak} Those windows are left out. Lower the voltage of the dynamic test, or raise the limit."
     )
 
 

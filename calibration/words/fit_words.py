@@ -238,9 +238,9 @@ def calibration_answer(found: CalibrationResult) -> str:
             channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not channel_errors:
         return f"{_VERDICTS[found.adequacy.adequate]}. No row has a prediction both before and after the fit."
-    same = len(set(rows.values())) == 1
-    errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in channel_errors)
-    row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
+    same_rows = len(set(rows.values())) == 1
+    errors = ", ".join(text + ("" if same_rows else f" ({rows[label]} rows)") for label, text in channel_errors)
+    row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same_rows else "the same rows"
     return f"{_VERDICTS[found.adequacy.adequate]}. The rms error before → after on {row_words}: {errors}."
 
 
@@ -276,13 +276,13 @@ LISTED = 6
 def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that depend on a column that the model does not use."""
     subject = f"residuals of {channels.find_channel(c.channel).label}"
-    within = f" within {c.within}" if c.within else ""
+    range_ = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"
     role = "a column that the model does not use" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
-            f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}, {p}), "
+            f"{subject} are correlated with {c.column}{range_}{signs} (rank correlation {c.correlation:+.2f}, {p}), "
             f"{role}. Find what changes with it"
         )
     if c.coarser:
@@ -293,7 +293,7 @@ def residual_cluster(c: ResidualCluster) -> str:
     level_words = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in mean_levels)
     more = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
-        f"{subject} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
+        f"{subject} differ between the levels of {c.column}{range_}{signs} (simulated minus measured, by level: "
         f"{level_words}{more}, {p}), {role}. Give each level its own configuration, or find what differs between them"
     )
 

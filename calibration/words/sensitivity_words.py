@@ -87,8 +87,10 @@ def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
         covered = int(np.isin(x, values_inside).sum())
         if covered > most:
             most, words = covered, f"{', '.join(f'{v:g}' if symbol else str(v) for v in values_inside)}{symbol}"
-    others = int(mask.sum()) - most
-    return " and ".join([words] * bool(words) + [f"{others} more" if words else str(others)] * bool(others))
+    other_count = int(mask.sum()) - most
+    return " and ".join(
+        [words] * bool(words) + [f"{other_count} more" if words else str(other_count)] * bool(other_count)
+    )
 
 
 def points_left_out(points: int, total: int, sampled: bool, outputs: Names) -> str:

@@ -65,8 +65,8 @@ def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[t
 def settle_statement(found: Settled) -> str:
     """Number of settled runs of a log, and its samples."""
     stretches, rows = found.kept, sum(len(s.rows) for s in found.kept)
-    back = sum(s.imposed < 0 for s in stretches)
-    ways = f", {len(stretches) - back} forward and {back} backward" if back else ""
+    backward_count = sum(s.imposed < 0 for s in stretches)
+    ways = f", {len(stretches) - backward_count} forward and {backward_count} backward" if backward_count else ""
     return (
         f"{count_noun(len(stretches), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
         f"{found.shortest:.3g} s long, with means steady to {100 * found.drift:g} %)."

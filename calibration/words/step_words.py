@@ -69,8 +69,8 @@ def expected_time(text: str, seconds: float) -> float | None:
         text: line of a stage that begins.
         seconds: seconds since the loop began.
     """
-    stage, _, rest = text.partition(f" of {OF}, ")
-    share_done = OVER.get(int(stage)) if rest and stage.isdigit() else None
+    stage, _, detail = text.partition(f" of {OF}, ")
+    share_done = OVER.get(int(stage)) if detail and stage.isdigit() else None
     return None if share_done is None else seconds * (1 - share_done) / share_done
 
 

@@ -129,8 +129,8 @@ def sentence_on_implausible_readings(
     column: str, unit: str, factor: float, units: Names, others: Names, imposed: str
 ) -> str:
     """Readings that no robot like this one shows."""
-    off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
-    subject = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
+    ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
+    subject = f"{column}: readings are about {float(f'{ratio:.2g}'):g} times too {size} for this robot"
     alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{subject}; are they in {' or '.join(units)}? expected {unit}{alike}"

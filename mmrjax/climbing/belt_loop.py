@@ -78,8 +78,8 @@ class BeltLoop(eqx.Module):
         def integral(s: Array) -> Array:
             total = jnp.zeros_like(s)
             for begin, end, radius in zip(self.marks[::2], self.marks[1::2], (self.first, self.second), strict=True):
-                within = jnp.clip(s - begin, 0.0, end - begin)
-                total = total + (within**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
+                length_inside = jnp.clip(s - begin, 0.0, end - begin)
+                total = total + (length_inside**2 / 2 + (end - begin) * jnp.maximum(s - end, 0.0)) / radius
             return total
 
         mean = (integral(place + half) - integral(place - half)) / self.grouser_length
@@ -89,15 +89,15 @@ class BeltLoop(eqx.Module):
         """Points of the pitch line [m], at positions `place` from 0 to the length of the belt."""
         a, b, c, d = self.marks
         normal = self.normal(self.turned(place))
-        first = place < (b + c) / 2
-        first = first & (place > -self.run)
+        on_first_pulley = place < (b + c) / 2
+        on_first_pulley = on_first_pulley & (place > -self.run)
         along = jnp.where(
-            first,
+            on_first_pulley,
             jnp.minimum(place - a, 0.0) + jnp.maximum(place - b, 0.0),
             jnp.minimum(place - c, 0.0) + jnp.maximum(place - d, 0.0),
         )
-        radius = jnp.where(first, self.first, self.second)
-        centre = jnp.stack([jnp.where(first, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
+        radius = jnp.where(on_first_pulley, self.first, self.second)
+        centre = jnp.stack([jnp.where(on_first_pulley, 0.0, self.distance), jnp.zeros_like(place)], axis=-1)
         return centre + radius[..., None] * normal + along[..., None] * running_direction(normal)
 
     def places(self, drawn: Scalar) -> Float[Array, " grousers"]:
@@ -177,8 +177,8 @@ def gaps_to_belt(loop: BeltLoop, at: Float[Array, "n 2"]) -> CornerGaps:
 def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> CornerGaps:
     """Gaps between points and the nearest grouser, a rigid tooth with flanks perpendicular to its base."""
     under = loop.project(at)[1]
-    ahead = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
-    place = jnp.mod(under - ahead, loop.length)
+    grouser_offset = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
+    place = jnp.mod(under - grouser_offset, loop.length)
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     along = running_direction(normal)

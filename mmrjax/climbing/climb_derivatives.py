@@ -154,9 +154,9 @@ def climb_derivatives(
     )
     records: list[Any] = []
     for k in range(parts):
-        first = jnp.asarray(k * samples * steps * step)
+        first_step = jnp.asarray(k * samples * steps * step)
         (state, record), (state_change, changed) = _advance_part(
-            (run, state), (rotated_run, state_change), first, interval, step_numbers, samples
+            (run, state), (rotated_run, state_change), first_step, interval, step_numbers, samples
         )
         records.append(jax.device_get((record, changed)))
         if progress is not None:
@@ -177,20 +177,20 @@ def climb_derivatives(
         (rotated_run, jax.tree.map(lambda x: x[:, :count], changed)),
     )
     offsets = np.linspace(-1, 1, BESIDE)
-    beside = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
-    more = jax.vmap(given)(beside)
+    nearby_values = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
+    more = jax.vmap(given)(nearby_values)
     batch = climb.climb_batch(
         *more, duration=duration, step=step, sample=sample, part=part,
         progress=None if progress is None else lambda share: progress((1 + share) / 2),
     )  # fmt: skip
-    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
-    others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
+    single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(nearby_values)))
+    other_outputs = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
     slope, sd = {}, {}
     for name in gradients:
-        y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
-        square, off = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
-        rise = off @ offsets / square
-        unexplained_rise = off - np.outer(rise, offsets)
+        y = np.array([float(other[name]) for other in other_outputs]).reshape(-1, BESIDE)
+        square, deviations = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
+        rise = deviations @ offsets / square
+        unexplained_rise = deviations - np.outer(rise, offsets)
         slope[name] = rise / np.asarray(widths)
         sd[name] = np.sqrt(np.sum(unexplained_rise**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
     return ClimbDerivatives(
@@ -210,12 +210,12 @@ def outputs_of_run(robot: Robot, terrain: Terrain, ended: ClimbRuns, k: int) -> 
 
 def _value_and_derivatives_along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
     """Value of a function and its derivatives along `directions`. Leaves have a first axis (None: zero)."""
-    numbers, rest = eqx.partition(at, eqx.is_inexact_array)
+    numbers, static_parts = eqx.partition(at, eqx.is_inexact_array)
     further: list[Any] = []
 
     def one(moved: Any) -> tuple[Any, Any, Any]:
         def of_numbers(numbers: Any) -> tuple[Any, Any]:
-            numeric, others = eqx.partition(function(eqx.combine(numbers, rest)), eqx.is_inexact_array)
+            numeric, others = eqx.partition(function(eqx.combine(numbers, static_parts)), eqx.is_inexact_array)
             arrays, words = eqx.partition(others, eqx.is_array)
             further.append(words)
             return numeric, arrays
@@ -239,5 +239,5 @@ def _advance_with_samples(
 
 @functools.partial(compiled, options=SELDOM)
 def _advance_part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
-    along = functools.partial(_advance_with_samples, first=first, step=step, steps=steps, samples=samples)
-    return _value_and_derivatives_along(along, at, directions)
+    advance = functools.partial(_advance_with_samples, first=first, step=step, steps=steps, samples=samples)
+    return _value_and_derivatives_along(advance, at, directions)

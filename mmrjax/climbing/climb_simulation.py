@@ -166,8 +166,8 @@ class ClimbRecord(eqx.Module):
 
         Negative if the line is outside them, NaN for a robot that falls or bounces.
         """
-        least = jnp.min(self.base, axis=-1)
-        return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
+        lowest = jnp.min(self.base, axis=-1)
+        return jnp.where(jnp.isfinite(lowest) & (self.carried >= CARRIED), lowest, jnp.nan)
 
 
 class ClimbSystem(eqx.Module):
@@ -322,8 +322,8 @@ def climb_instant(
     """
     touching = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
-    bears = touching.force * touching.rolls
-    share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
+    bearing_force = touching.force * touching.rolls
+    share = bearing_force / jnp.maximum(jnp.sum(bearing_force), 1e-9)
     speed = share @ (touching.carried @ motion.v)
     conditions = _driven(run, on)
 
@@ -342,8 +342,8 @@ def _driven(run: ClimbSystem, on: Scalar) -> Conditions:
 
 def _lever_loss(run: ClimbSystem, speed: Array) -> Array:
     """Loss torques of the lever tracks (24) [N·m], at the speeds of their pulleys relative to the levers [rad/s]."""
-    rolls = contact.smooth_sign(run.shape.main.first * speed, run.chassis.speed_still)
-    return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
+    direction = contact.smooth_sign(run.shape.main.first * speed, run.chassis.speed_still)
+    return jnp.asarray(run.lever_track.torque_loss(speed, direction))
 
 
 def _with_lever_current(run: ClimbSystem, motion: ClimbMotion) -> ClimbSystem:
@@ -370,8 +370,8 @@ def _drive_action(
 ) -> LeverStep:
     """Action of the lever drives in a step. Without it, the rates after the step would be `free` [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
-    most = jnp.abs(source) if sequence.supply is None else sequence.supply
-    high = jnp.stack([most, most])
+    lever_voltage = jnp.abs(source) if sequence.supply is None else sequence.supply
+    high = jnp.stack([lever_voltage, lever_voltage])
     low = -high
     aims = demanded_lever_rates(run, motion, time)
     if sequence.begins is not None:
@@ -380,8 +380,8 @@ def _drive_action(
         low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
     # beyond its range a lever is not driven further
     angles = _convert_lever_angles(*motion.q[LED])
-    above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
-    up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
+    above_range, below_range = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
+    up, down = jnp.stack([above_range[0], below_range[1]]), jnp.stack([below_range[0], above_range[1]])
     low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
     return step_levers(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
 
@@ -431,8 +431,8 @@ def advance_climb(
     inverse = jnp.array(
         [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
     ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
-    alone = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
-    swung = _drive_action(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
+    lever_speeds = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
+    swung = _drive_action(run, motion, time, signals.voltage_source, lever_speeds, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
     gained = jnp.concatenate([acceleration - coupling @ led, led])
     v = motion.v + gained
@@ -440,8 +440,8 @@ def advance_climb(
 
     charge = balances.charge_drawn(robot, run.conditions, signals.total_current)
     current = current_after(robot, _driven(run, on), step, signals)
-    drawn = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
-    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
+    lever_current = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
+    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, lever_current)
 
     pair = run.drive
     # (1 / step) is the compiler's form of a division by a constant: a step passed as an argument gives the same bits
@@ -476,11 +476,11 @@ def advance_climb(
     total = jnp.sum(touching.force)
     adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
-    passed = ClimbRecord(
+    record = ClimbRecord(
         time=time,
         motion=motion,
         current=signals.current,
-        total_current=signals.total_current + drawn,
+        total_current=signals.total_current + lever_current,
         voltage=signals.voltage,
         torque=up * swung.torque,
         lever_current=up * swung.current,
@@ -495,15 +495,15 @@ def advance_climb(
         centre=centre,
         base=_distances_to_outermost_contacts(centre, touching),
     )
-    return after, spent, passed
+    return after, spent, record
 
 
 def _distances_to_outermost_contacts(centre_of_mass: Scalar, at: Footing) -> Pair:
     """Distances from the centre of mass to the outermost contacts behind and ahead [m], measured along level
     ground.
     """
-    bears, ahead = at.force > 0, at.place - centre_of_mass
-    return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
+    is_loaded, ahead = at.force > 0, at.place - centre_of_mass
+    return jnp.stack([jnp.max(jnp.where(is_loaded, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
 def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Footing) -> Scalar:
@@ -617,9 +617,9 @@ def advance_samples(
         motion, energy, progress = state
 
         def small(j: Array, carry: Any) -> Any:
-            *after, passed = advance_climb(run, carry[0], first + (k * steps + j) * run.step, carry[1])
-            base = jnp.maximum(passed.base, carry[2].base)
-            return (*after, dataclasses.replace(passed, base=base))
+            *after, record = advance_climb(run, carry[0], first + (k * steps + j) * run.step, carry[1])
+            base = jnp.maximum(record.base, carry[2].base)
+            return (*after, dataclasses.replace(record, base=base))
 
         nothing = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
@@ -739,8 +739,10 @@ def climb_batch(
     state = _begin(robot, conditions, terrain, sequence, interval, start)
     records: list[ClimbRecord] = []
     for k in range(parts):
-        first = jnp.asarray(k * samples * steps * step)
-        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, step_numbers, samples)
+        first_step = jnp.asarray(k * samples * steps * step)
+        state, passed = _compiled(
+            robot, conditions, terrain, sequence, state, first_step, interval, step_numbers, samples
+        )
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
         records = [*(records if record else []), jax.device_get(last)]

@@ -193,9 +193,9 @@ def _wheel_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> l
         gap = jnp.concatenate([jnp.where(beside, to_edge, FAR_OFF), to_corner]) - shape.wheel - terrain.nose
         normal = jnp.concatenate([normals, arm / to_corner[:, None]])
         touch_points = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
-        none = jnp.zeros_like(gap)
+        zeros = jnp.zeros_like(gap)
         rate = shape.wheel * belt_loop.running_direction(-normal)
-        groups.append(_ContactGroup(touch_points, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
+        groups.append(_ContactGroup(touch_points, gap, normal, rate, None, zeros, zeros + 1 - shape.on_tracks))
     return groups
 
 
@@ -209,8 +209,8 @@ def _body_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> _C
     is_over = jnp.abs(local[:, 0]) < shape.half
     gap = jnp.where(is_over & (local[:, 1] < 0), shape.belly - local[:, 1], FAR_OFF) - terrain.nose
     up = body.along(jnp.broadcast_to(jnp.array([0.0, 1.0]), local.shape))
-    none = jnp.zeros_like(gap)
-    return _ContactGroup(terrain.corners + terrain.nose * up, gap, up, 0 * up, None, none, none + 1, 0.0)
+    zeros = jnp.zeros_like(gap)
+    return _ContactGroup(terrain.corners + terrain.nose * up, gap, up, 0 * up, None, zeros, zeros + 1, 0.0)
 
 
 def contacts_with_terrain(shape: ContactShape, terrain: Terrain, q: Array, v: Array) -> Footing:
@@ -221,8 +221,8 @@ def contacts_with_terrain(shape: ContactShape, terrain: Terrain, q: Array, v: Ar
     groups = _belt_contacts(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
     for lever in (front, rear):
         assert lever.turns is not None
-        drawn = radius * (q[SHAFT] + q[lever.turns])
-        groups += _belt_contacts(shape, terrain, shape.lever, lever, drawn, shape.on_tracks)
+        belt_travel = radius * (q[SHAFT] + q[lever.turns])
+        groups += _belt_contacts(shape, terrain, shape.lever, lever, belt_travel, shape.on_tracks)
     groups += _wheel_contacts(shape, terrain, body)
     groups.append(_body_contacts(shape, terrain, body))
 

@@ -158,12 +158,12 @@ def step_levers(
         weak, strong = (drive.constant / drive.resistance * (x[k] - drive.constant * speed) for x in (least, most))
         on = pushed[k][ways]
         beyond = end[ways] * (speed - asked[k]) * stiff
-        stays = jnp.maximum(on - up, down - on)
+        standing_excess = jnp.maximum(on - up, down - on)
         goes = jnp.maximum(-way[ways] * speed * stiff, -sign[ways] * force)
         off = jnp.where(
             follows[ways],
             jnp.maximum(low - strong, weak - high),
-            jnp.maximum(jnp.where(moves[ways], goes, stays), beyond),
+            jnp.maximum(jnp.where(moves[ways], goes, standing_excess), beyond),
         )
         return jnp.maximum(off, 0.0), jnp.clip(jnp.clip(0.0, low, high), weak, strong), force, speed
 

@@ -104,9 +104,9 @@ def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = Non
     front, rear = masses.lever_angles(gear, conditions)
     half, reach = gear.wheelbase / 2, gear.lever_length * tracked
     axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
-    none = jnp.zeros_like(half)
+    zeros = jnp.zeros_like(half)
     corners = [-half - reach * jnp.cos(rear), -half, half, half + reach * jnp.cos(front)]
-    lie = [reach * jnp.sin(rear), none, none, reach * jnp.sin(front)]
+    lie = [reach * jnp.sin(rear), zeros, zeros, reach * jnp.sin(front)]
     forward, up, radius = (
         jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x) for x in row)), -1)
         for row in (corners, lie, [roller, axle, axle, roller])

@@ -131,20 +131,22 @@ def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLim
     Args:
         pitch: pitch of the highest step [rad]. None: it is searched.
     """
-    still = jax.lax.stop_gradient(side)
+    constant_side = jax.lax.stop_gradient(side)
     best = (
-        _pitch_of_highest_step(lambda pitch: step_height_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
+        _pitch_of_highest_step(lambda pitch: step_height_at(constant_side, pitch), *_PITCHES)[0]
+        if pitch is None
+        else pitch
     )
-    beside = best + jnp.array([-_BESIDE, _BESIDE])
-    rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_height_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(
-        beside
-    )
+    neighbours = best + jnp.array([-_BESIDE, _BESIDE])
+    rises = jax.vmap(
+        lambda pitch: jax.jvp(lambda x: step_height_at(constant_side, x), (pitch,), (jnp.ones_like(pitch),))[1]
+    )(neighbours)
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
     height_change = jnp.asarray(
-        jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(still, pitch))(beside)
+        jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(constant_side, pitch))(neighbours)
     )
     pitched = side.with_pitch(best)
-    height = step_height_at(still, best) + share * height_change[0] + (1 - share) * height_change[1]
+    height = step_height_at(constant_side, best) + share * height_change[0] + (1 - share) * height_change[1]
     return StepLimit(height, best, pitched, -lowest_points(pitched)[0])
 
 

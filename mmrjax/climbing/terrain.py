@@ -69,9 +69,9 @@ class Terrain(eqx.Module):
         sign = jnp.where(self.inside(at), -1.0, 1.0)
         edge = along / jnp.sqrt(square)[:, None]
         edge = jnp.stack([-edge[:, 1], edge[:, 0]], axis=1)[nearest[:, 0]]
-        within = (share > 0) & (share < 1) | (least < 1e-24)
-        normal = jnp.where(within[:, None], edge, (sign / length)[:, None] * off)
-        return jnp.where(within, jnp.sum(edge * off, axis=1), sign * length) - self.nose, normal
+        is_inside = (share > 0) & (share < 1) | (least < 1e-24)
+        normal = jnp.where(is_inside[:, None], edge, (sign / length)[:, None] * off)
+        return jnp.where(is_inside, jnp.sum(edge * off, axis=1), sign * length) - self.nose, normal
 
 
 def _cross_product(a: Array, b: Array) -> Array:
@@ -110,8 +110,8 @@ def stairs(rise: Scalar, tread: Scalar, count: int, nose: Scalar = 0.0, size: in
     points: list[tuple[Scalar, Scalar]] = [(-FAR, 0.0)]
     for k in range(count):
         points += [(k * tread, k * rise), (k * tread, (k + 1) * rise)]
-    last = (count - 1) * tread
-    return _terrain_of_points([*points, (last + FAR, count * rise)], last, nose, size)
+    last_edge = (count - 1) * tread
+    return _terrain_of_points([*points, (last_edge + FAR, count * rise)], last_edge, nose, size)
 
 
 def gap(width: Scalar, size: int = 0) -> Terrain:
@@ -131,17 +131,17 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
         raise ValueError(f"terrain: got x of shape {x.shape} and z of {z.shape}; expected two points or more")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
         raise ValueError("terrain: got a point that is not a number; expected x and z in metres")
-    if (back := np.flatnonzero(np.diff(x) < 0)).size:
-        k = int(back[0])
+    if (points_of_falls := np.flatnonzero(np.diff(x) < 0)).size:
+        k = int(points_of_falls[0])
         raise ValueError(
             f"terrain: x falls from {x[k]:g} to {x[k + 1]:g} m at point {k + 2}; expected ground that goes forward, "
             "x equal or larger from point to point (no overhangs)"
         )
     keep = np.concatenate([[True], (np.diff(x) != 0) | (np.diff(z) != 0)])
     x, z = x[keep], z[keep]
-    up = np.where(np.diff(x) == 0, np.diff(z), 0.0)
-    if (back := np.flatnonzero(up[1:] * up[:-1] < 0)).size:
-        k = int(back[0]) + 1
+    rise = np.where(np.diff(x) == 0, np.diff(z), 0.0)
+    if (points_of_falls := np.flatnonzero(rise[1:] * rise[:-1] < 0)).size:
+        k = int(points_of_falls[0]) + 1
         raise ValueError(
             f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected a wall up or down"
         )

@@ -129,12 +129,12 @@ class Programs:
             return existing.result()
         # The tracing thread may wait for a program of another thread, which must have finished its own tracing.
         with TRACING:
-            first = structure not in self._found
+            is_new = structure not in self._found
             promise = self._found.setdefault(structure, Future())
-            if first:
+            if is_new:
                 leaves, tree = jax.tree.flatten(arguments)
                 make = self._kept(structure, functools.partial(self._obtained, Path(folder), leaves, tree))
-        if first:
+        if is_new:
             promise.set_result(self._kept(structure, make))
         return promise.result()
 
@@ -177,8 +177,8 @@ class Programs:
                 if read or "callback" in text:
                     return StoredProgram(program, result)
                 with contextlib.suppress(Exception):  # an unwritable program, for any reason, is not stored
-                    written = serialize_executable.serialize(program)[0]
-                    _write_atomically(_executable(folder, compiled), zlib.compress(written, 1))
+                    serialized = serialize_executable.serialize(program)[0]
+                    _write_atomically(_executable(folder, compiled), zlib.compress(serialized, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
                 _write_atomically(place, pickle.dumps((result, compiled)))
             return StoredProgram(program, result)
@@ -317,12 +317,12 @@ def _executable(folder: Path, name: str) -> Path:
 
 def _load_executable(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., list[Any]] | None:
     """The executable with that name for this number of arrays, None if it is missing or unreadable."""
-    out = sum(isinstance(x, _ArrayPlaceholder) for x in jax.tree.leaves(result))
+    result_count = sum(isinstance(x, _ArrayPlaceholder) for x in jax.tree.leaves(result))
     try:
-        written = zlib.decompress(_executable(folder, name).read_bytes())
+        serialized = zlib.decompress(_executable(folder, name).read_bytes())
         _load_lapack()
         return serialize_executable.deserialize_and_load(
-            written, jax.tree.structure(((0,) * arrays, {})), jax.tree.structure([0] * out)
+            serialized, jax.tree.structure(((0,) * arrays, {})), jax.tree.structure([0] * result_count)
         )
     except Exception:  # an unreadable entry, for any reason, is made again
         return None

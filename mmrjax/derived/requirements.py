@@ -128,8 +128,8 @@ def thermal_margin(robot: Robot, point: EnvelopePoint, current: Scalar, limit: S
     1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a). `robot` as stated, not as returned by `_robot_and_conditions_at`.
     """
     motor = robot.motor
-    hot = motor.resistance * motor.resistance_ratio(limit)
-    return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
+    hot_resistance = motor.resistance * motor.resistance_ratio(limit)
+    return 1 - current**2 * motor.resistance_thermal * hot_resistance / jnp.maximum(limit - point.ambient, 1.0)
 
 
 def _cell_voltage_margin(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
@@ -195,23 +195,23 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
         loaded_point = dataclasses.replace(point, payload=payload)
         robot_there, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
         signals, _, _ = operating_state(robot_there, conditions)
-        hot = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
+        heat_margin = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
         margins = [
             steepest_slope.travel_margin(robot_there, signals),
-            hot,
+            heat_margin,
             torque,
             _cell_voltage_margin(rated, signals, point),
         ]
         return functools.reduce(jnp.minimum, margins)
 
-    found, holds = _find_sign_change(smallest_margin, robot, jnp.zeros(()), jnp.asarray(most))
+    found, is_positive = _find_sign_change(smallest_margin, robot, jnp.zeros(()), jnp.asarray(most))
     unladen_robot, conditions = _robot_and_conditions_at(
         robot, dataclasses.replace(point, payload=jnp.zeros(())), rated
     )
     signals, status, _ = operating_state(unladen_robot, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
-    return QuantityValue(jnp.where(holds, found, 0.0), outcome)
+    return QuantityValue(jnp.where(is_positive, found, 0.0), outcome)
 
 
 def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
@@ -219,24 +219,24 @@ def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Ar
 
     `high` if it does not become negative. Derivatives are implicit, forward and reverse.
     """
-    still = jax.lax.stop_gradient(robot)
+    constant_robot = jax.lax.stop_gradient(robot)
 
     def halve(bracket: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         a, b = bracket
         middle = (a + b) / 2
-        holds = margin(still, middle) > 0
-        return (jnp.where(holds, middle, a), jnp.where(holds, b, middle)), None
+        is_positive = margin(constant_robot, middle) > 0
+        return (jnp.where(is_positive, middle, a), jnp.where(is_positive, b, middle)), None
 
     begin, end = jax.lax.stop_gradient((low, high))
     (a, b), _ = jax.lax.scan(halve, (begin, end), None, length=HALVINGS)
-    at = (a + b) / 2
-    steep = jax.jvp(lambda x: margin(still, x), (at,), (jnp.ones_like(at),))[1]
+    root = (a + b) / 2
+    steep = jax.jvp(lambda x: margin(constant_robot, x), (root,), (jnp.ones_like(root),))[1]
     usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
-    step = margin(robot, at) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
-    edge = at - jnp.where(usable & jnp.isfinite(step), step, 0.0)
+    step = margin(robot, root) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
+    edge = root - jnp.where(usable & jnp.isfinite(step), step, 0.0)
     # A margin that jumps has no root for a Newton step.
-    edge = jnp.where(jnp.abs(edge - at) < 1e-3 * (end - begin) + 1e-9, edge, at)
-    return jnp.where(margin(still, end) > 0, high, edge), margin(still, begin) > 0
+    edge = jnp.where(jnp.abs(edge - root) < 1e-3 * (end - begin) + 1e-9, edge, root)
+    return jnp.where(margin(constant_robot, end) > 0, high, edge), margin(constant_robot, begin) > 0
 
 
 #: Nodes of the integral over the charge.
@@ -249,7 +249,9 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
     The robot drives at full voltage for a share s of the time and stands otherwise. It ends when a cell reaches its
     cut-off.
     """
-    first, last = (jnp.asarray(robot.battery.capacity * (1 - x)) for x in (point.charge, point.charge_end))
+    charge_at_begin, charge_at_end = (
+        jnp.asarray(robot.battery.capacity * (1 - x)) for x in (point.charge, point.charge_end)
+    )
 
     def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
         """Mean battery current [A], margin above the cut-off [V], status."""
@@ -262,12 +264,12 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
         current = robot_there.battery.current(point.share * motors)
         return current, cell, jnp.where(stands, CONVERGED, status)
 
-    end, begins = _find_sign_change(lambda robot, c: drawn(robot, c)[1], robot, first, last)
+    end, begins = _find_sign_change(lambda robot, c: drawn(robot, c)[1], robot, charge_at_begin, charge_at_end)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    discharges = first + (end - first) * jnp.asarray((nodes + 1) / 2)
+    discharges = charge_at_begin + (end - charge_at_begin) * jnp.asarray((nodes + 1) / 2)
     current, _, status = jax.vmap(lambda c: drawn(robot, c))(discharges)
     flowing = jnp.maximum(current, 1e-9)
-    time = (end - first) * jnp.sum(jnp.asarray(weights / 2) / flowing)
+    time = (end - charge_at_begin) * jnp.sum(jnp.asarray(weights / 2) / flowing)
     worst = status[jnp.argmax(status != CONVERGED)]
     outcome = jnp.where(begins, worst, CUT_OFF)
     return QuantityValue(time, outcome)
@@ -292,9 +294,13 @@ def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str)
     signals, motion, status = circling_signals(robot_there, conditions)
     low = jnp.any(jnp.asarray(_cell_voltage_margin(rated, signals.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
-    rolls = motion.speed**2 + motion.speed_lateral**2
+    speed_squared = motion.speed**2 + motion.speed_lateral**2
     # A root of 0 has no derivative.
-    value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.sqrt(jnp.maximum(rolls, 1e-24)) / jnp.abs(turns)
+    value = (
+        motion.yaw_rate
+        if name == "turn_in_place_rad_s"
+        else jnp.sqrt(jnp.maximum(speed_squared, 1e-24)) / jnp.abs(turns)
+    )
     return QuantityValue(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
 
 
@@ -307,13 +313,15 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
     chassis = robot_there.chassis(conditions.configuration)
-    stands = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
+    stance = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
     friction = chassis.ground.friction.static * point.adhesion
     rolling_share = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
     # A root of 0 has no derivative.
-    slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
-    tips = stands.width / (2 * stands.height)
-    return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
+    slope_of_sliding = friction * stance.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
+    slope_of_tipping = stance.width / (2 * stance.height)
+    return QuantityValue(
+        jnp.degrees(jnp.arctan(jnp.minimum(slope_of_sliding, slope_of_tipping))), jnp.asarray(CONVERGED)
+    )
 
 
 def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:

@@ -120,11 +120,11 @@ def stages_of_start(
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
     starting = float(time[int(np.argmax(sense * sliding))])
     sliding, even = (_moving_means(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
-    beyond = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
-    slipping = float(time[min(int(beyond[-1]) + 1, len(time) - 1)]) if beyond.size else starting
-    last = speed[last_samples(time)].mean()
-    late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
-    settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
+    slipping_instants = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
+    slipping = float(time[min(int(slipping_instants[-1]) + 1, len(time) - 1)]) if slipping_instants.size else starting
+    final_speed = speed[last_samples(time)].mean()
+    unsettled_instants = np.flatnonzero(np.abs(even - final_speed) > WITHIN * abs(final_speed))
+    settled = float(time[min(int(unsettled_instants[-1]) + 1, len(time) - 1)]) if unsettled_instants.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
     slips = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
     mean_of_start = mean_slip(time, speed, theoretical, 0.0, settled)
@@ -185,14 +185,14 @@ def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: S
     finite_values = jnp.where(jnp.isfinite(x), x, -jnp.inf)
     k = jnp.clip(jnp.argmax(finite_values), 1, x.shape[0] - 2)
     before, after = times[k] - times[k - 1], times[k + 1] - times[k]
-    inside = (before > 0) & (after > 0) & (x[k] > x[k - 1]) & (x[k] > x[k + 1])
-    before, after = jnp.where(inside, before, 1.0), jnp.where(inside, after, 1.0)
+    is_peak = (before > 0) & (after > 0) & (x[k] > x[k - 1]) & (x[k] > x[k + 1])
+    before, after = jnp.where(is_peak, before, 1.0), jnp.where(is_peak, after, 1.0)
     rise, fall = (x[k] - x[k - 1]) / before, (x[k + 1] - x[k]) / after
     bend = (fall - rise) / (before + after)
     slope = rise + bend * before
     highest = finite_values[jnp.argmax(finite_values)]
-    top = jnp.minimum(x[k] - slope**2 / (4 * jnp.where(inside, bend, -1.0)), jnp.maximum(kink, highest))
-    return jnp.where(inside, top, highest)
+    top = jnp.minimum(x[k] - slope**2 / (4 * jnp.where(is_peak, bend, -1.0)), jnp.maximum(kink, highest))
+    return jnp.where(is_peak, top, highest)
 
 
 def first_crossing(

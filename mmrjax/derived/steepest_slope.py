@@ -50,7 +50,9 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         `steepest_slope` [deg], NaN if the robot does not travel on level ground, `STEEPEST`, with zero derivatives,
         if it climbs that. `status` is that of level ground.
     """
-    flat = operating_point(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]
+    level_point = operating_point(
+        robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg))
+    )[0]
     still_robot, still = jax.lax.stop_gradient((robot, conditions))
 
     solution: optx.Solution = optx.root_find(
@@ -68,4 +70,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     steepest = root - slope_margin(robot, conditions, root) / slope
     holds_all = slope_margin(still_robot, still, jnp.full_like(root, STEEPEST)) > 0
     steepest = jnp.where(holds_all, STEEPEST, jnp.clip(steepest, 0.0, STEEPEST))
-    return {"steepest_slope": jnp.where(flat.status == CONVERGED, steepest, jnp.nan), "status": flat.status}
+    return {
+        "steepest_slope": jnp.where(level_point.status == CONVERGED, steepest, jnp.nan),
+        "status": level_point.status,
+    }

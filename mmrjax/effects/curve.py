@@ -156,8 +156,8 @@ _EXTENDED[0, :3] = _EXTENDED[-1, :-4:-1] = 6.0, -8.0, 3.0
 def _level_below_zero(u: Scalar) -> Float[Array, "..."]:
     """u if positive. Below 0 a parabola with slope 1 at 0 that is level from u = -LEVEL _LAST on."""
     width = LEVEL * _LAST
-    below = jnp.clip(u, -width, 0.0)
-    return jnp.maximum(u, 0.0) + below + below**2 / (2 * width)
+    negative_part = jnp.clip(u, -width, 0.0)
+    return jnp.maximum(u, 0.0) + negative_part + negative_part**2 / (2 * width)
 
 
 def ordinate_weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 6"]:

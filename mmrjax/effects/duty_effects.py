@@ -46,10 +46,10 @@ class DutyExponent(DutyEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         log = jnp.log(at_least(jnp.abs(signals.command), LEAST_POWER))
-        beyond = (self.exponent - 1) * log
-        near = jnp.abs(beyond) < 1e-6
-        far = jnp.where(near, 1.0, beyond)
-        ratio = jnp.where(near, 1 + beyond / 2, jnp.expm1(far) / far)
+        exponent = (self.exponent - 1) * log
+        near = jnp.abs(exponent) < 1e-6
+        far = jnp.where(near, 1.0, exponent)
+        ratio = jnp.where(near, 1 + exponent / 2, jnp.expm1(far) / far)
         return -self.amplitude * signals.command * log * ratio
 
 

@@ -52,7 +52,7 @@ class BrushDrop(ElectricalEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "V", "voltage drop of a pair of brushes", (-0.5, 3.0), "0.2 V (copper-graphite) to 1 V (graphite) a pair",
+        "V", "voltage drop of a pair of brushes", (-0.5, 3.0), "0.2 V (copper-graphite) to 1 V (graphite) per pair",
         sd=0.5,
     )  # fmt: skip
     current_ohmic: Scalar = parameter(

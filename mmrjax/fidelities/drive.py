@@ -75,8 +75,11 @@ def state_of_unknowns(robot: Robot, y: Unknowns) -> State:
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     first = len(_UNITS) + len(memory)
-    own = dict(zip(robot.controller_states, y[first : first + len(robot.controller_states)], strict=True))
-    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None, **own)
+    controller_states = dict(
+        zip(robot.controller_states, y[first : first + len(robot.controller_states)], strict=True)
+    )
+    gap = y[-1] if robot.loose else None
+    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=gap, **controller_states)
 
 
 def unknowns_of_state(robot: Robot, state: State) -> Unknowns:
@@ -89,7 +92,7 @@ def unknowns_of_state(robot: Robot, state: State) -> Unknowns:
 
 
 def sampled_unknowns(robot: Robot, conditions: Conditions, y: Unknowns) -> Unknowns:
-    """Unknowns after a controller with a rate has read them, if a sample is due. Of other robots the same."""
+    """Unknowns after a controller with a rate has read them, if a sample is due. Unchanged for other robots."""
     if robot.controller is None or not robot.controller.rate:
         return y
     state = balances.sampled_controller(robot, conditions, state_of_unknowns(robot, y))
@@ -179,8 +182,8 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
     radius = robot.chassis(conditions.configuration).radius
     turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
     rolling, none = radius * turning / robot.gearbox.ratio, jnp.zeros(())
-    still = State(none, turning, rolling, none, distance=radius * begin.angle)
-    conditions = balances.with_controller_duty(robot, conditions, still)
+    state_without_slip = State(none, turning, rolling, none, distance=radius * begin.angle)
+    conditions = balances.with_controller_duty(robot, conditions, state_without_slip)
     voltage_left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
         share = jnp.abs(balances.bridge_duty(robot, conditions)) if robot.driver.decay == FAST else 1.0
@@ -223,15 +226,15 @@ def drive(
     if conditions.turns:
         return _drive_turning(robot, conditions, times, tolerance, max_steps, rolling)
     y0 = drive_start(robot, conditions, rolling)
-    imposed = conditions.motor_speed is not None
-    driven = rolling or imposed or robot.controller is not None  # a controller may turn it later
+    is_speed_imposed = conditions.motor_speed is not None
+    driven = rolling or is_speed_imposed or robot.controller is not None  # a controller may turn it later
     parked = jnp.asarray(False) if driven else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
     run = robot, conditions, moves, y0, times, tolerance, max_steps
     sampled = robot.controller is not None and robot.controller.rate
     ys, went = _integrate_samples(*run) if sampled else _integrate_unknowns(drive_rates, _norm, *run)
     signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
-    if not imposed:
+    if not is_speed_imposed:
         static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
         signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)

@@ -96,28 +96,32 @@ def time_grid(
     last = float(np.max(times, initial=0.0))
     changes = np.zeros(0) if changes is None else np.asarray(changes, float)
     sizes = np.ones(len(changes)) if sizes is None else np.asarray(sizes, float)
-    inside = (changes > 0) & (changes < last)
-    begins, first = np.append(0.0, changes[inside]), np.append(start[0], change[0] / sizes[inside])
-    grows = np.append(start[1], np.full(inside.sum(), change[1]))
+    is_inside = (changes > 0) & (changes < last)
+    begins, first = np.append(0.0, changes[is_inside]), np.append(start[0], change[0] / sizes[is_inside])
+    grows = np.append(start[1], np.full(is_inside.sum(), change[1]))
     requested_times, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
     longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
     longest = np.broadcast_to(longest, max(len(requested_times) - 1, 1))
     longest = longest[np.clip(np.searchsorted(requested_times, times[:-1], side="right") - 1, 0, len(longest) - 1)]
     interval_index = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
-    since, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
+    interval_start, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
     knee = np.maximum((longest - first) / grows, 0.0)
 
     def step_count(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
         young = np.log1p(grows * np.minimum(t, knee) / first) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
-    at, ends, at_knee = step_count(times[:-1] - since), step_count(times[1:] - since), step_count(knee)
+    at, ends, at_knee = (
+        step_count(times[:-1] - interval_start),
+        step_count(times[1:] - interval_start),
+        step_count(knee),
+    )
     instants = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
         even_places = np.linspace(at[k], ends[k], count, endpoint=False)
         young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(even_places, at_knee[k]))
-        instants.append(since[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
+        instants.append(interval_start[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
         instants[-1][0] = times[k]
     all_instants = np.concatenate([*instants, times[-1:]])
     return np.interp(
@@ -332,12 +336,12 @@ def _solve_stage(
         matrix, value = jax.jacfwd(lambda y: (left(y),) * 2, has_aux=True)(y)
         step = solve(matrix, value)
         # Over a kink of the friction law full steps can alternate without end.
-        tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
-        residual_size = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
-        best = jnp.where(residual_size[0] < residual_size[1], tried[0], tried[1])
+        trials = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
+        residual_size = jnp.max(jnp.abs(jax.vmap(left)(trials)), 1)
+        best = jnp.where(residual_size[0] < residual_size[1], trials[0], trials[1])
         return (
             count + 1,
-            jnp.where(residual_size[2] <= jnp.min(residual_size), tried[2], best),
+            jnp.where(residual_size[2] <= jnp.min(residual_size), trials[2], best),
             jnp.min(residual_size),
         )
 
@@ -689,8 +693,8 @@ def _unknowns_of_run(
     robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: LinearisedRun | None
 ) -> tuple[Float[Array, "times unknowns"], Float[Array, "steps 2"]]:
     """Unknowns at every instant, and `sides` of every step."""
-    still = jax.lax.stop_gradient(robot)
-    run = solve_states(still, conditions, times) if known is None else known
+    constant_robot = jax.lax.stop_gradient(robot)
+    run = solve_states(constant_robot, conditions, times) if known is None else known
     ends = _unknowns_at_ends(robot, conditions, times, run)
     return jnp.concatenate([first_conditions_and_state(robot, conditions)[1][None], ends]), run.sides
 

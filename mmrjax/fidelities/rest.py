@@ -36,10 +36,10 @@ def smallest_of(*values: Scalar) -> Array:
     The derivative of `jnp.minimum` is 0 if XLA computes an argument twice with different rounding, because it
     compares each argument with the result.
     """
-    least = jnp.asarray(values[0])
+    smallest = jnp.asarray(values[0])
     for value in values[1:]:
-        least = jnp.where(value < least, value, least)
-    return least
+        smallest = jnp.where(value < smallest, value, smallest)
+    return smallest
 
 
 def travel_direction(robot: Robot, conditions: Conditions) -> Array:
@@ -234,16 +234,18 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
-        leaving_sense, later = (
+        leaving_sense, later_sense = (
             1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then)
         )
-        lacks, exceeds = (jnp.where(later > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then))
+        lacks, exceeds = (
+            jnp.where(later_sense > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then)
+        )
         winding = balances.driven_signals(robot, conditions, _without_motion(state), None)
         rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
-        waits = (leaving_sense == 0) & (later != 0) & (rises * missing > 0)
+        waits = (leaving_sense == 0) & (later_sense != 0) & (rises * missing > 0)
         share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
         wait = -jnp.log1p(-share) * missing / jnp.where(waits, rises, 1.0)
-        way = jnp.where(leaving_sense != 0, leaving_sense, jnp.where(later != 0, later, HELD))
+        way = jnp.where(leaving_sense != 0, leaving_sense, jnp.where(later_sense != 0, later_sense, HELD))
         stands = state.speed_motor == 0
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
@@ -323,8 +325,8 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
     """
     settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travel_status(end.speed, voltage))
-    sense, rest = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
+    sense, speed_still = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    still = is_at_rest(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, speed_still)
     status = jnp.where(still & (sense * end.acceleration < STARTS), STALLED, status)
     gain = end.acceleration * jnp.sign(end.speed_sliding)
     return status_with_slip(status, robot, end, gain, GAIN, still)

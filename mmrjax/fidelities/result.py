@@ -32,8 +32,8 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
     power_ground = sides * signals.traction * signals.speed
     temperature = robot.motor.temperature_settled(signals.current * robot.driver.ripple(signals.duty) ** 0.5)
     limit = robot.motor.temperature_limit
-    hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(HEAT)  # settled or not
-    flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": hot})
+    is_too_hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(HEAT)  # settled or not
+    flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": is_too_hot})
     result = Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,
@@ -69,7 +69,7 @@ def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """Limits exceeded at an instant, by the flag's name."""
     battery, on_battery = robot.battery, signals.battery > 0.5
     cell, current = signals.voltage_source / battery.cells, battery.current(signals.total_current)
-    most, back = battery.current_limit or jnp.inf, battery.current_charge or jnp.inf
+    discharge_limit, charge_limit = battery.current_limit or jnp.inf, battery.current_charge or jnp.inf
     # A full cell at rest may have its charge voltage: only a current into it can exceed the limit.
     overcharged = (cell > battery.voltage_charge) & (current < 0)
     torque = jnp.abs(signals.torque_gear)
@@ -77,9 +77,9 @@ def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
         "motor_overspeed": jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
         "gearbox_overspeed": jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
         "slips": movers_slip(robot, signals),
-        "overvoltage": on_battery & (overcharged | (current < -back)),
+        "overvoltage": on_battery & (overcharged | (current < -charge_limit)),
         "cut_off": on_battery & (cell < battery.voltage_cutoff),
-        "battery_overcurrent": on_battery & (current > most),
+        "battery_overcurrent": on_battery & (current > discharge_limit),
         "current_limited": robot.driver.limits(signals.current),
         "gearbox_overload": torque > (robot.gearbox.torque_limit or jnp.inf),
         "voltage_rising": on_battery & battery.rises(signals.discharge),

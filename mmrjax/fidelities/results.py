@@ -344,7 +344,7 @@ class Results:
         rows_of = (
             *outputs.output_table(self.channels), *mission_batch.OUTPUTS, *mission_batch.OF_TURNS,
         )  # fmt: skip
-        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit_shown, o.resolution) for o in rows_of}}
+        column_facts = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit_shown, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
             columns = ["configuration", *mission_batch.USUAL, "status"]
         elif columns is None:
@@ -365,7 +365,7 @@ class Results:
             ]
         cells = []
         for name in columns:
-            label, unit, digits = about.get(name, (name.replace("_", " "), "", 3))
+            label, unit, digits = column_facts.get(name, (name.replace("_", " "), "", 3))
             values = content[name][:rows]
             words = values.dtype.kind == "U"
             body = [str(v) if words else f"{v:z.{digits}f}" for v in values]

@@ -218,11 +218,11 @@ def check_robot(robot: Robot) -> None:
         if np.ndim(value) or np.asarray(value).dtype.kind not in "biuf":
             got = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
             raise UsageError(f"{parameter.name}: got {got}; expected one number; for several robots use jax.vmap")
-        wrong = _first_outside(value, *spec.bounds)
-        if wrong is not None:
+        place = _first_outside(value, *spec.bounds)
+        if place is not None:
             low, high = spec.bounds
             raise UsageError(
-                f"{parameter.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {spec.unit} "
+                f"{parameter.name}{place[0]}: got {place[1]:.6g}; expected {low:g} to {high:g} {spec.unit} "
                 f"({spec.meaning})"
             )
 
@@ -289,10 +289,10 @@ def _check_conditions(conditions: Conditions) -> None:
     declared_mass, payload = conditions.total_mass, conditions.payload
     if declared_mass is None or has_tracer((declared_mass, payload)):
         return
-    bare = np.asarray(declared_mass) - np.asarray(payload)
-    wrong = _first_outside(bare, np.nextafter(0.0, 1.0), math.inf)
+    own_mass = np.asarray(declared_mass) - np.asarray(payload)
+    wrong = _first_outside(own_mass, np.nextafter(0.0, 1.0), math.inf)
     if wrong is not None:
-        place = np.unravel_index(int(np.argmax(~(bare > 0))), bare.shape)
+        place = np.unravel_index(int(np.argmax(~(own_mass > 0))), own_mass.shape)
         mass, load = float(np.asarray(declared_mass)[place]), float(np.asarray(payload)[place])
         raise UsageError(f"total_mass{wrong[0]}: got {mass:g} kg; expected more than the payload, {load:g} kg")
 

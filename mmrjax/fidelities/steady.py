@@ -203,13 +203,13 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     speed = jnp.where(parked, 0.0, point.speed)
     reading = {**point.reading, "speed": speed}
     # The ground of a standing robot does not carry more than its limit either, although the shafts creep.
-    beyond = parked & (point.adhesion_used > 1)
+    exceeds_adhesion = parked & (point.adhesion_used > 1)
     point = dataclasses.replace(
         point,
         reading=reading,
         slip=jnp.where(parked, ground.slip_ratio(speed, point.theoretical_speed), point.slip),
-        adhesion_used=jnp.where(beyond, 1.0, point.adhesion_used),
-        traction=point.traction / jnp.where(beyond, point.adhesion_used, 1.0),
+        adhesion_used=jnp.where(exceeds_adhesion, 1.0, point.adhesion_used),
+        traction=point.traction / jnp.where(exceeds_adhesion, point.adhesion_used, 1.0),
         power_ground=jnp.where(parked, 0.0, point.power_ground),
         power_lift=jnp.where(parked, 0.0, point.power_lift),
     )
@@ -259,16 +259,20 @@ def _state_at_unknowns(
     sound, conditions = _conditions_are_sound(robot, conditions)
     sense = travel_direction(robot, conditions)
     state, signals, residual = _signals_and_residuals(robot, conditions, unknowns, sense)
-    rest = robot.chassis(conditions.configuration).speed_still
+    speed_still = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
-    still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, rest)
-    still |= sense * signals.speed_theoretical <= 1e-9
+    at_rest = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, speed_still)
+    at_rest |= sense * signals.speed_theoretical <= 1e-9
     # In the order in which they matter to a reader.
-    status = jnp.where(still, STALLED, travel_status(signals.speed, voltage))
+    status = jnp.where(at_rest, STALLED, travel_status(signals.speed, voltage))
     if robot.has_ground:
-        beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = compute_if_needed(beyond, _slides_in_place, detached, jnp.zeros_like(beyond)) if stands else beyond
-        status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
+        exceeds_adhesion = jnp.abs(signals.demand) > signals.adhesion_limit
+        is_sliding = (
+            compute_if_needed(exceeds_adhesion, _slides_in_place, detached, jnp.zeros_like(exceeds_adhesion))
+            if stands
+            else exceeds_adhesion
+        )
+        status = jnp.where(exceeds_adhesion, jnp.where(is_sliding, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
         stands_still &= ~_is_held(conditions) | (sense * unknowns[2] <= 1e-9)  # friction leaves the clamp nothing
@@ -282,18 +286,13 @@ def _state_at_unknowns(
     return signals, status, sound, residual
 
 
-def _vmap_axes(tree: Any) -> Any:
-    """Axes for `jax.vmap`: 0 for arrays with a leading axis of points, else None."""
-    return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
-
-
 #: Most points that a CPU computes at once; the intermediate values of a block then fit in its cache.
 BLOCK = 32_768
 
 
 def _map_over_points(function: Callable[..., Any], *arguments: Any) -> Any:
     """`function` of scalars, mapped over the leading axis of all arrays that have one. On a CPU block by block."""
-    batched = jax.vmap(function, in_axes=_vmap_axes(arguments))
+    batched = jax.vmap(function, in_axes=jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, arguments))
     leaves, tree = jax.tree.flatten(arguments)
     points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
     # Blocks of equal size share a program; a number of points without a suitable divisor is computed at once.

@@ -108,11 +108,13 @@ def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: 
     """Unknowns of `drive` after a step. A robot that has stopped is held if friction can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     last = len(y) - robot.loose
-    drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - len(robot.controller_states), last)))
+    keeps_changing = np.isin(
+        np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - len(robot.controller_states), last))
+    )
     y = drive.sampled_unknowns(robot, conditions, y)
     is_standing = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
     stands = is_standing & jnp.all(jnp.where(speeds, y, 0.0) == 0)
-    moves = jnp.where(stands, jnp.asarray(drawn, y.dtype), 1.0)
+    moves = jnp.where(stands, jnp.asarray(keeps_changing, y.dtype), 1.0)
 
     def rate(y: Array) -> tuple[Array, Array]:
         return drive.drive_rates(robot, conditions, y) * moves, y[:0]

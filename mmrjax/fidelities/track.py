@@ -95,8 +95,8 @@ def _period_averages(
     pitch, end = run.path.pitch, travelled[-1]
     middle = (travelled[1:] + travelled[:-1]) / 2
     plain = (time[1:] > time[-1] - WINDOW * (time[-1] - time[0])).astype(time.dtype)
-    first = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
-    periods = jnp.floor(jax.lax.stop_gradient((end - first) / pitch))
+    window_start = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
+    periods = jnp.floor(jax.lax.stop_gradient((end - window_start) / pitch))
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
     def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Any, Array]:
@@ -169,14 +169,14 @@ def _advance_and_record(
     kind = _moving_system_module(run.conditions)
 
     def small(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[Any, Array]]:
-        after, passed, guided = kind.advance(run, motion)
-        return after, (passed, guided)
+        after, record, guided = kind.advance(run, motion)
+        return after, (record, guided)
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
     def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
         after, records = jax.lax.scan(small, motion, None, length=steps)
-        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
-        return after, SampleRecord(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
+        record, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
+        return after, SampleRecord(after, record, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)
 

@@ -199,8 +199,8 @@ def _segment_status(
     largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
         mode == SPEED, per_speed, 1.0
     )
-    off = jnp.max(jnp.abs(jnp.asarray(asked.error)))
-    missed = controlled & (off > MISSED * jnp.maximum(largest, 10.0))
+    largest_error = jnp.max(jnp.abs(jnp.asarray(asked.error)))
+    missed = controlled & (largest_error > MISSED * jnp.maximum(largest, 10.0))
     status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
     return status, missed
 
@@ -310,8 +310,8 @@ def _segment_end(
     flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
     rise = law.stored(robot, signals) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
-    first, last = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
-    energy_supplied = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
+    energy_before, energy_after = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
+    energy_supplied = jnp.where(conditions.battery > 0.5, energy_after - energy_before, drawn - returned)
     ran = ~before.ended
     time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
     return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept)
@@ -326,8 +326,8 @@ def _assemble_mission(
     by_segment = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
     total, status = jax.tree.map(jnp.sum, by_segment), ends.status
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
-    first = jnp.argmax(bad)
-    outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
+    first_bad = jnp.argmax(bad)
+    outcome = jnp.where(jnp.any(bad), status[first_bad], CONVERGED)
     outcome = jnp.where(c.ended, _early_end_status(c), outcome)
     end = jax.tree.map(lambda x: x[-1], ends.found)
     answer = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
@@ -370,7 +370,7 @@ def _recorded_course(
     index = jnp.arange(len(ys))
     # Segment of each recorded step: the first one with a larger step count.
     segment = jnp.minimum(jnp.searchsorted(kept, index, side="right"), len(kept) - 1)
-    within = index < kept[-1]
+    is_recorded = index < kept[-1]
     begin_times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
     so_far = {
         name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
@@ -386,12 +386,12 @@ def _recorded_course(
     winding, housing = _winding_and_housing_temperatures(law, ys)
 
     def shown(x: Array) -> Array:
-        return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
+        return jnp.where(is_recorded.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return MissionCourse(
         time=shown(begin_times + ys[:, law.CLOCK]),
-        segment=jnp.where(within, segment, -1),
-        event=jnp.where(within, marks, -1),
+        segment=jnp.where(is_recorded, segment, -1),
+        event=jnp.where(is_recorded, marks, -1),
         distance=shown(so_far["distance"]),
         path=shown(so_far["path"]),
         energy=shown(so_far["drawn"] - so_far["returned"]),

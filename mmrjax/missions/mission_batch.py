@@ -61,14 +61,14 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
     """
     by_segment, ran = found.of, found.time > 0
     converted_energy = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in SINKS)
-    still = by_segment["path"] <= 1e-6  # m
+    is_standing = by_segment["path"] <= 1e-6  # m
     numbers = {
         "duration": found.time,
         "distance": by_segment["path"],
         "displacement": by_segment["distance"],
         "energy": found.energy,
         "energy_per_metre": jnp.where(
-            still, jnp.nan, _safe_ratio(found.energy, jnp.where(still, 1.0, by_segment["path"]))
+            is_standing, jnp.nan, _safe_ratio(found.energy, jnp.where(is_standing, 1.0, by_segment["path"]))
         ),
         "energy_drawn": by_segment["drawn"],
         "energy_returned": by_segment["returned"],
@@ -130,13 +130,13 @@ def cell_below_cutoff(
 
     Not traceable. The motor current is `start.current`, or 0 if no start is given.
     """
-    battery, first = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
-    other = battery.current_other if first.current_other is None else first.current_other
-    duty = conditions.duty if first.duty is None else first.duty
+    battery, first_row = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
+    other = battery.current_other if first_row.current_other is None else first_row.current_other
+    duty = conditions.duty if first_row.duty is None else first_row.duty
     motors = robot.sides * (Start() if start is None else start).current * duty
     cell = battery.voltage_no_load(conditions.discharge) - (motors + other) * battery.resistance
-    below = (conditions.battery > 0.5) & (cell < battery.voltage_cutoff)
-    return np.asarray(jnp.where(below, cell, jnp.nan))
+    is_below = (conditions.battery > 0.5) & (cell < battery.voltage_cutoff)
+    return np.asarray(jnp.where(is_below, cell, jnp.nan))
 
 
 def numbers_by_column(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -242,8 +242,11 @@ def event_functions(
     standing = smallest_of(slow, grips, stays - FIRMLY)
     battery, discharge = demand.robot.battery, law.supply_current_and_charge(demand, y, stands)[1]
     empty = jnp.where(demand.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
-    above = _cell_voltage_margin(law, demand, y, stands)
-    falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
+    cell_margin = _cell_voltage_margin(law, demand, y, stands)
+    falls, recovers = (
+        jnp.where(below, -1.0, -cell_margin / OF_CELL),
+        jnp.where(below, (cell_margin - RECOVERED) / OF_CELL, -1.0),
+    )
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
 
@@ -455,10 +458,10 @@ class _SegmentIntegrator(NamedTuple):
             jnp.maximum(c.peaks, jnp.stack([jnp.asarray(signal_peaks[name]) * jnp.ones(()) for name in law.PEAKS])),
             highest,
         )
-        hot = is_accepted & (within["temperature"] > robot.motor.temperature_limit)
+        is_too_hot = is_accepted & (within["temperature"] > robot.motor.temperature_limit)
         exceedance = law.exceeded(robot, signals)
         exceedance.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
-        flags = flag_mask({**exceedance, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
+        flags = flag_mask({**exceedance, "cut_off": cut_off}) | flag_mask({"too_hot": is_too_hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         has_ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)

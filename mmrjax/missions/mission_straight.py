@@ -120,11 +120,11 @@ def instant(
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
     copper = copper * robot.driver.ripple(signals.duty)
     heating = robot.heating(copper, winding, housing)
-    still = jnp.where(stands, 0.0, 1.0)
+    moves = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
-        still * signals.acceleration_wheel * robot.gearbox.ratio,
-        still * signals.acceleration,
+        moves * signals.acceleration_wheel * robot.gearbox.ratio,
+        moves * signals.acceleration,
         balances.charge_drawn(demand.robot, demand.conditions, signals.total_current),
         *heating,
         demand.integral_rate,
@@ -185,8 +185,8 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
 
 
 def exceeded(robot: Robot, found: Signals) -> Scalars:
-    hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
-    return {**result.exceeded_limits(robot, found), "too_hot": hot}
+    is_too_hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
+    return {**result.exceeded_limits(robot, found), "too_hot": is_too_hot}
 
 
 def limited(robot: Robot, y: Array) -> Array:
@@ -201,8 +201,8 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
 
 
 def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
-    now = dataclasses.replace(conditions, discharge=jnp.asarray(found.discharge))
-    return rest.status_moving(robot, now, found, found.duty * found.voltage_source)
+    conditions_now = dataclasses.replace(conditions, discharge=jnp.asarray(found.discharge))
+    return rest.status_moving(robot, conditions_now, found, found.duty * found.voltage_source)
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:

@@ -90,8 +90,8 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
     if segment.yaw_rate is None:
         return demand
     y = SIDES * robot.chassis(otherwise.configuration).turning.width
-    apart = jnp.where(segment.mode == SPEED, segment.yaw_rate, 0.0)
-    return demand - jnp.asarray(apart)[..., None] * y
+    yaw_rate = jnp.where(segment.mode == SPEED, segment.yaw_rate, 0.0)
+    return demand - jnp.asarray(yaw_rate)[..., None] * y
 
 
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
@@ -125,15 +125,15 @@ def instant(
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
     copper = copper * robot.driver.ripple(signals.duty)
-    still = jnp.where(stands, 0.0, 1.0)
+    moves = jnp.where(stands, 0.0, 1.0)
     rates = [
         signals.voltage_left / signals.inductance,
-        still * signals.acceleration_wheel * robot.gearbox.ratio,
+        moves * signals.acceleration_wheel * robot.gearbox.ratio,
         *robot.heating(copper, winding, housing),
         demand.integral_rate,
-        still * travel.acceleration,
-        still * travel.acceleration_lateral,
-        still * travel.acceleration_yaw,
+        moves * travel.acceleration,
+        moves * travel.acceleration_lateral,
+        moves * travel.acceleration_yaw,
         motion.yaw_rate,
         balances.charge_drawn(demand.robot, demand.conditions, jnp.asarray(signals.total_current)[0]),
         1.0,
@@ -168,9 +168,9 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
     robot, conditions = asked.robot, asked.conditions
     load, motion = robot.chassis(conditions.configuration), state_of(robot, y, stands)
     rolling = load.radius * jnp.asarray(motion.speed_motor) / robot.gearbox.ratio
-    along = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
+    sliding = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
     across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
-    slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - along / load.speed_grip
+    slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - sliding / load.speed_grip
     return smallest_of(*slow), smallest_of(*grips, 1 - across / load.speed_grip)
 
 

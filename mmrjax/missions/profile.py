@@ -161,9 +161,9 @@ def profile(
         raise UsageError(f"profile, time: got {count_noun(rows.size, 'row')}; expected two or more")
     if not np.isfinite(rows).all():
         raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(rows))) + 1} is not a finite number")
-    back = np.flatnonzero(np.diff(rows) <= 0)
-    if back.size:
-        k = int(back[0]) + 1
+    rows_of_falls = np.flatnonzero(np.diff(rows) <= 0)
+    if rows_of_falls.size:
+        k = int(rows_of_falls[0]) + 1
         raise UsageError(
             f"profile, time: row {k + 1} has {rows[k]:g} s after {rows[k - 1]:g} s; expected a later time"
         )

@@ -124,9 +124,9 @@ def _controller_duty(robot: Robot, conditions: Conditions, state: State) -> Scal
     """Duty that a controller wants [-]."""
     assert robot.controller is not None and conditions.goal is not None
     shown, speed = controller_reading(robot, conditions, state)
-    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
+    goal_feed_forward = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
     integral = 0.0 if state.integral is None else state.integral
-    return robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
+    return robot.controller.duty(conditions.goal - shown, integral, speed, goal_feed_forward)
 
 
 def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
@@ -174,7 +174,7 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
-    rest = chassis.speed_still
+    speed_still = chassis.speed_still
     duty = robot.driver.duty_limited(bridge_duty(robot, conditions), state.current, conditions.polarity)
     straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = Signals(
@@ -192,8 +192,8 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
         current=state.current,
         speed_motor=state.speed_motor,
         speed=state.speed,
-        direction=contact.smooth_sign(speed_theoretical, rest) if direction is None else direction,
-        direction_travel=contact.smooth_sign(state.speed, rest) if direction is None else direction,
+        direction=contact.smooth_sign(speed_theoretical, speed_still) if direction is None else direction,
+        direction_travel=contact.smooth_sign(state.speed, speed_still) if direction is None else direction,
         speed_wheel=speed_wheel,
         speed_theoretical=speed_theoretical,
         speed_output=state.speed / chassis.radius if robot.loose else speed_wheel,
@@ -220,11 +220,13 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     source = power.voltage_source(
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
-    back = robot.motor.voltage_back(signals.speed_motor)
-    voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
+    back_emf = robot.motor.voltage_back(signals.speed_motor)
+    voltage = robot.driver.voltage(
+        source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back_emf
+    )
     demanded, limited = (conditions.polarity * duty for duty in (bridge_duty(robot, conditions), signals.duty))
-    conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back, conditions.open)
-    voltage = jnp.where(conducts == 1, voltage, back + conducts * (voltage - back))
+    conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back_emf, conditions.open)
+    voltage = jnp.where(conducts == 1, voltage, back_emf + conducts * (voltage - back_emf))
     return _fill_unset(signals, voltage_source=source, voltage=voltage)
 
 
@@ -246,19 +248,19 @@ def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signal
     imposed current, the voltage of an amplifier that brings the current to its set value within the winding's time
     constant.
     """
-    back = robot.motor.voltage_back(signals.speed_motor)
+    back_emf = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current, signals.temperature) + effects_sum(
         robot, signals, "electrical"
     )
     if conditions.voltage_follows:
         current_imposed = signals.current if conditions.motor_current is None else conditions.motor_current
-        voltage_needed = back + drop + robot.motor.resistance * (current_imposed - signals.current)
+        voltage_needed = back_emf + drop + robot.motor.resistance * (current_imposed - signals.current)
         signals = _fill_unset(signals, voltage=voltage_needed, voltage_source=voltage_needed)
     return _fill_unset(
         signals,
-        voltage_back=back,
+        voltage_back=back_emf,
         voltage_drop=drop,
-        voltage_left=signals.voltage - back - drop,
+        voltage_left=signals.voltage - back_emf - drop,
         inductance=robot.motor.inductance + effects_sum(robot, signals, "inductance"),
     )
 
@@ -286,8 +288,8 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
     """Forces along the slope that traction has to overcome [N]. For a shaft, its load torque over the radius."""
     if isinstance(chassis, Shaft):
         demand = opposing_torque(chassis, signals) / chassis.radius
-        none = jnp.zeros_like(demand)
-        return _fill_unset(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
+        zero = jnp.zeros_like(demand)
+        return _fill_unset(signals, resistance=zero, gravity=demand, demand=demand, adhesion_limit=zero + jnp.inf)
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
     resistance = resistance + effects_sum(robot, signals, "ground")
     gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
@@ -645,10 +647,10 @@ def settled_signals(
     chassis = robot.chassis(conditions.configuration)
     signals = demanded_signals(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
     # In steady travel nothing changes: the rates that other fidelities compute are zero.
-    still = jnp.zeros_like(signals.demand)
-    signals = _fill_unset(signals, traction=signals.demand, acceleration=still)
+    zero = jnp.zeros_like(signals.demand)
+    signals = _fill_unset(signals, traction=signals.demand, acceleration=zero)
     if isinstance(chassis, Shaft):
-        creep = still
+        creep = zero
     else:
         creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
     return gearbox(robot, chassis, track(robot, chassis, signals), settled=True), creep
@@ -682,15 +684,15 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
     if conditions.states_levers:
         rests = resting_posture.level_posture(robot, conditions, mass)
         length, on_tracks, height = rests.length, rests.line, rests.centre_height
-        ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
+        centre_offset = rests.centre_ahead - (rests.front + rests.rear) / 2
     else:
-        ahead, up = masses.masses_of_parts(robot, conditions, mass).centre
+        centre_offset, up = masses.masses_of_parts(robot, conditions, mass).centre
         height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
     return Stance(
         length=length,
         width=chassis.turning.width,
         height=height,
-        ahead=ahead,
+        ahead=centre_offset,
         on_tracks=on_tracks,
         lateral=lateral_friction(conditions, chassis),
         rule=chassis.turning.rule,
@@ -701,8 +703,10 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
 def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> State:
     """States of left and right side, with a leading axis of 2. Each side travels at V_s = v_x - ω y_s."""
     speed = motion.speed - motion.yaw_rate * SIDES * robot.chassis(conditions.configuration).turning.width
-    none, drawn = jnp.zeros_like(speed), jnp.broadcast_to(motion.discharge, speed.shape)
-    return State(motion.current, motion.speed_motor, speed, drawn, motion.memory, motion.temperature, distance=none)
+    none, discharge = jnp.zeros_like(speed), jnp.broadcast_to(motion.discharge, speed.shape)
+    return State(
+        motion.current, motion.speed_motor, speed, discharge, motion.memory, motion.temperature, distance=none
+    )
 
 
 def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
@@ -762,11 +766,11 @@ def turning_signals(
     even = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
-    stands = stance(robot, conditions, chassis, mass)
+    stance_loads = stance(robot, conditions, chassis, mass)
     load, sliding = sum_of_sides(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
     contact_forces = ground_forces(
-        stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
-        jnp.asarray(rolling), loads,
+        stance_loads, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral,
+        motion.yaw_rate, jnp.asarray(rolling), loads,
     )  # fmt: skip
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill_unset(even, normal=contact_forces.normal / units, moment_lateral=contact_forces.moment / units)

@@ -97,9 +97,9 @@ class Friction(eqx.Module):
         such speed. ±V_s is returned, with a zero derivative.
         """
         share = coefficient / self.static
-        within = jnp.abs(share) < 1.0
-        third = sine_third(jnp.where(within, share, 0.0))
-        return self.speed_static * jnp.where(within, 2 * third, jnp.sign(share))
+        grips = jnp.abs(share) < 1.0
+        third = sine_third(jnp.where(grips, share, 0.0))
+        return self.speed_static * jnp.where(grips, 2 * third, jnp.sign(share))
 
 
 def force_contact(

@@ -131,15 +131,17 @@ class Driver(eqx.Module):
         if self.current_limit is None:
             return wanted, jnp.zeros_like(wanted)
         way, limit = jnp.where(wanted < 0, -1.0, 1.0), self.current_limit
-        along = way * duty
+        forward_duty = way * duty
         excess, step = at_least(jnp.abs(wanted) - limit, 0.0), limit / STEEPNESS
-        reduction = at_most(excess / (most + step), 1 + along if self.returns_current else at_least(along, 0.0))
+        reduction = at_most(
+            excess / (most + step), 1 + forward_duty if self.returns_current else at_least(forward_duty, 0.0)
+        )
         beyond = excess - reduction * (most + step)
         current = at_most(jnp.abs(wanted), limit) + reduction * step
         if self.returns_current:
             return way * (current + beyond), jnp.zeros_like(beyond)
-        current = jnp.where(along < 0, 0.0, way * current)
-        return current, jnp.where(along < 0, wanted, way * beyond)
+        current = jnp.where(forward_duty < 0, 0.0, way * current)
+        return current, jnp.where(forward_duty < 0, wanted, way * beyond)
 
     def demand(self, error: Scalar, integral: Scalar, speed: Scalar, constant: Scalar) -> Scalar:
         """Voltage [V] of the speed controller: PI with the back-EMF fed forward.

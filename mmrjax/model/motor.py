@@ -119,8 +119,8 @@ class Motor(eqx.Module):
     def current_continuous(self) -> Scalar:
         """Current with a final winding temperature at the permissible limit [A], with the rise of its resistance."""
         allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
-        hot = self.resistance * self.resistance_ratio(self.temperature_limit)
-        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
+        hot_resistance = self.resistance * self.resistance_ratio(self.temperature_limit)
+        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot_resistance, 1e-9))
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
         """Rates of the temperatures of winding and housing [K/s], two thermal masses in series.
@@ -133,10 +133,10 @@ class Motor(eqx.Module):
             winding, housing: temperatures [°C].
         """
         flow = (winding - housing) / self.resistance_thermal_winding
-        out = (housing - self.temperature_ambient) / self.resistance_thermal_housing
+        heat_to_ambient = (housing - self.temperature_ambient) / self.resistance_thermal_housing
         return (
             (power - flow) * self.resistance_thermal_winding / self.time_constant_winding,
-            (flow - out) * self.resistance_thermal_housing / self.time_constant_housing,
+            (flow - heat_to_ambient) * self.resistance_thermal_housing / self.time_constant_housing,
         )
 
     def temperatures_after(
@@ -152,9 +152,9 @@ class Motor(eqx.Module):
             power = self.voltage_winding(current, x[0]) * current
             return jnp.stack([jnp.asarray(rate, float) for rate in self.heating(power, x[0], x[1])])
 
-        still = rates(jnp.zeros(2))
+        rates_at_zero = rates(jnp.zeros(2))
         matrix = jax.jacfwd(rates)(jnp.zeros(2))
-        augmented_matrix = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
+        augmented_matrix = jnp.block([[matrix, rates_at_zero[:, None]], [jnp.zeros((1, 3))]])
         begin = jnp.stack([jnp.asarray(x, float) + zero for x in (winding, housing, 1.0)])
         end = jax.scipy.linalg.expm(augmented_matrix * time) @ begin
         return end[0], end[1]
@@ -172,8 +172,8 @@ class Motor(eqx.Module):
 
         def excess(time: Scalar, held: tuple[Motor, Scalar, tuple[Scalar, Scalar]]) -> Array:
             motor, current, begin = held
-            reached = motor.temperatures_after(current, time, *begin)[0] - motor.temperature_limit
-            return jnp.where(jnp.isfinite(reached), reached, jnp.inf)
+            temperature_excess = motor.temperatures_after(current, time, *begin)[0] - motor.temperature_limit
+            return jnp.where(jnp.isfinite(temperature_excess), temperature_excess, jnp.inf)
 
         bounds = {"lower": math.log(_SHORT), "upper": math.log(_LONG)}
         inputs = jax.lax.stop_gradient((self, current, begin))

@@ -112,8 +112,8 @@ def cutoff_remark(battery: Battery) -> str | None:
     cutoff, empty, resistance = battery.voltage_cutoff, float(battery.voltage_empty), float(battery.resistance)
     if cutoff >= empty or cutoff == Battery.voltage_cutoff:
         return None
-    acts = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
-    return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {acts}"
+    effect_words = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
+    return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {effect_words}"
 
 
 def curve_remark(battery: Battery) -> str | None:

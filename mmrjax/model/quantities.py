@@ -52,16 +52,29 @@ WRITTEN = {
 }  # fmt: skip
 
 
+_SPELLED = {unit.lower(): unit for unit in SIZES}
+
+
 def unit_in_column(unit: str) -> str:
-    """Returns a unit as a column's name ends with it: `km_h` for `km/h`."""
+    """Returns a unit as a column's name ends with it: `km_h` for `km/h`, `rpm` for `RPM`, `Nm` for `N-m`."""
     unit = WRITTEN.get(unit.lower(), unit)
+    if torque := re.fullmatch(r"([mk]?)[Nn][ ._*·-]?m", unit):
+        unit = f"{torque[1]}Nm"
+    elif unit not in SIZES and len(unit) > 1 and not unit.startswith("M"):  # a capital M may be mega
+        unit = _SPELLED.get(unit.lower(), unit)
     return unit.replace("/", "_").replace("%", PERCENT).replace("·", "")
 
 
 def unit_at_end(text: str, known: Iterable[str]) -> str | None:
-    """Unit among `known` at the end of a column's name, such as kNm of `torque_kNm` and `Torque [kN·m]`, or None."""
+    """Unit among `known` at the end of a column's name, such as kNm of `torque_kNm`, `Torque [kN·m]`, or None."""
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
-    units = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end))]
+    last = re.split(r"[^A-Za-z/]", end)[-1]
+    written = unit_in_column(last) if len(last) > 1 else ""
+    units = [
+        unit
+        for unit in known
+        if unit and (unit == written or re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end)))
+    ]
     return max(units, key=len, default=None)
 
 
@@ -410,7 +423,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             "duty", "", "share of the supply's voltage that the driver gives the motors", _SHARE, percent=True,
             in_tables=True, imposed=_BY_VOLTAGE, in_profiles=True,
         ),
-        Condition("open", "", "1 where the motors' circuit is open", _SHARE),
+        Condition("open", "", "1 if the motors' circuit is open", _SHARE),
         Condition("motor_acceleration", "rad/s^2", "acceleration of an imposed motor speed", (-1e7, 1e7)),
         *(
             Condition(

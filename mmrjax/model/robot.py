@@ -106,9 +106,8 @@ class Robot(eqx.Module):
 
     def __repr__(self) -> str:
         effects = "".join(f", {e.name}" for e in self.effects)
-        head = (
-            f"Robot: {', '.join(self.configurations)}; {params.number_text(self.sides)} motors driven alike{effects}"
-        )
+        motors = f"{params.number_text(self.sides)} motors with the same command"
+        head = f"Robot: {', '.join(self.configurations)}; {motors}{effects}"
         return f"{head}\n{params.parameter_table(self)}"
 
     def for_equations(self) -> Robot:
@@ -178,6 +177,9 @@ class Robot(eqx.Module):
     def controller_states(self) -> tuple[str, ...]:
         """Fields of `State` that its controller has."""
         return () if self.controller is None else self.controller.states
+
+    def __dir__(self) -> list[str]:  # methods are the program's own
+        return [field.name for field in dataclasses.fields(self)]
 
     @property
     def moves_as_one(self) -> bool:

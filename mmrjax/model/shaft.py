@@ -1,4 +1,4 @@
-"""Load on a bench: a shaft with inertia, friction, a constant torque and a torque of gravity over its angle."""
+"""Load on a bench: a shaft with inertia, friction, a constant torque, and a gravity torque over its angle."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Shaft(eqx.Module):
         (-1e4, 1e4), _STATED, relative_sd=0.2,
     )  # fmt: skip
     torque_gravity: Scalar = parameter(
-        0.0, "N·m", "largest torque of gravity on an arm m g l", (0.0, 1e4), _STATED, relative_sd=0.1
+        0.0, "N·m", "largest gravity torque on an arm, m g l", (0.0, 1e4), _STATED, relative_sd=0.1
     )
     angle_zero: Scalar = parameter(
         0.0, "rad", "hanging angle θ_0 of the arm, from the start of a run", (-6.3, 6.3), _STATED, sd=0.05,
@@ -119,11 +119,11 @@ class Shaft(eqx.Module):
         elastic = jnp.asarray(self.stiffness) > 0
         stiffness = jnp.where(elastic, self.stiffness, FLANK_STIFFNESS * inertia)
         damping = jnp.where(elastic, self.damping, FLANK_DAMPING * inertia) * closing
-        ahead = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
+        flank_forward = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
         behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
         # Damping sets in over a tenth of the backlash, so that the torque is continuous at contact.
         full = 0.1 * self.backlash + 1e-4
-        push = jnp.maximum(stiffness * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
+        push = jnp.maximum(stiffness * flank_forward + damping * jnp.minimum(flank_forward / full, 1.0), 0.0)
         pull = jnp.minimum(stiffness * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
         return jnp.where(jnp.asarray(self.backlash) > 0, push + pull, stiffness * gap + damping)
 

@@ -110,16 +110,16 @@ def loop_until(
         kept: the part of the last state to return.
         most: number of members computed at a time, `LANES` if None.
     """
-    numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
+    numbers, static_parts = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
 
     def of(numbers: Any) -> Any:
-        return eqx.combine(numbers, rest)
+        return eqx.combine(numbers, static_parts)
 
     lanes = LANES if most is None else most
     loop = _MemberLoop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
 
     def many(numbers: Any, batched: Any, size: int) -> T:
-        """The end of each of `size` members. If these are batched again, all members share the same lanes."""
+        """End states of `size` members. If these are batched again, all members share the same lanes."""
 
         @custom_vmap
         def each(numbers: Any) -> T:

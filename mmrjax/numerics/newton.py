@@ -117,16 +117,20 @@ class NewtonState(eqx.Module):
         factors = factorise(jacobian)
         step, unknowns, residual = _solve_step(factors, value), self.y[-1], value[-1]
         # Such a small step leaves an error of the order of its square.
-        solved, others, late = _is_small(step, atol**0.7), _is_small(value[:-1], atol**0.5), self.turns >= PATIENCE
-        low = jnp.where(others & (residual < 0), unknowns, self.low)
-        high = jnp.where(others & (residual > 0), unknowns, self.high)
+        solved, is_value_small, is_late = (
+            _is_small(step, atol**0.7),
+            _is_small(value[:-1], atol**0.5),
+            self.turns >= PATIENCE,
+        )
+        low = jnp.where(is_value_small & (residual < 0), unknowns, self.low)
+        high = jnp.where(is_value_small & (residual > 0), unknowns, self.high)
         then = unknowns - step[-1]
-        leaves = late & others & ~solved & jnp.isfinite(high - low) & ((then <= low) | (then >= high))
+        leaves = is_late & is_value_small & ~solved & jnp.isfinite(high - low) & ((then <= low) | (then >= high))
         share = jnp.where(leaves, (unknowns - 0.5 * (low + high)) / jnp.where(leaves, step[-1], 1.0), 1.0)
-        aside = (*_solve_step([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(unknowns))
-        alone = late & ~others & ~solved
+        linear_step = (*_solve_step([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(unknowns))
+        retries = is_late & ~is_value_small & ~solved
         damped_step = tuple(
-            jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True)
+            jnp.where(retries, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, linear_step, strict=True)
         )
         return NewtonState(_subtract_step(self.y, damped_step), solved, self.turns + 1, low, high)
 

@@ -247,10 +247,6 @@ def _load_units(robot: Robot, conditions: Conditions) -> Pair:
     return jnp.stack([robot.chassis(conditions.configuration).mass * GRAVITY, robot.running_gear.wheelbase])
 
 
-def _load_transfer(robot: Robot, conditions: Conditions, y: Settling) -> Pair:
-    return y[SETTLING:] * _load_units(robot, conditions)
-
-
 def _is_searched(conditions: Conditions) -> np.ndarray:
     """True for the unknowns of a search, False for imposed speeds and their currents, shape (9,)."""
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
@@ -269,19 +265,19 @@ def _begin_broyden(held: tuple[Robot, Conditions]) -> _BroydenSearch:
 def _broyden_step(held: tuple[Robot, Conditions], search: _BroydenSearch) -> _BroydenSearch:
     """Next evaluation: at the start, then along each unknown from there, then along the secants."""
     size = search.y.size
-    aside = search.looks <= size
+    is_probing = search.looks <= size
     step = (search.inverse * search.rates).sum(-1)
     damped_step = step * _allowed_step_fraction(*held, search.y, step)
-    damped_step = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), damped_step)
+    damped_step = jnp.where(is_probing, ALONG * (np.arange(size) == search.looks - 1), damped_step)
     residual = _scaled_balance(*held, search.y + damped_step)
     residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - damped_step)
-    gone = search.inverse @ (search.rates - residual)
+    predicted_step = search.inverse @ (search.rates - residual)
     row = damped_step @ search.inverse
-    change = jnp.outer(damped_step - gone, row) / (damped_step @ gone)
+    change = jnp.outer(damped_step - predicted_step, row) / (damped_step @ predicted_step)
     inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
-    y = jnp.where(aside, search.y, search.y + damped_step)
-    rates = jnp.where(aside & (search.looks > 0), search.rates, residual)
-    return _BroydenSearch(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
+    y = jnp.where(is_probing, search.y, search.y + damped_step)
+    rates = jnp.where(is_probing & (search.looks > 0), search.rates, residual)
+    return _BroydenSearch(y, rates, inverse, search.looks + 1, ~is_probing & (jnp.max(jnp.abs(step)) < NEAR))
 
 
 def _jacobian_at_rest(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
@@ -351,9 +347,11 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
     end = lanes.loop_until(
         _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*inputs, first[0], solution), most=FEW
     )
-    sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
-    slope = jnp.where(sound, end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
-    return end.y + inverse(-slope)[0] @ jnp.where(sound, _scaled_balance(robot, conditions, end.y), 0.0), sound
+    is_solved = end.solved & jnp.all(jnp.isfinite(end.jacobian))
+    slope = jnp.where(is_solved, end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
+    return end.y + inverse(-slope)[0] @ jnp.where(
+        is_solved, _scaled_balance(robot, conditions, end.y), 0.0
+    ), is_solved
 
 
 def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balances.Travel, PlaneMotion]:
@@ -366,7 +364,7 @@ def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tu
         conditions.of_sides(), motion.current
     )
     motion = dataclasses.replace(motion, current=current)
-    travel = _turning(rest.without_diode(robot), conditions, motion, _load_transfer(robot, conditions, y))
+    travel = _turning(rest.without_diode(robot), conditions, motion, y[SETTLING:] * _load_units(robot, conditions))
     signals = travel.signals
     signals = dataclasses.replace(
         signals, voltage=signals.voltage - is_limited, voltage_left=signals.voltage_left - is_limited
@@ -426,8 +424,8 @@ def status_of_steady_motion(
     """Status of a robot in steady motion."""
     chassis = robot.chassis(conditions.configuration)
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
-    along = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
-    status = jnp.where(jnp.minimum(shafts, along) < chassis.speed_still, STALLED, CONVERGED)
+    motion_size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    status = jnp.where(jnp.minimum(shafts, motion_size) < chassis.speed_still, STALLED, CONVERGED)
     status = jnp.where(has_tipped(robot, travel), TIPS, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
     return jnp.where(empty, BATTERY_EMPTY, status)
@@ -455,9 +453,9 @@ norm = functools.partial(error_norm_of_sides, whole=slice(4, len(_UNITS)), own=O
 def _sides_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
     """Conditions of each side, with the slope along its heading, and its state."""
     sides = conditions.of_sides()
-    along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
+    slope_along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
     return (
-        dataclasses.replace(sides, slope_deg=along, heading_deg=None),
+        dataclasses.replace(sides, slope_deg=slope_along, heading_deg=None),
         balances.states_of_sides(robot, conditions, motion),
     )
 
@@ -477,8 +475,8 @@ def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) ->
     sides = jnp.asarray(jax.vmap(lambda c, s: rest.holding_margin(robot, c, s))(own, state))
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
-    aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
-    return rest.smallest_of(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
+    lateral_slope = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
+    return rest.smallest_of(sides[0], sides[1], jnp.where(lateral_slope > 0, level - lateral_slope, jnp.inf))
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:
@@ -522,17 +520,17 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     """A settled turn, see `circling_signals`, and True if its conditions are valid. All numbers are finite for every
     status.
     """
-    sound = jnp.asarray(True)
+    is_solved = jnp.asarray(True)
     for number in jax.tree.leaves(conditions):
-        sound &= jnp.isfinite(number)
-    conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
+        is_solved &= jnp.isfinite(number)
+    conditions = jax.tree.map(lambda x: jnp.where(is_solved, x, jnp.ones_like(x)), conditions)
     travel, _, status = circling_signals(robot, conditions)
     # On a slope the heading changes continuously.
     status = jnp.where(conditions.slope_deg == 0, status, NOT_SETTLED)
-    return result_of_turn(robot, travel, jnp.where(sound, status, FAILED)), sound
+    return result_of_turn(robot, travel, jnp.where(is_solved, status, FAILED)), is_solved
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
     """Result of `steady` for a robot that turns, see `circling_signals`. NaN if there is no settled turn."""
-    point, sound = operating_point(robot, conditions)
-    return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
+    point, is_solved = operating_point(robot, conditions)
+    return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), is_solved)

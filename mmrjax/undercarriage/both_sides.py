@@ -179,11 +179,11 @@ def generalized_forces(
     assert pulled.aside is not None
     ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral
     turn = several * (jnp.sum(pulled.aside * at.lever_x) - y @ forward) - yaw
-    tilt = several * (y @ normal - jnp.sum(pulled.aside * at.lever_z))
+    roll_moment = several * (y @ normal - jnp.sum(pulled.aside * at.lever_z))
     body = [cos * ahead - sin * aside, sin * ahead + cos * aside, several * jnp.sum(normal), turn]
     shafts = several * jnp.asarray(signals.torque_net), several * rear
     pulleys = [x[k] for k in range(2) for x in shafts]
-    return jnp.stack([*body, several * jnp.sum(moment), tilt, *pulleys])
+    return jnp.stack([*body, several * jnp.sum(moment), roll_moment, *pulleys])
 
 
 def _with_lateral_moment(run: HalfRobotSystem, signals: Signals, at: ContactState, pulled: ContactPull) -> Signals:
@@ -316,10 +316,10 @@ def _damping_product(
     losses, shafts = _loss_derivatives(run, plane_motion(run, motion), found.sides)
     cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
     ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
-    rolls = losses * (ahead - y * turn)
+    rolling_damping = losses * (ahead - y * turn)
     gained_forces = jnp.zeros(COORDINATES, motion.v.dtype).at[SHAFTS].set(shafts * gained[SHAFTS])
     gained_forces = gained_forces.at[jnp.asarray([X, Y, YAW])].add(
-        jnp.stack([cos * jnp.sum(rolls), sin * jnp.sum(rolls), -y @ rolls])
+        jnp.stack([cos * jnp.sum(rolling_damping), sin * jnp.sum(rolling_damping), -y @ rolling_damping])
     )
     for lever, now, then in zip(
         (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, touching.force), after, strict=True
@@ -400,8 +400,10 @@ def stand(run: HalfRobotSystem) -> HalfRobotState:
     """
     heading_deg = run.conditions.heading_deg
     heading = jnp.zeros(()) if heading_deg is None else jnp.radians(heading_deg)
-    along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
-    half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
+    slope_along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
+    half = half_robot.stand(
+        dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=slope_along))
+    )
     q = (
         jnp.zeros(COORDINATES, half.q.dtype)
         .at[jnp.asarray([HEIGHT, PITCH, YAW])]

@@ -385,8 +385,8 @@ def _sums_and_motion_derivatives(
         tip.rate_forward * cos + tip.rate_up * sin,
         tip.rate_up * cos - tip.rate_forward * sin,
     )
-    below = jnp.where(WHEEL, chassis.radius, 0.0)
-    pitched = (z + below, -x, rate_z, -rate_x - below / path.radius)
+    wheel_radius = jnp.where(WHEEL, chassis.radius, 0.0)
+    pitched = (z + wheel_radius, -x, rate_z, -rate_x - wheel_radius / path.radius)
 
     def free(motion: Sequence[Scalar]) -> Scalar:
         return tension_free(path, belt_runs(path, motion[:2], motion[2:]))

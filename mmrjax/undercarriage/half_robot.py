@@ -458,8 +458,8 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
     (sunk, pitch), _ = root(
         unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None, False
     )
-    stands = tipping_margin(run) > 0
-    q = placed(turned, axle - jnp.where(stands, sunk, 0.0), jnp.where(stands, pitch, 0.0))
+    stays_upright = tipping_margin(run) > 0
+    q = placed(turned, axle - jnp.where(stays_upright, sunk, 0.0), jnp.where(stays_upright, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
     return HalfRobotState(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
 
@@ -512,13 +512,15 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     """Status of a run from its averages and its last motion."""
     robot, conditions, signals = run.robot, run.conditions, averages.signals
     status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travel_status(signals.speed, signals.voltage))
-    sense, rest = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    stands = is_at_rest(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
-    parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
+    sense, speed_still = travel_direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    at_rest = is_at_rest(
+        sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, speed_still
+    )
+    parked = (jnp.abs(signals.direction) < 0.999) | (at_rest & (sense * signals.acceleration < STARTS))
     status = jnp.where(parked, STALLED, status)
     # On average over the window.
     status = status_with_slip(
-        status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands
+        status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, at_rest
     )
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)

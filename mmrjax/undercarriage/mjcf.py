@@ -76,16 +76,18 @@ def robot_bodies(robot: Robot, half: HalfRobotMasses, conditions: Conditions) ->
         places = [jnp.stack([x + zero, zero, zero]) for _, x in ends]
     else:
         turning = robot.chassis(conditions.configuration).turning
-        several, aside = robot.sides / 2, turning.width / 2
+        several, half_width = robot.sides / 2, turning.width / 2
         pulley, spins = several * half.pulley, several * half.inertia_pulley
         mass = [2 * several * half.chassis] + [pulley] * 4
         names = tuple(f"{name}_{side}" for side in channels.SIDES for name, _ in ends)
         places = [jnp.stack([x + zero, y * turning.width + zero, zero]) for y in SIDES for _, x in ends]
         centre = half.centre[0]
-        apart = mass[0] * (half.forward - centre) ** 2 + 4 * (spins + pulley * (base**2 / 4 + aside**2 + centre**2))
+        apart = mass[0] * (half.forward - centre) ** 2 + 4 * (
+            spins + pulley * (base**2 / 4 + half_width**2 + centre**2)
+        )
         pitch, yaw = 2 * several * half.inertia, turning.inertia - apart
         payload = conditions.payload / robot.sides
-        roll = 2 * several * (half.body / 3 + half.chassis - half.body - payload) * aside**2
+        roll = 2 * several * (half.body / 3 + half.chassis - half.body - payload) * half_width**2
         rows = [jnp.stack([jnp.maximum(roll, yaw - pitch), pitch, yaw])] + [jnp.stack([spins] * 3)] * 4
         inertia = jnp.stack(rows)
     half_sizes = jnp.stack([half.forward, zero, half.up])

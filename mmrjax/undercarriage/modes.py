@@ -102,7 +102,7 @@ def _linearised_steps(
 
 def _run_modes(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.ndarray, "positions 5 5"]) -> list[Mode]:
     """The modes of one run, from its linearisation at each position."""
-    found: dict[str, list[tuple[complex, float]]] = {}
+    modes_by_name: dict[str, list[tuple[complex, float]]] = {}
     for rate, mass in zip(rates, masses, strict=True):
         if not np.isfinite(rate).all():
             continue
@@ -112,9 +112,9 @@ def _run_modes(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.nda
         energy = np.abs(np.real(velocity.conj() * (mass @ velocity)))
         shares = (energy / energy.sum(axis=0)).T
         for k, name in zip(*linear_sum_assignment(-shares), strict=True):
-            found.setdefault(NAMES[name], []).append((values[swings][k], shares[k, name]))
+            modes_by_name.setdefault(NAMES[name], []).append((values[swings][k], shares[k, name]))
     answer = []
-    for name, members in found.items():
+    for name, members in modes_by_name.items():
         value, share = np.array([m[0] for m in members]), np.array([m[1] for m in members])
         damped, size = value.imag / (2 * np.pi), np.abs(value)
         numbers = (damped.mean(), damped.min(), damped.max(), (size / (2 * np.pi)).mean())

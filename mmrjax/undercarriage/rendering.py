@@ -159,8 +159,8 @@ def draw_sample(axes: Any, view: RunScene, k: int) -> None:
     strip = ground([(-0.6, 0.0), (0.6, 0.0), (0.6, -0.2), (-0.6, -0.2)])
     axes.add_patch(Polygon(strip, color=_GROUND, alpha=0.45, lw=0))
     axes.plot(*ground([(-0.6, 0), (0.6, 0)]).T, color=_INK, lw=1)
-    first = np.ceil((axle_x - 0.6) / 0.05) * 0.05
-    marks = np.arange(first, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
+    first_mark = np.ceil((axle_x - 0.6) / 0.05) * 0.05
+    marks = np.arange(first_mark, axle_x + 0.6, 0.05) - axle_x  # fixed to the ground: they show the travel
     axes.add_collection(LineCollection([ground([(m, 0), (m - 0.008, -0.012)]) for m in marks], colors=_INK, lw=0.8))
 
     gear = view.path.gear
@@ -287,10 +287,10 @@ def frame_times(
         raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
     if file.suffix == ".png" and end is not None:
         raise ValueError(f"end: got {end:g} s for {file.name}; a PNG shows only the time `begin`; leave `end` out")
-    film, last = file.suffix != ".png", length if end is None else end
-    until = min(last, length)
+    film, last_time = file.suffix != ".png", length if end is None else end
+    until = min(last_time, length)
     if not 0 <= begin <= length or (film and not begin < until):
-        received = f"begin, end: got {begin:g} to {last:g} s" if film else f"begin: got {begin:g} s"
+        received = f"begin, end: got {begin:g} to {last_time:g} s" if film else f"begin: got {begin:g} s"
         raise ValueError(f"{received}; expected times within the run, 0 to {length:g} s")
     if not film:
         return np.asarray([begin])
@@ -342,14 +342,16 @@ def _write_frames(view: RunView, file: File, frames: list[int], rate: int) -> No
         images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
         return
     pictures = (_figure_pixels(view.sheet(k)) for k in frames)
-    first = next(pictures)
+    first_picture = next(pictures)
     import imageio_ffmpeg
 
-    writer = imageio_ffmpeg.write_frames(str(file), (first.shape[1], first.shape[0]), fps=rate, quality=7)
+    writer = imageio_ffmpeg.write_frames(
+        str(file), (first_picture.shape[1], first_picture.shape[0]), fps=rate, quality=7
+    )
     with warnings.catch_warnings():
         # jax warns of every fork; this one becomes ffmpeg at once and does not use jax's threads
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
         writer.send(None)
-    for picture in itertools.chain([first], pictures):
+    for picture in itertools.chain([first_picture], pictures):
         writer.send(picture.tobytes())
     writer.close()

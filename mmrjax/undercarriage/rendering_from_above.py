@@ -109,7 +109,7 @@ def draw_sample(axes: Any, view: TopViewScene, k: int) -> None:
     axes.annotate(
         "", *page([(half, 0.0), (-half / 2, 0.0)]), arrowprops={"arrowstyle": "-|>", "color": _INK}, zorder=3
     )
-    most = max(float(view.load.max()), 1e-9)
+    largest_load = max(float(view.load.max()), 1e-9)
     ahead, aside = cos * v[0] + sin * v[1], cos * v[1] - sin * v[0]
     for side, colour in enumerate(_SIDES):
         y = SIDES[side] * view.width
@@ -118,7 +118,9 @@ def draw_sample(axes: Any, view: TopViewScene, k: int) -> None:
         for x, load in zip(view.along[k, side], view.load[k, side], strict=True):
             if load > 0:
                 ends = page([(x, y - GROUSER), (x, y + GROUSER)])
-                axes.plot(*ends.T, color=colour, lw=0.8 + LOADED * load / most, zorder=4, solid_capstyle="butt")
+                axes.plot(
+                    *ends.T, color=colour, lw=0.8 + LOADED * load / largest_load, zorder=4, solid_capstyle="butt"
+                )
         for x in np.linspace(-half, half, min(ARROWS, view.along.shape[-1])):
             slides = np.array([ahead - v[both_sides.YAW] * y - view.belt[k, side], aside + v[both_sides.YAW] * x])
             tail, head = page([(x, y), np.array([x, y]) + SPEED * slides])
@@ -153,8 +155,10 @@ def figure_of_sample(view: TopViewScene, k: int) -> Any:
     upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False)
     for side, colour in enumerate(_SIDES):
         current.plot(view.time, view.current[:, side], color=colour, lw=0.9)
-    most = 1.3 * np.percentile(np.abs(view.current), 95)
-    current.set(ylabel="I, A", ylim=(min(0.0, 1.3 * np.percentile(view.current, 5)), max(most, 0.1)), xticklabels=[])
+    axis_limit = 1.3 * np.percentile(np.abs(view.current), 95)
+    current.set(
+        ylabel="I, A", ylim=(min(0.0, 1.3 * np.percentile(view.current, 5)), max(axis_limit, 0.1)), xticklabels=[]
+    )
     rate.plot(view.time, view.v[:, both_sides.YAW], color=_INK, lw=1.0)
     rate.set(xlabel="time, s", ylabel="yaw rate, rad/s")
     for axes in (current, rate):

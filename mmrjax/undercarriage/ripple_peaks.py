@@ -45,22 +45,22 @@ def measure_ripple(time: Series, values: Series) -> Ripple:
     largest. It is refined by a parabola and by counting on to the last such repetition.
     """
     time, values = np.asarray(time, float), np.asarray(values, float)
-    rest = values - np.polyval(np.polyfit(time, values, 1), time)
-    n = len(rest)
+    detrended = values - np.polyval(np.polyfit(time, values, 1), time)
+    n = len(detrended)
     lags = np.arange(n // 2)
     with np.errstate(invalid="ignore", divide="ignore"):  # for a constant signal
-        agreement = np.array([np.corrcoef(rest[: n - k], rest[k:])[0, 1] for k in lags])
+        agreement = np.array([np.corrcoef(detrended[: n - k], detrended[k:])[0, 1] for k in lags])
     inner = agreement[1:-1]
     peaks = 1 + np.nonzero((inner > agreement[:-2]) & (inner >= agreement[2:]))[0]
     period = float("nan")
     good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max(initial=0.0)]
     if len(good):
-        first = _parabola_vertex(agreement, good[0])
-        count = np.round(good / first)
-        near = np.abs(good / first - count) < 0.2
+        fundamental = _parabola_vertex(agreement, good[0])
+        period_counts = np.round(good / fundamental)
+        near = np.abs(good / fundamental - period_counts) < 0.2
         last = good[near][-1]
-        period = float(_parabola_vertex(agreement, last) / np.round(last / first) * (time[1] - time[0]))
-    return Ripple(float(values.mean()), float(np.ptp(rest) / 2 / abs(values.mean())), period)
+        period = float(_parabola_vertex(agreement, last) / np.round(last / fundamental) * (time[1] - time[0]))
+    return Ripple(float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period)
 
 
 class Fluctuation(NamedTuple):
@@ -83,19 +83,19 @@ def measure_fluctuation(time: Series, values: Series) -> Fluctuation:
     mean = float(values.mean())
     if not np.isfinite(values).all() or mean == 0.0:
         return Fluctuation(mean, float("nan"), float("nan"))
-    rest = values - np.polyval(np.polyfit(time, values, 1), time)
-    deviation = float(rest.std() / abs(mean))
+    detrended = values - np.polyval(np.polyfit(time, values, 1), time)
+    deviation = float(detrended.std() / abs(mean))
     if deviation < 1e-13:  # rounding
         return Fluctuation(mean, deviation, float("nan"))
-    size = 1 << (8 * len(rest) - 1).bit_length()  # zero padding, for a fine grid of frequencies
-    power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)), size)) ** 2
+    size = 1 << (8 * len(detrended) - 1).bit_length()  # zero padding, for a fine grid of frequencies
+    power = np.abs(np.fft.rfft(detrended * np.hanning(len(detrended)), size)) ** 2
     best = int(np.argmax(power[1:-1])) + 1
     return Fluctuation(mean, deviation, float(_parabola_vertex(power, best) / (size * (time[1] - time[0]))))
 
 
 def _parabola_vertex(values: Series, k: int) -> float:
-    below, middle, above = values[k - 1 : k + 2]
-    return float(k + (below - above) / (2 * (below - 2 * middle + above)))
+    value_before, value_at, value_after = values[k - 1 : k + 2]
+    return float(k + (value_before - value_after) / (2 * (value_before - 2 * value_at + value_after)))
 
 
 def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
@@ -112,8 +112,8 @@ def touchdown_times(
     A grouser that lifts and returns in the middle of the run does not count. Its place has to be in the second half
     of the path, or just at the start of it.
     """
-    bears = np.asarray(grouser) > 0
-    lands = ~bears[:-1] & bears[1:]
+    is_loaded = np.asarray(grouser) > 0
+    lands = ~is_loaded[:-1] & is_loaded[1:]
     length = np.asarray(place).max()
     front = (np.asarray(place)[1:] > length / 2) | (np.asarray(place)[1:] < 0.02 * length)
     return np.sort(np.asarray(time)[1:][np.nonzero(lands & front)[0]])
@@ -342,8 +342,8 @@ def find_crossings(
     for mode in modes:
         if not mode.resonant:
             continue
-        first = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
-        for order in range(first, int(mode.frequency * travel / slowest) + 1):
+        lowest_order = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
+        for order in range(lowest_order, int(mode.frequency * travel / slowest) + 1):
             shows = tuple(p.signal for p in found if (p.payload, p.mode, p.order) == (payload, mode.name, order))
             answer.append(ModeCrossing(mode.name, order, payload, mode.frequency * travel / order, shows))
     return answer

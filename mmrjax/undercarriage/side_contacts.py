@@ -114,11 +114,11 @@ def compute_contacts(
     forward, up = join_contacts(tip_places.forward, path.gear.wheelbase / 2 * _END), join_contacts(tip_places.up)
     ahead, rise = join_contacts(tip_places.rate_forward), join_contacts(tip_places.rate_up)
     # The lowest point of a wheel is below its axle at any pitch of the robot.
-    below = jnp.where(WHEEL, chassis.radius, 0.0)
+    wheel_radius = jnp.where(WHEEL, chassis.radius, 0.0)
     x, z, rate_x, rate_z, weight = (
         forward * cos + up * sin,
-        up * cos - forward * sin - below,
-        ahead * cos + rise * sin - below / path.radius,
+        up * cos - forward * sin - wheel_radius,
+        ahead * cos + rise * sin - wheel_radius / path.radius,
         rise * cos - ahead * sin,
         join_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
     )

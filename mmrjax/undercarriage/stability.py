@@ -53,9 +53,9 @@ def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     parts = mjcf.robot_bodies(robot, masses.masses_of_parts(robot, conditions, mass), conditions)
-    aside = robot.chassis(conditions.configuration).turning.width / 2
+    half_width = robot.chassis(conditions.configuration).turning.width / 2
     inertia = jnp.sum(parts.inertia[:, 0] + parts.mass * parts.place[:, 1] ** 2)
-    return jnp.sqrt(inertia / jnp.sum(parts.mass)) / aside
+    return jnp.sqrt(inertia / jnp.sum(parts.mass)) / half_width
 
 
 def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " runs"]:
@@ -123,7 +123,7 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
     worst = int(np.argmin(limits))
     if step > limits[worst]:
         raise ValueError(
-            f"step: got {step:g} s; contacts, belt or friction are too stiff for it, the largest stable step is "
+            f"step: got {step:g} s; contacts, belt or friction are too stiff for it; the largest stable step is "
             f"{limits[worst]:.2g} s (run {worst + 1} of {len(limits)}); take {_whole(sample, limits[worst]):g} s, a "
             "softer contact or a larger V_s"
         )

@@ -33,7 +33,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
         result.save(folder.results(), config.robot, folder.tables)
-        report = calibration_report.calibration_document(result, config.robot)
+        report = calibration_report.calibration_document(result, config.robot, feedforward_fit.voltage_fit(runs))
         document = print_report(report, brief=not beside.verbose)
         settled = result.converged and all(b.converged for h in result.held_out.values() for b in h.blocks.values())
         manifest = {"seed": result.seed, "statuses": result.counts}

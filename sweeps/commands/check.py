@@ -45,8 +45,8 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
                 f"lacks {', '.join(lacking)}; add them, or remove the requirement"
             )
     with open_folder("check", config, robot, beside) as folder:
-        with step_reporter(print_message, "reading the requirements") as heard:
-            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(heard))
+        with step_reporter(print_message, "reading the requirements") as report:
+            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(report))
             result = CheckResult(demands, robot, outcomes, posture_words.of_requirements(robot, outcomes))
         _write_folder(folder, config, result)
         document = print_report(

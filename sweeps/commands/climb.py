@@ -62,9 +62,9 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
-    along = _derivative_variables(config, robot, conditions, sequence)
+    derivative_variables = _derivative_variables(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, beside) as folder:
-        climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, along)
+        climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, derivative_variables)
         folder.write_table("history.csv", climbed.table)
         if rows := climbed.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
@@ -206,20 +206,24 @@ def _search_largest(
     """
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
-    tried: dict[float, str] = {}
+    verdict_of_size: dict[float, str] = {}
     largest_climbed: tuple[Terrain, ClimbRuns, int] | None = None
     while True:
         grounds, climb_runs = run(sizes)
-        tried |= {float(s): v for s, v in zip(sizes, climb_runs.names, strict=True)}
-        order = sorted(tried)
-        climbed_sizes = [s for s in order if tried[s] == "over" and all(tried[t] == "over" for t in order if t < s)]
+        verdict_of_size |= {float(s): v for s, v in zip(sizes, climb_runs.names, strict=True)}
+        order = sorted(verdict_of_size)
+        climbed_sizes = [
+            s
+            for s in order
+            if verdict_of_size[s] == "over" and all(verdict_of_size[t] == "over" for t in order if t < s)
+        ]
         best = max(climbed_sizes, default=None)
         if largest_climbed is None or best in sizes:
             largest_climbed = grounds, climb_runs, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
-        beyond = [s for s in order if best is None or s > best]
-        if best is None or not beyond or min(beyond) - best <= NEAR:
-            return *largest_climbed, tuple((s, tried[s]) for s in order), best
-        inner = np.linspace(best, min(beyond), ROUND + 2)[1:-1]
+        larger_sizes = [s for s in order if best is None or s > best]
+        if best is None or not larger_sizes or min(larger_sizes) - best <= NEAR:
+            return *largest_climbed, tuple((s, verdict_of_size[s]) for s in order), best
+        inner = np.linspace(best, min(larger_sizes), ROUND + 2)[1:-1]
         sizes = np.unique(np.round(inner, 1))
 
 
@@ -283,8 +287,8 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Lev
     if config.levers_voltage_V is not None:
         sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))
     if tracked:
-        first = (float(sequence.first[0]), float(np.pi - sequence.first[1]))
-        for option, angle in zip(("front", "rear"), first, strict=True):
+        first_angles = (float(sequence.first[0]), float(np.pi - sequence.first[1]))
+        for option, angle in zip(("front", "rear"), first_angles, strict=True):
             if why := terrains.lever_start_refusal(robot, float(np.degrees(angle))):
                 raise BadConfiguration(f"levers {option}: {why}")
     return sequence

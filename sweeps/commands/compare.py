@@ -101,10 +101,10 @@ def _compare_histories(
         folder.write_table("comparison.csv", comparison)
         readings = ((comparison[f"simulated_{c.column}"], comparison[c.column]) for c in runs.channels)
         factors = [c.factor for c in runs.channels]
-        off = np.stack([simulated - measured for simulated, measured in readings], 1) * factors
+        errors = np.stack([simulated - measured for simulated, measured in readings], 1) * factors
         notes = (
             *missing_readings_notes(comparison, runs.channels),
-            *sentences((*error_after_steps(runs, off), *ready.checked, *ready.begins, *ready.weighed)),
+            *sentences((*error_after_steps(runs, errors), *ready.checked, *ready.begins, *ready.weighed)),
         )
         after_steps = np.logical_or(*rows_after_steps(runs))
         result = Comparison(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Names, effect_file
+from calibration.data import Names, effect_file, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.words import experiment_words
 from mmrjax import derived, effects
@@ -34,6 +34,13 @@ Explain = Callable[[str, Library], Iterator[Line]]
 WIDTH, INDENT = 80, 16
 #: Outputs of runs, and of missions.
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
+
+#: Keys of robot files that no fit frees, with their meanings.
+KEYS: dict[str, str] = {
+    **{name: str(about[-1]).strip("()") for name, about in (robot_file.COUNTS | robot_file.RATINGS).items()},
+    **robot_file.SWITCHES,
+    **{name: meaning for name, (_, meaning) in robot_file.CHOICES.items()},
+}
 
 
 def explain_name(name: str | None, files: Names = ()) -> int:
@@ -86,6 +93,7 @@ def explainable_names(library: Library) -> dict[str, list[str]]:
         "channels": [c.name for c in channels.EVERY],
         "conditions": [*(c.name for c in quantities.LABELS), *(c.field for c in quantities.SET if c.field)],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
+        "keys that no fit frees": list(KEYS),
         "parameters": [p.name for p in params.walk_parameters(paper_robots.nominal())],
     }
 
@@ -189,10 +197,10 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
         yield "other units", ", ".join(c.other_units)
     yield "typical noise", f"{100 * c.sd_share:g} % of the reading, which is assumed if you give no noise"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
-    wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
-    if wrong:
-        yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(experiment_words.effect_tests(wrong[0])):
+    sensor_effects = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
+    if sensor_effects:
+        yield "its errors", ", ".join(e.name for e in sensor_effects)
+        for k, test in enumerate(experiment_words.effect_tests(sensor_effects[0])):
             yield "" if k else "on a bench", test
 
 
@@ -240,8 +248,8 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
     yield "nominal", f"{float(parameter.value):g} {spec.unit}. Source: {spec.source}"
     yield "prior", _prior_text(parameter)
     yield "bounds", _bounds_text(spec)
-    first = name.partition(".")[0]
-    part: Any = dict(robot.configurations.items()).get(first, robot)
+    first_part = name.partition(".")[0]
+    part: Any = dict(robot.configurations.items()).get(first_part, robot)
     for step in name.split(".")[:-1]:
         part = getattr(part, step, part)
     equation = " ".join((inspect.getdoc(type(part)) or "").partition("\n\nAttributes:")[0].split())
@@ -282,6 +290,7 @@ EXPLAINED: dict[str, Explain] = {
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,
+    "key of a robot file": _explain_by_table(KEYS),
     "condition": _operating_condition_lines,
     "word of the reports": _explain_by_table(
         {k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 from importlib import resources
@@ -11,7 +12,7 @@ import numpy as np
 from calibration.data import contents, robot_file
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.inference.feedforward import UNITS, DriveLog, Tolerances, fit_feedforward
+from calibration.inference.feedforward import UNITS, DriveLog, Feedforward, Tolerances, fit_feedforward
 from mmrjax.model.channels import EVERY
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
@@ -41,13 +42,21 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
     tolerances = Tolerances(
         config.position_error, config.velocity_error, config.effort_V, config.period_s, config.measurement_delay_s
     )
-    found = fit_feedforward(log, config.feedforward or "", tolerances)
+    fit = fit_feedforward(log, config.feedforward or "", tolerances)
     with open_folder("calibrate", config, robot, beside, runs) as folder:
-        folder.write_json("feedforward.json", found.to_json())
-        folder.write_table("windows.csv", found.windows)
-        shown = print_report(feedforward_report.feedforward_document(found))
+        folder.write_json("feedforward.json", fit.to_json())
+        folder.write_table("windows.csv", fit.windows)
+        page = print_report(feedforward_report.feedforward_document(fit))
         note = "the rig of this log" if has_robot else "a rig that reads this log"
-        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=shown, runs=runs)
+        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=page, runs=runs)
+
+
+def voltage_fit(runs: Runs) -> Feedforward | None:
+    """Constants of a log of voltage and speed. None for other data, or with too little motion."""
+    if runs.sampled and runs.layout.imposed == "voltage":
+        with contextlib.suppress(BadData):
+            return fit_feedforward(drive_log(runs))
+    return None
 
 
 def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:

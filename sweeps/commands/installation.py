@@ -80,4 +80,4 @@ def _check_derivative() -> str:
 def _check_folder() -> str:
     with tempfile.NamedTemporaryFile(dir=".") as file:
         file.write(b"mmrjax")
-    return "the working folder can be written"
+    return "the working folder is writable"

@@ -70,7 +70,7 @@ def _run_with_time_limit(
 
 
 def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
-    began, within = time.monotonic(), beside.seconds
+    began, time_budget = time.monotonic(), beside.seconds
     prior_options = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, beside.members)
@@ -79,7 +79,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
     stages: dict[str, Any] = {}
 
     def left() -> float:
-        return max(within - (time.monotonic() - began), 0.0)
+        return max(time_budget - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
         elapsed = time.monotonic() - began
@@ -113,7 +113,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                _report_out_of_time(within, begun=bool(stages))
+                _report_out_of_time(time_budget, begun=bool(stages))
                 for note in lost_motion_notes(runs, robot):  # then no effect is ranked
                     print_message(describe(note))
             _report_stored_stages(stages, folder, config.robot)
@@ -145,8 +145,8 @@ def _add_track_model_test(
 def _report_out_of_time(within: float, begun: bool) -> None:
     """Reports that the time budget [s] ended before a verdict. `begun`: True if at least one stage has finished."""
     more = max(5, math.ceil(within / 30))  # with twice the time
-    first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
-    print_message(f"no verdict within {within:g} s{first}")
+    base_words = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
+    print_message(f"no verdict within {within:g} s{base_words}")
 
 
 @contextlib.contextmanager
@@ -175,8 +175,8 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
 
 def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
     """Prints the ranking by regression, the first answer, and writes it to the run folder."""
-    first, *lines = loop_words.ranking_lines(found, brief=brief)
-    timed(first)
+    first_line, *lines = loop_words.ranking_lines(found, brief=brief)
+    timed(first_line)
     for line in lines:
         print_message(line)
     answer = loop_words.regression_verdict(found)

@@ -124,8 +124,8 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
 
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
     """Columns of a log for one joint, with the joint's name removed, and columns of no joint."""
-    others = tuple(f"{name}." for name in joints if name != joint)
-    joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(others)]
+    other_prefixes = tuple(f"{name}." for name in joints if name != joint)
+    joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(other_prefixes)]
     return dataclasses.replace(
         log,
         name=f"{log.name}, joint {joint}",
@@ -194,9 +194,10 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
     """
     motion, cubic, knots = smoothed_log(log, chain)
     torques, cubic_torques = chain.torques(motion), chain.torques(cubic)
-    apart = round(len(log) / knots)  # rows from knot to knot
+    rows_per_knot = round(len(log) / knots)  # rows from knot to knot
     doubts = [
-        maximum_filter1d(np.abs(x), 4 * apart + 1, axis=0) for x in (torques - cubic_torques, motion[1] - cubic[1])
+        maximum_filter1d(np.abs(x), 4 * rows_per_knot + 1, axis=0)
+        for x in (torques - cubic_torques, motion[1] - cubic[1])
     ]
     runs = {}
     for name, robot in robots.items():
@@ -216,7 +217,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         noise_sd = np.zeros(len(table)) if noise is None else noise.sd(sizes[:, 0])
         change = np.abs(np.diff(table[CURRENT], prepend=np.nan))
         jump = np.where(change > JUMP * noise_sd, change, 0.0)
-        spread = np.sqrt(maximum_filter1d(jump, 2 * apart + 1) ** 2 + doubt**2 + noise_sd**2)
+        spread = np.sqrt(maximum_filter1d(jump, 2 * rows_per_knot + 1) ** 2 + doubt**2 + noise_sd**2)
         certain = np.abs(table[SPEED]) > least
         columns = {SD: spread, **table.columns, CURRENT: np.where(certain, table[CURRENT], np.nan)}
         note = f"{joint.name}: {np.sum(~certain)} of {len(table)} readings of the current are left out, because the "

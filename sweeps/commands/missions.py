@@ -118,11 +118,13 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
     imposed.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
-    most = max((float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0)
+    highest = max(
+        (float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0
+    )
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
-    if most > supply:
+    if highest > supply:
         raise BadConfiguration(
-            f"{source.source}, voltage_left_V and voltage_right_V: got {most:g} V; the supply has {supply:g} V "
+            f"{source.source}, voltage_left_V and voltage_right_V: got {highest:g} V; the supply has {supply:g} V "
             "(--voltage, or a column supply_voltage_V)"
         )
 
@@ -155,10 +157,10 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
         return
     conditions = run.conditions_of_runs(robot, runs, config)
     cell = mission_batch.cell_below_cutoff(robot, conditions, source.profile(robot, conditions), source.start)
-    below = np.flatnonzero(np.isfinite(cell))
-    if len(below):
+    too_low = np.flatnonzero(np.isfinite(cell))
+    if len(too_low):
         raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[below[0]]:.4g} V, below its "
+            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[too_low[0]]:.4g} V, below its "
             f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
         )
 
@@ -194,9 +196,9 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
             is_complete &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             done += count
             advance(count)
-    about = _condition_columns(robot, runs, source, config)
+    conditions_table = _condition_columns(robot, runs, source, config)
     return Missions(
-        {**about, **_concatenate_tables(tables)},
+        {**conditions_table, **_concatenate_tables(tables)},
         _concatenate_tables(segments),
         _concatenate_tables(courses),
         source,
@@ -216,10 +218,10 @@ def _condition_columns(
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
     unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
-    about = {key: nothing if key in unknown else value for key, value in run.condition_table(robot, runs).items()}
+    columns = {key: nothing if key in unknown else value for key, value in run.condition_table(robot, runs).items()}
     if source.surface is not None:
-        about.pop(profiles.SURFACE, None)
-    return about
+        columns.pop(profiles.SURFACE, None)
+    return columns
 
 
 def _segment_rows(
@@ -263,8 +265,8 @@ def _segment_rows(
         "mode",
         *(c for c in mission_batch.mission_columns(source.turns) if c in rows),
     ]
-    reached = time.ravel() > 0
-    return {column: rows[column][reached] for column in (*order, "status", "flags")}
+    is_reached = time.ravel() > 0
+    return {column: rows[column][is_reached] for column in (*order, "status", "flags")}
 
 
 def _segment_of_steps(found: Mission, k: int) -> np.ndarray:
@@ -320,7 +322,7 @@ def _course_rows(
     else:
         reading = balances.sensor(robot, signals)
     # Demands act this much later than in the profile, as do the values written next to them.
-    late = float(robot.rig.delay)
+    delay = float(robot.rig.delay)
     segment = course.segment % source.segment_count
     length = np.asarray(found.segments.time[k]).ravel()
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
@@ -337,7 +339,7 @@ def _course_rows(
         }
     return {
         "run_id": np.full(len(picked), name),
-        "time_s": course.time + late,
+        "time_s": course.time + delay,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
         "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),

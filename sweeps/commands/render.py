@@ -38,10 +38,10 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         _write_completely(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
         print_output(str(file))
         return DONE
-    still, columns = file.suffix == ".png", picture.stated
+    is_picture, columns = file.suffix == ".png", picture.stated
     slow = 20.0 if slow is None else slow
-    begin = (0.8 if still else 0.0) if begin is None else begin
-    end = begin + 0.1 if end is None and not still else end
+    begin = (0.8 if is_picture else 0.0) if begin is None else begin
+    end = begin + 0.1 if end is None and not is_picture else end
     options = config.options
     try:
         rendering.frame_times(file, begin, end, slow, options["duration"])
@@ -84,9 +84,9 @@ def _check_output_file(picture: configuration.Picture) -> None:
 
 def _write_completely(file: Path, draw: Callable[[Path], Any]) -> None:
     """Writes a picture or film completely or not at all."""
-    with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
+    with replacing(file) as temporary, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:
-            draw(aside)
+            draw(temporary)
         except ValueError as error:
-            raise BadConfiguration(f"render: {error}".replace(aside.name, file.name)) from error
+            raise BadConfiguration(f"render: {error}".replace(temporary.name, file.name)) from error
         advance(1)

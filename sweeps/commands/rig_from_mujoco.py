@@ -221,10 +221,10 @@ class _MujocoModel:
             rigid = model.body_weldid[model.geom_bodyid[k]] == welded
             if not rigid or kind not in (geom.mjGEOM_CYLINDER, geom.mjGEOM_SPHERE):
                 continue
-            along = data.geom_xmat[k].reshape(3, 3)[:, 2] if kind == geom.mjGEOM_CYLINDER else None
+            cylinder_axis = data.geom_xmat[k].reshape(3, 3)[:, 2] if kind == geom.mjGEOM_CYLINDER else None
             radius, centre = float(model.geom_size[k, 0]), data.geom_xpos[k] - data.xanchor[joint]
-            if is_round(centre, data.xaxis[joint], radius, along):
-                shape = "sphere" if along is None else "cylinder"
+            if is_round(centre, data.xaxis[joint], radius, cylinder_axis):
+                shape = "sphere" if cylinder_axis is None else "cylinder"
                 geom_name = self._name(self.library.mjtObj.mjOBJ_GEOM, k)
                 collides = bool(model.geom_contype[k] or model.geom_conaffinity[k])
                 radii.append((collides, radius, " ".join(filter(None, ("geom", geom_name, f"({shape})")))))

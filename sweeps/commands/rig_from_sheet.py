@@ -63,9 +63,9 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
             `LARGEST` although these equations make them equal.
     """
     if not stated:
-        others = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
+        other_options = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
         raise BadConfiguration(
-            f"--from-sheet: no motor data; expected --no-load-current and at least three of {others}"
+            f"--from-sheet: no motor data; expected --no-load-current and at least three of {other_options}"
         )
     sheet = {name: _parse_quantity(name, text) for name, text in stated.items()}
     drop = _stall_minus_no_load_current(sheet)
@@ -78,9 +78,9 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         resistances.append((torque * speed / drop**2, "stall torque, no-load speed and stall current"))
     known_resistances = [(value, source) for value, source in resistances if value is not None]
     resistance = known_resistances[0][0]
-    back = resistance * drop if voltage is None else voltage - resistance * idle
+    back_emf = resistance * drop if voltage is None else voltage - resistance * idle
     constants = [
-        (_ratio_or_none(back, speed), "voltage / no-load speed"),
+        (_ratio_or_none(back_emf, speed), "voltage / no-load speed"),
         (_ratio_or_none(torque, drop), "stall torque / stall current"),
     ]
     stated_constants = [(value, source) for value, source in constants if value is not None]
@@ -99,7 +99,7 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
             0.0,
             "N·m·s",
             "the no-load current does not separate Coulomb and viscous friction; ± as if half of it were viscous",
-            f"{0.5 * constant**2 * idle / back:.2g}",
+            f"{0.5 * constant**2 * idle / back_emf:.2g}",
         ),
     }
 

@@ -101,9 +101,9 @@ class _UrdfRobot:
             )
         if joint not in turning:
             kind = self.joints[joint].get("type") or "without a type"
-            slides = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
+            advice = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
             raise BadConfiguration(f"--joint: got {joint}, which is {kind}; expected one that turns: "
-                                   f"{list_some(candidates) or 'the file has none'}{slides}")  # fmt: skip
+                                   f"{list_some(candidates) or 'the file has none'}{advice}")  # fmt: skip
         return joint
 
     def numbers(self, joint: str) -> JointNumbers:
@@ -113,8 +113,8 @@ class _UrdfRobot:
         moved_links = list(self._moved(link))
         inertia, moment, count = 0.0, np.zeros(3), 0
         for name, pose in moved_links:
-            mass, about, first = self._inertial(name, pose, axis)
-            inertia, moment, count = inertia + about, moment + first, count + (mass > 0)
+            mass, inertia_about_axis, first_moment = self._inertial(name, pose, axis)
+            inertia, moment, count = inertia + inertia_about_axis, moment + first_moment, count + (mass > 0)
         named = (
             f"link {link}"
             if len(moved_links) == 1
@@ -123,8 +123,8 @@ class _UrdfRobot:
         if count == 0:
             raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
         if inertia < LEAST_INERTIA:
-            got = f"{round(inertia, 12):g} kg·m² about the axis of {joint}"
-            raise BadConfiguration(f"{self.file}, {named}, <inertia>: got {got}; expected more than 0")
+            inertia_text = f"{round(inertia, 12):g} kg·m² about the axis of {joint}"
+            raise BadConfiguration(f"{self.file}, {named}, <inertia>: got {inertia_text}; expected more than 0")
         radius = self._radius(joint)
         level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
         rolls = radius is not None and level and root_link != FIXED_ROOT and element.get("type") == "continuous"
@@ -228,11 +228,11 @@ class _UrdfRobot:
             for name, pose in self._moved(link, rigid=True):
                 for shape in self.links[name].findall(tag):
                     rotation, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
-                    for kind, along in (("cylinder", rotation[:, 2]), ("sphere", None)):
+                    for kind, cylinder_axis in (("cylinder", rotation[:, 2]), ("sphere", None)):
                         place_words = f"link {name}, <{tag}> <{kind}>"
                         element = shape.find(f"geometry/{kind}")
                         radius = self._number(element, "radius", place_words, "m", 0.0)
-                        if radius > 0 and is_round(centre, axis, radius, along):
+                        if radius > 0 and is_round(centre, axis, radius, cylinder_axis):
                             radii.append((radius, place_words))
             if radii:
                 return max(radii)
@@ -268,8 +268,8 @@ class _UrdfRobot:
             shared = len(element.findall("joint")) > 1  # actuators then belong to no single joint
             of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
             owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
-            texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
-            ratio_texts = [(text, tag) for text, tag in texts if text is not None]
+            reduction_texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
+            ratio_texts = [(text, tag) for text, tag in reduction_texts if text is not None]
             if not ratio_texts:
                 continue
             name = f"transmission {element.get('name', '')}, <{ratio_texts[0][1]}>".replace(" ,", ",")
@@ -342,5 +342,7 @@ def _compose(outer: Pose, inner: Pose) -> Pose:
 def _hanging_weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
     """As `hanging`, for a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
     across = np.cross(axis, moment)
-    flat = np.cross(across, axis)  # moment without its component along the axis
-    return hanging_torque_and_angle(float(axis @ np.cross(flat, gravity)), float(axis @ np.cross(across, gravity)))
+    moment_across = np.cross(across, axis)  # moment without its component along the axis
+    return hanging_torque_and_angle(
+        float(axis @ np.cross(moment_across, gravity)), float(axis @ np.cross(across, gravity))
+    )

@@ -158,6 +158,6 @@ def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndar
         axis: axis of the joint.
         along: axis of the cylinder. None: a sphere. Axes are unit vectors, shape (3,).
     """
-    off = np.linalg.norm(np.cross(axis, centre))
+    distance = np.linalg.norm(np.cross(axis, centre))
     tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))
-    return bool(off <= OFF_AXIS * radius and tilted <= OFF_AXIS)
+    return bool(distance <= OFF_AXIS * radius and tilted <= OFF_AXIS)

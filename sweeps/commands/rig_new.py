@@ -112,15 +112,15 @@ def write_new_rig(
         raise BadConfiguration(f"{file}: {instruction}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: the folder {file.parent} does not exist; create it first")
-    written = new_rig_text(kind, source, joint, sheet)
+    text = new_rig_text(kind, source, joint, sheet)
     if source is None and sheet is None:
         instruction = f'{KINDS[kind or USUAL]}. Replace the numbers marked "{EXAMPLE}" with your own, then'
     else:
-        lacking = ", ".join(f"{name} {unit}".rstrip() for name, unit in example_numbers(written).items())
-        instruction = written.removeprefix("# ").partition("; a comment")[0]
+        lacking = ", ".join(f"{name} {unit}".rstrip() for name, unit in example_numbers(text).items())
+        instruction = text.removeprefix("# ").partition("; a comment")[0]
         instruction += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
-        write_text(file, written)
+        write_text(file, text)
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); choose another path") from error
     print_output(f"{file}: {instruction}: mmrjax rig check {file} [DATA.csv]")

@@ -32,13 +32,13 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         rolling=settling.rolling_readings(robot),
         loop=loop,
     )
-    few = settle_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
+    few_runs_sentence = settle_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", segments_table(settled))
-        folder.write_json("result.json", to_json(settled, few))
+        folder.write_json("result.json", to_json(settled, few_runs_sentence))
         sign_sentences = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
-        document = print_report(settle_report.settle_document(settled, few, sign_sentences))
+        document = print_report(settle_report.settle_document(settled, few_runs_sentence, sign_sentences))
         return finish_run_folder(
             folder,
             config,

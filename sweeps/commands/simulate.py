@@ -73,7 +73,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         shows_turns = showing_turns(robot, runs.axes)
         table, histories = _simulate_table(folder, shows_turns, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)
-        stands = posture_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
+        postures = posture_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
         further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
@@ -81,9 +81,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             draws = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
             table |= draws.columns
             remarks += uncertainty.interval_remarks(draws)
-        if stands is not None:
-            folder.write_table("posture.csv", stands.table)
-            further["notes"] += posture_words.tipping_remarks(stands)
+        if postures is not None:
+            folder.write_table("posture.csv", postures.table)
+            further["notes"] += posture_words.tipping_remarks(postures)
         if histories is not None and robot.has_ground:
             assert histories.history is not None  # the fidelity was asked for it
             stages = stages_of_histories(robot, histories.history, runs.configurations(robot))
@@ -97,7 +97,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
         of_page = dataclasses.replace(file, robot=shows_turns)
-        document = runs_report.runs_document(of_page, config.model, table, histories, stands, remarks)
+        document = runs_report.runs_document(of_page, config.model, table, histories, postures, remarks)
         return run.write_run_folder(folder, config, result, print_report(document, of_page))
 
 
@@ -148,23 +148,26 @@ def end_columns_of_histories(robot: Robot, batch: RunBatch) -> Columns:
     columns = run.ending_columns(robot, batch)
     current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
     finite = np.isfinite(current)
-    last = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
-    rows = np.arange(len(last))
+    last_sample = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
+    rows = np.arange(len(last_sample))
     motors = float(robot.sides) * np.asarray(history.signals.current)
     limit = float(robot.sides) * float(robot.driver.current_limit)
     columns[PEAK] = np.maximum(
         _peaks_of_runs(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0
     )
-    columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
+    columns["displacement_m"], columns["time_end_s"] = (
+        np.array(history.distance)[rows, last_sample],
+        time[rows, last_sample],
+    )
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
-        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
+        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last_sample], history.signals)
         at_last = outputs.output_columns(
             jax.device_get(result_of_signals(robot, signals, jnp.asarray(status))), robot.channels
         )
         for name, values in at_last.items():
             columns[name] = np.where(empty & finite.any(-1), values, columns[name])
-        after = time[rows, np.minimum(last + 1, finite.shape[-1] - 1)] - time[rows, last]
+        after = time[rows, np.minimum(last_sample + 1, finite.shape[-1] - 1)] - time[rows, last_sample]
         draws = np.asarray(robot.battery.current(signals.total_current))
         time_left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
         time_left = np.where(empty & finite.any(-1), np.clip(np.nan_to_num(time_left), 0.0, after), 0.0)
@@ -216,9 +219,9 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
         name = f"run {k + 1}: " if several else ""
         flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])
         if "overvoltage" in flags:
-            back = -float(robot.battery.current(table["total_current_A"][k]))
+            charging = -float(robot.battery.current(table["total_current_A"][k]))
             remarks.append(
-                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V. The highest "
+                f"{name}overvoltage: {charging:.2f} A flow into the battery, a cell at {cell:.2f} V. The highest "
                 f"charging voltage is {robot.battery.voltage_charge:g} V"
             )
         if "cut_off" in flags:
@@ -240,9 +243,9 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
                 f"{float(robot.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
-            when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])
+            when, distance = float(table["time_end_s"][k]), float(table["displacement_m"][k])
             remarks.append(
-                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m. Values are those just before"
+                f"{name}battery_empty: after {when:.1f} s and {distance:.2f} m. Values are those just before"
                 if when > 0
                 else f"{name}battery_empty: empty before the start"
             )

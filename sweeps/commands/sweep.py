@@ -108,14 +108,14 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
             return DONE
         files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
         files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
-        same = job_identity(config, robot, files, device)
+        identity = job_identity(config, robot, files, device)
         if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
             _reject_without_space(layout.size, 1.0, path)  # a continued sweep needs less
-        store = SweepStore(path, same, layout, force=options.force)
+        store = SweepStore(path, identity, layout, force=options.force)
         try:
             if not store.finished:
                 simulate_chunks(store, job, options, pool)
-            return finish_sweep(store, config, file, job, same, options)
+            return finish_sweep(store, config, file, job, identity, options)
         except BaseException:
             if options.shard is None:
                 store.abandon()
@@ -239,9 +239,9 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        written = len(store.done())
+        count = len(store.done())
         raise DiskFull(
-            f"{store.partial}: {error.strerror} after {written} of {len(job.blocks)} chunks. Free some space, and "
+            f"{store.partial}: {error.strerror} after {count} of {len(job.blocks)} chunks. Free some space, and "
             "the same command resumes from there"
         ) from error
 

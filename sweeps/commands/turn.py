@@ -69,7 +69,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 **_turn_table(robot, readings, swept, batch),
             }
             folder.write_table("turns.csv", capabilities.drop_inapplicable_columns(robot, turns))
-            first, history = jax.tree.map(lambda x: x[:1], batch), None
+            first_run, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
             fidelity = fidelities.get_fidelity(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
@@ -78,21 +78,21 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 report_stage(stages - 1, stages, "the turn over time", slow),
                 progress_bar(1, quiet=not slow) as advance,
             ):
-                told = scale.share_counter(advance, 1)
-                first = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
-                told(1.0)
-            turns, history = None, first.history
+                report_share = scale.share_counter(advance, 1)
+                first_run = jax.device_get(fidelity.histories(robot, conditions, config.options, report_share))
+                report_share(1.0)
+            turns, history = None, first_run.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, readings))
-        columns = {name: np.asarray(values) for name, values in first.columns.items()}
-        table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first), **columns}
+        columns = {name: np.asarray(values) for name, values in first_run.columns.items()}
+        table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first_run), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
-            stands = posture_words.posture_of_runs(robot, runs, conditions)
+            postures = posture_words.posture_of_runs(robot, runs, conditions)
         notes = []
-        if stands is not None:
-            folder.write_table("posture.csv", stands.table)
-            notes.append(posture_words.posture_sentences(stands))
+        if postures is not None:
+            folder.write_table("posture.csv", postures.table)
+            notes.append(posture_words.posture_sentences(postures))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
         document = turn_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
         return run.write_run_folder(folder, config, result, print_report(document, file))
@@ -118,8 +118,8 @@ def _run_for_demand(
 
     def driven(volts: np.ndarray) -> Conditions:
         """Voltage of an external supply. A battery determines its own."""
-        most = max(supply, float(np.abs(volts).max()))
-        left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / most, most))
+        supply_voltage = max(supply, float(np.abs(volts).max()))
+        left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / supply_voltage, supply_voltage))
         voltage = asked.voltage if config.battery else source
         return dataclasses.replace(asked, voltage=voltage, duty_left=left, duty_right=right)
 
@@ -143,9 +143,9 @@ def _run_for_demand(
     turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
     for share in LOADED:
         first_guess = turning + share * np.abs(turning).max() * np.sign(belts)
-        found = scipy.optimize.root(off, first_guess, options={"maxfev": TRIED})
-        volts = found.x
-        if np.abs(found.fun).max() < NEAR:  # not NaN
+        solution = scipy.optimize.root(off, first_guess, options={"maxfev": TRIED})
+        volts = solution.x
+        if np.abs(solution.fun).max() < NEAR:  # not NaN
             break
     else:
         volts = np.full(2, np.inf)
@@ -193,10 +193,10 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
         return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}
     if config.left_V is None or config.right_V is None:  # duties for a demand are found later
         return columns | {name: 1.0 for name in SIDES}
-    most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
-    if supply is not None and supply < most:
+    larger_voltage, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
+    if supply is not None and supply < larger_voltage:
         raise BadConfiguration(
-            f"--voltage: got {supply:g}; expected at least {most:g} V, the voltage of --left and --right"
+            f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, the voltage of --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
     source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))
@@ -213,10 +213,10 @@ def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Condit
     """Settled turns in one batch: the requested one, and turns at other duties of the slower side."""
     left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
     outer, shares = max(left, right, key=abs), len(SHARES)
-    others = outer * SHARES
+    other_duties = outer * SHARES
     slower = abs(left) <= abs(right)
-    duty_left = np.concatenate([[left], others if slower else np.full(shares, outer)])
-    duty_right = np.concatenate([[right], np.full(shares, outer) if slower else others])
+    duty_left = np.concatenate([[left], other_duties if slower else np.full(shares, outer)])
+    duty_right = np.concatenate([[right], np.full(shares, outer) if slower else other_duties])
     rows = jax.tree.map(lambda x: np.repeat(np.asarray(x), shares + 1), asked)
     rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
     rows = jax.tree.map(jax.numpy.asarray, rows)

@@ -20,10 +20,10 @@ from sweeps.export.situation import ComparisonRuns, JointResult
 
 #: Share of an effect's change of current and speed below which the format does not hold it.
 LITTLE = 0.1
-#: Share from which on a format holds an effect but for rounding.
+#: Share above which a format holds an effect within rounding.
 NEARLY_ALL = 0.999
-#: Weight that keeps parameters near their translation where the runs do not determine them: a relative change of 1 of
-#: a parameter's root counts as much as this relative error of every reading.
+#: Weight that keeps undetermined parameters near their translation: a relative change of 1 in a parameter's root
+#: counts as much as this relative error of every reading.
 NEAR = 1e-3
 #: Residual below which translated parameters are exact, and no refit changes them.
 EXACT = 1e-7
@@ -48,7 +48,7 @@ class FormatLaw(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class EffectFate:
-    """How a format represents an effect, or a term of the base.
+    """Representation of an effect, or of a base term, in a format.
 
     Attributes:
         name: name of the effect or term.
@@ -65,7 +65,7 @@ class EffectFate:
 
 @dataclasses.dataclass(frozen=True)
 class ModelErrors:
-    """Error of one model against the reference of each channel, rms over rms [%], by the name of the channel."""
+    """Error of one model against the reference by channel: rms error over rms [%]."""
 
     label: str
     percent: Mapping[str, float]
@@ -82,7 +82,7 @@ class ExportComparison:
         errors: errors of native, exported, translated, and exported without the effects.
         reference: what errors are relative to, in words.
         readings: readings of the exported drive [SI], (runs, channels).
-        exported: at the joint.
+        exported: result of the exported drive at the joint.
     """
 
     situation: ComparisonRuns
@@ -113,33 +113,35 @@ def compare_format(
     """Compares a format with the native model over runs.
 
     Args:
-        law_of: the format's law of a joint in which some amplitudes, by name of the effect, have other values.
-        fates: fates of terms that are no effects inside the joint.
-        held: effects that the format holds by a term of its own → words for that term.
+        law_of: function that returns the format's law of a joint, with given amplitudes of effects by name.
+        fates: fates of terms that are not effects inside the joint.
+        held: effects for which the format has its own term → words for that term.
         approximated: words for the terms that replace an effect of a balance.
     """
     joint = situation.joint
     law = law_of(joint, {})
-    inside = situation.inside
-    theta = refit_parameters(law, situation, inside)
+    joint_result = situation.inside
+    theta = refit_parameters(law, situation, joint_result)
     names = tuple(e.name for e in joint.inside)
     fates_found = list(fates)
     for effect in joint.inside:
         without_effect = situation.solve_without_effects((effect.name,))
-        share = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, without_effect)
+        share = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, joint_result, without_effect)
         verdict = HELD if effect.name in held else DROPPED if share < LITTLE else APPROXIMATED
-        how = held.get(effect.name) or approximated(effect.balance)
+        approximation = held.get(effect.name) or approximated(effect.balance)
         if not np.isfinite(share) and effect.name not in held:
-            verdict, how = DROPPED, "it has no effect on these runs, and the format has no term for it"
-        fates_found.append(EffectFate(effect.name, verdict, how, share))
+            verdict, approximation = DROPPED, "it has no effect on these runs, and the format has no term for it"
+        fates_found.append(EffectFate(effect.name, verdict, approximation, share))
     exported = _law_at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
         models[TRANSLATED] = situation.readings(_law_at(law, law.start, situation))
     if names:
-        plain = law_of(joint, dict.fromkeys(names, 0.0))
-        bare = refit_parameters(plain, situation, situation.solve_without_effects(names))
-        models[WITHOUT] = situation.readings(_law_at(plain, bare, situation))
+        law_without_effects = law_of(joint, dict.fromkeys(names, 0.0))
+        refit_without_effects = refit_parameters(
+            law_without_effects, situation, situation.solve_without_effects(names)
+        )
+        models[WITHOUT] = situation.readings(_law_at(law_without_effects, refit_without_effects, situation))
     reference = situation.measured if situation.is_measured else situation.native
     return ExportComparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
@@ -151,7 +153,7 @@ def compare_format(
 
 
 def channel_errors(joint: DriveJoint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Rms of the difference over the rms of the reference [%], by channel that has readings."""
+    """Rms of the difference over the rms of the reference [%], for each channel with readings."""
     shares = share_of_measured(shown, reference)
     return {c.name: 100 * float(s) for c, s in zip(channels_of(joint), shares, strict=True) if np.isfinite(s)}
 
@@ -170,8 +172,8 @@ def evaluate_law(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) 
 def refit_parameters(law: FormatLaw, situation: ComparisonRuns, native: JointResult) -> np.ndarray:
     """Least-squares fit of a format's parameters to the native model's currents and speeds.
 
-    Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown. No
-    reading enters, so errors against readings are as honest as those of the native model.
+    Residuals are relative to each quantity's rms. Parameters stay positive, because each is the square of an unknown.
+    No readings are used, so errors against readings are comparable with those of the native model.
     """
     if not law.names:
         return np.zeros(0)
@@ -185,13 +187,13 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
     sizes = [jnp.sqrt(jnp.mean(x**2)) for x in (current, speed)]
     scale = jnp.sqrt(jnp.maximum(law.start, least))
 
-    # A root has no slope at 0, so a parameter that is 0 starts a little above.
+    # The square has no slope at 0, so a parameter of 0 starts slightly above.
     start = jnp.maximum(jnp.sqrt(law.start) / scale, 1e-3)
 
     def residual(z: jax.Array, args: Any) -> jax.Array:
         solution = law((scale * z) ** 2, command, load, way)
-        apart = [(a - b) / s for a, b, s in zip(solution, (current, speed), sizes, strict=True)]
-        return jnp.concatenate([*apart, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
+        errors = [(a - b) / s for a, b, s in zip(solution, (current, speed), sizes, strict=True)]
+        return jnp.concatenate([*errors, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
 
     solver: Any = solvers.solver_by_name("lm")
     solution: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)
@@ -205,8 +207,8 @@ def share_kept(
 ) -> float:
     """Fraction of an effect's change of current and speed that a refitted format reproduces [-], at most 1.
 
-    1 less the rms of what the change of the format's error by the effect is, over that of the change itself. NaN
-    where the effect changes nothing.
+    1 minus the rms change of the format's error by the effect, over the rms change of current and speed. NaN if the
+    effect changes nothing.
     """
     errors = [
         _scaled_residuals(exact)

@@ -1,4 +1,4 @@
-"""An export from Python, in one call."""
+"""Export from Python in one call."""
 
 from __future__ import annotations
 
@@ -28,24 +28,25 @@ def export(
     draws: int = 1000,
     seed: int = 0,
 ) -> Export:
-    """Export a robot's drive as the actuator of one joint in another simulator, compared with the native model.
+    """Exports a robot's drive as the actuator of one joint in another simulator, and compares it with the native
+    model.
 
     Args:
         robot: a robot, the name of a packaged one, or its TOML file. The posterior next to it is read.
         to: `mujoco`, `jax`, `onnx`, `mjlab`, `table` or `randomization` (docs/howto/export.md).
         out: folder for the files and `LAW.md`, made if it does not exist. None: no files are written.
         data: runs to compare with, or the file of a table or log. None: a grid of operating points.
-        configuration: which of the robot's. None: its first.
+        configuration: configuration of the robot. None: its first.
         joint: name of the joint in the simulator's model, for `mujoco`.
-        posterior: posterior of a robot that comes from no file, as a calibration or the loop returns it.
+        posterior: posterior of a robot in memory, from a calibration or the loop.
         draws, seed: draws and seed of `randomization`.
 
     Returns:
         The export: `files` by name, `comparison` with refitted parameters, fates of effects and errors in percent.
 
     Raises:
-        BadConfiguration: an unknown format, a drive that is not one joint, a folder that holds some of these files.
-        BadData: a table that is refused.
+        BadConfiguration: the format is unknown, the drive is not one joint, or the folder has one of these files.
+        BadData: the table is rejected.
     """
     file = RobotFile(robot, "robot") if isinstance(robot, Robot) else robot_file.find_robot_file(str(robot))
     exported = export_format(

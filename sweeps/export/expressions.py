@@ -17,7 +17,7 @@ import numpy as np
 from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration
 
-#: Operators with their precedence, and how they are written.
+#: Operators with their precedence and notation.
 _INFIX = {
     "lt": (1, "<"), "le": (1, "<="), "gt": (1, ">"), "ge": (1, ">="), "eq": (1, "=="), "ne": (1, "!="),
     "or": (2, "|"), "and": (3, "&"),
@@ -285,8 +285,8 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
     """Returns a scalar function of scalars as an expression of their names.
 
     Args:
-        function: traceable, of as many positional scalars.
-        what: opens the message of an error.
+        function: traceable function of as many positional scalars.
+        what: beginning of the error message.
 
     Raises:
         BadConfiguration: the function has a loop, or another operation that has no form as an expression.
@@ -353,7 +353,7 @@ class Torch(Dialect):
     def call(self, op: str, args: Sequence[str], constants: Sequence[bool]) -> str:
         if op in ("max", "min") and any(constants):
             tensor, number = (args[1], args[0]) if constants[0] else (args[0], args[1])
-            bound = "min" if op == "max" else "max"  # the larger of x and a number is x with that number as its least
+            bound = "min" if op == "max" else "max"  # max(x, number) clamps x from below
             return f"torch.clamp({tensor}, {bound}={number})"
         name = {"max": "maximum", "min": "minimum", "not": "logical_not"}.get(op, op)
         return f"torch.{name}({', '.join(args)})"
@@ -371,7 +371,7 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
     """Lines of a function body that returns an expression. Repeated subexpressions become local variables.
 
     Args:
-        spelled: text of a name.
+        spelled: function that returns the text of a name.
     """
     uses: dict[int, int] = {}
 
@@ -400,8 +400,8 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
             return local[id(x)]
         return f"({written})" if own_rank < outer else written
 
-    last = text(result)
-    return [*lines, f"{indent}return {last}"]
+    last_text = text(result)
+    return [*lines, f"{indent}return {last_text}"]
 
 
 def _operation_text(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int, str]:

@@ -21,9 +21,9 @@ from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 from sweeps.export.situation import ComparisonRuns
 
-#: Points of an axis on either side of rest; how far beyond the runs the axes reach.
+#: Points of an axis on each side of rest. Ratio of the axes to the range of the runs.
 POINTS, BEYOND = 20, 1.2
-#: Newton steps of the voltage at which a torque is given.
+#: Newton steps for the voltage that gives a torque.
 STEPS = 30
 #: Columns of the table, with their units.
 COLUMNS = {
@@ -124,9 +124,13 @@ def map_of_drive(
     module = module_from_source(jax_source(situation.joint, constants))
     params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
     reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
-    most = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
+    largest_torque = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
     return steady_state_map(
-        module, params, symmetric_axis(reach), symmetric_axis(most), float(situation.joint.robot.motor.resistance)
+        module,
+        params,
+        symmetric_axis(reach),
+        symmetric_axis(largest_torque),
+        float(situation.joint.robot.motor.resistance),
     )
 
 
@@ -211,8 +215,8 @@ def c_header(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> str:
     origin = f"Feed-forward of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     # Names come from users, so nothing in them can end the comment.
     words = (" ".join(printable(text).split()) for text in (origin, *notes))
-    about = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
-    return f"""/* {about}
+    comment = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
+    return f"""/* {comment}
  * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of steady motion.
  * When accelerating, add armature * acceleration to it.
  */

@@ -45,12 +45,12 @@ class Export:
 
     Attributes:
         format: one of `FORMATS`.
-        joint: what is exported.
+        joint: the exported drive.
         constants: constants of its law.
         posterior: posterior of the robot, if any.
-        files: contents by name.
+        files: contents of the files by name.
         comparison: comparison with the native model.
-        checks: numbers found with the files, by name.
+        checks: results of checks with the files, by name.
     """
 
     format: str
@@ -74,18 +74,18 @@ def export_format(
     seed: int = 0,
     posterior: Posterior | None = None,
 ) -> Export:
-    """Returns the drive of a robot in a format, compared with the native model over runs.
+    """Drive of a robot in a format, compared with the native model over runs.
 
     Args:
         to: one of `FORMATS`.
-        configuration: name, None: the robot's first.
+        configuration: name of the configuration. None: the robot's first.
         data: runs, or the file of a table or log. None: a grid of operating points.
         at: name of the joint in the simulator's model.
         draws, seed: draws and seed of `randomization`.
-        posterior: posterior of the robot. None: that from the folder of its file.
+        posterior: posterior of the robot. None: read from the folder of its file.
 
     Raises:
-        BadConfiguration, BadData: a format, a drive or a table that is refused.
+        BadConfiguration, BadData: the format, drive or table is rejected.
     """
     stated_word(to, FORMATS, "--to")
     if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):
@@ -115,6 +115,12 @@ def notes_for_file_head(runs: ComparisonRuns) -> list[str]:
     ]
 
 
+def middle_run(command: np.ndarray, load: np.ndarray) -> tuple[float, float]:
+    """Command and load of the run with the median magnitude of the command. The mean of a symmetric grid is rest."""
+    row = int(np.argsort(np.abs(command))[len(command) // 2])
+    return float(command[row]), float(load[row])
+
+
 def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive = begun.joint
     normal = float(np.mean(np.asarray(runs.signals.normal)))
@@ -126,24 +132,26 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
         mujoco.approximated_terms,
     )
     motor, name = mujoco.mjcf_motor(drive, compared.refitted), f"{drive.name}_drive"
-    about = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
+    notes = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
-    middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
-    follows = drive.robot.rig.imposed == "goal_angle"
+    middle = middle_run(runs.command, runs.load)
+    follows_angle = drive.robot.rig.imposed == "goal_angle"
 
     def texts_of(drive: DriveJoint) -> dict[str, str]:
         return {
-            "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_for_file_head(runs), name, at, volts),
+            "drive.xml": mujoco.mjcf_fragment(drive, motor, notes, notes_for_file_head(runs), name, at, volts),
             "scene.xml": mujoco.mjcf_scene(
-                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)
+                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows_angle else middle)
             ),
         }
 
     texts = texts_of(drive)
     checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
-    if follows or (drive.loose and drive.controller is None):
-        checks |= _start_difference(drive, texts, GOAL if follows else volts, motor.ratio if follows else 1.0)
+    if follows_angle or (drive.loose and drive.controller is None):
+        checks |= _start_difference(
+            drive, texts, GOAL if follows_angle else volts, motor.ratio if follows_angle else 1.0
+        )
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(
@@ -177,8 +185,12 @@ def _check_in_mujoco(
 def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
     """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
     times = np.linspace(0.0, START, 26)
-    own = drive.controller
-    conditions = Conditions(voltage=command) if own is None else Conditions(voltage=own.supply_voltage, goal=command)
+    controller = drive.controller
+    conditions = (
+        Conditions(voltage=command)
+        if controller is None
+        else Conditions(voltage=controller.supply_voltage, goal=command)
+    )
     run = drive_batch(
         drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
     )

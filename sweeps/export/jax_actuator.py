@@ -19,9 +19,9 @@ from sweeps.export.law_source import LawConstant, constant_values, jax_source, m
 from sweeps.export.mujoco import CONTROLLER, PLAY, fates_outside_joint
 from sweeps.export.situation import ComparisonRuns
 
-#: Steps of a run to its steady state, and their length [s]: of an implicit step so long, Newton's method is left.
+#: Steps to the steady state, and their length [s]. An implicit step of this length is a step of Newton's method.
 SETTLING, LONG = 10, 1e9
-#: Newton steps of the speed at which a load is carried.
+#: Newton steps for the speed at a load.
 STEPS = 25
 #: Platforms for which the serialised program is lowered.
 PLATFORMS = ("cpu", "cuda")
@@ -32,7 +32,7 @@ PLACES = "jax_traceback_in_locations_limit"
 class ActuatorLaw(eqx.Module):
     """The generated actuator in steady travel, without a refit. Its attributes are those of `comparison.FormatLaw`.
 
-    params: parameters of the actuator, of shape (runs,) where they differ.
+    params: parameters of the actuator, of shape (runs,) if they differ.
     guess: speed of the joint near the solution [rad/s].
     """
 
@@ -49,7 +49,7 @@ class ActuatorLaw(eqx.Module):
         def nearer(speed: Any, _: None) -> tuple[Any, None]:
             residual, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
             stride = jnp.where(rise != 0, -residual / jnp.where(rise != 0, rise, 1.0), 0.0)
-            # Never across rest, where friction turns round.
+            # Never across rest, where friction changes its sign.
             return jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed), None
 
         speed = jax.lax.scan(nearer, self.guess, None, STEPS)[0]
@@ -57,7 +57,7 @@ class ActuatorLaw(eqx.Module):
 
 
 def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any) -> tuple[Any, Json]:
-    """Torque [N·m] and inside of an actuator at a constant voltage [V] and speed of the joint [rad/s]."""
+    """Torque [N·m] and internal quantities of an actuator at a constant voltage [V] and joint speed [rad/s]."""
     state = module.initial_state(jnp.shape(speed))
 
     def again(state: Any, _: None) -> tuple[Any, None]:
@@ -69,7 +69,7 @@ def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any)
 
 
 def steady_params(joint: DriveJoint, constants: Sequence[LawConstant], amplitudes: Mapping[str, float]) -> Json:
-    """Parameters of the actuator in steady travel: without what repeats with an angle, whose mean is 0."""
+    """Parameters of the actuator in steady travel, without terms that repeat with an angle, whose mean is 0."""
     params = dict(constant_values(constants))
     waves = {p.name: 0.0 for p in joint.parts if memory_grows(p)}
     for name, value in {**amplitudes, **waves}.items():
@@ -123,7 +123,7 @@ def effects_in_actuator(joint: DriveJoint) -> dict[str, str]:
 
 
 def jax_files(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str]) -> dict[str, str | bytes]:
-    """The actuator's source, and its program as `jax.export` serialises it."""
+    """The actuator's source, and its program serialised by `jax.export`."""
     source = jax_source(joint, constants, notes)
     return {"actuator.py": source, "actuator.jaxexport": serialise_actuator(module_from_source(source))}
 

@@ -1,4 +1,4 @@
-"""A robot's drive as the actuator of one joint, its driving wheel or shaft. Parts of its law are expressions."""
+"""A robot's drive as the actuator of one joint, its driving wheel or shaft. The parts of its law are expressions."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import ZERO, Symbol, names_in, trace_function
 
-#: Balances that a joint has; what enters another one belongs to what the joint moves, or to an instrument.
+#: Balances of a joint. Terms in other balances belong to the load or to an instrument.
 INSIDE = ("supply", "electrical", "inductance", "motor", "gearbox", "track", "inertia")
-#: A driver's limit of current from which on there is none [A].
+#: A current limit of the driver of this size means no limit [A].
 UNLIMITED = 1000.0
-#: Variables of the law, and the signals that they are; the output's torques are `load` and, at the wheel, `pull`.
+#: Variables of the law and their signals. Torques of the output are `load` and, at the wheel, `pull`.
 VARIABLES = {
     "current": "current",
     "voltage": "voltage",
@@ -44,14 +44,14 @@ class Part:
     """One equation of the law.
 
     Attributes:
-        name: a word.
-        balance: which it enters, or what it is.
+        name: name of the part.
+        balance: balance that it enters, or its role.
         unit: unit of its value.
-        equation, meaning: equation and meaning in words, from the docstring of what it is made of.
-        value: as an expression.
+        equation, meaning: equation and meaning in words, from a docstring.
+        value: value as an expression.
         slope: its derivative with respect to the variable `by`.
         rate, rate_slope: rate of its memory, and the derivative of the rate with respect to the memory.
-        effect: name of the effect that it is of. Empty: of the robot's base.
+        effect: name of its effect. Empty: part of the base robot.
     """
 
     name: str
@@ -72,9 +72,9 @@ class DriveJoint:
     """A drive as the actuator of a joint.
 
     Attributes:
-        file: the robot and what its file stated.
-        configuration: name of its load.
-        robot: robot with this configuration and the effects inside alone.
+        file: the robot and the content of its file.
+        configuration: name of the configuration.
+        robot: robot with only this configuration and the effects inside the joint.
         inside, outside: effects that enter the balances of a joint, and the others.
         idle: names of effects that do not act on this configuration.
         parts: equations of the law in their order.
@@ -118,7 +118,7 @@ class DriveJoint:
 
     @property
     def controller(self) -> Controller | None:
-        """Controller of its motor."""
+        """Controller of the motor."""
         return self.robot.controller
 
     @property
@@ -146,9 +146,9 @@ class DriveJoint:
         """The same joint in steady travel under a voltage, without the controller and with a rigid gearbox."""
 
         def driven(robot: Robot) -> Robot:
-            motor, own = robot.motor, robot.controller
-            if own is not None and motor.voltage_limit is None:
-                motor = dataclasses.replace(motor, voltage_limit=float(own.supply_voltage * own.limit))
+            motor, controller = robot.motor, robot.controller
+            if controller is not None and motor.voltage_limit is None:
+                motor = dataclasses.replace(motor, voltage_limit=float(controller.supply_voltage * controller.limit))
             rig = dataclasses.replace(robot.rig, imposed="voltage", loose=False)
             return dataclasses.replace(robot, motor=motor, rig=rig, controller=None)
 
@@ -160,7 +160,7 @@ class DriveJoint:
         return tuple(p for p in self.parts if p.balance == balance)
 
     def with_robot(self, robot: Robot) -> DriveJoint:
-        """The same joint of a robot with other numbers. Its parts are expressions of names and stay."""
+        """The same joint for a robot with other numbers. Its parts are expressions of names and do not change."""
         return dataclasses.replace(self, robot=robot, inside=robot.effects)
 
     def parameters(self) -> dict[str, params.Parameter]:
@@ -187,14 +187,14 @@ def _symbols_of_part(part: Part) -> list[Symbol]:
 
 
 def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJoint:
-    """Returns the drive of a robot as the actuator of one joint.
+    """Drive of a robot as the actuator of one joint.
 
     Args:
-        configuration: its name. None: the robot's first.
+        configuration: name of the configuration. None: the robot's first.
 
     Raises:
-        BadConfiguration: no such configuration. A drive that is not one joint or that no voltage drives. An effect
-            whose equation has no closed form.
+        BadConfiguration: the configuration does not exist, the drive is not one joint or not driven by voltage, or
+            the equation of an effect has no closed form.
     """
     robot = file.robot
     name = robot.configurations.names[0] if configuration is None else configuration
@@ -225,10 +225,12 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     one = dataclasses.replace(robot, configurations=members)
     acting = tuple(e for e in robot.effects if _effect_acts(one, e))
     idle = tuple(e.name for e in robot.effects if e not in acting)
-    inside = tuple(e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks)
-    outside = tuple(e for e in acting if e not in inside)
-    one = dataclasses.replace(one, effects=inside)
-    joint = DriveJoint(file, name, one, inside, outside, idle, ())
+    effects_inside = tuple(
+        e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks
+    )
+    outside = tuple(e for e in acting if e not in effects_inside)
+    one = dataclasses.replace(one, effects=effects_inside)
+    joint = DriveJoint(file, name, one, effects_inside, outside, idle, ())
     return dataclasses.replace(joint, parts=tuple(_trace_parts(joint)))
 
 
@@ -302,7 +304,7 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
     trace = _ExpressionTracer(joint)
     bare = lambda robot: dataclasses.replace(robot, effects=())  # noqa: E731
 
-    rest = float(joint.load.speed_still) / float(joint.load.radius)
+    speed_at_rest = float(joint.load.speed_still) / float(joint.load.radius)
     friction = (
         "M_t = M_t0 sign ω + K_ft ω, and friction by the normal load"
         if joint.robot.has_ground
@@ -310,8 +312,8 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
     )
     base: Sequence[tuple[str, str, str, str, str, str, Callable[[Robot, Signals], Any]]] = (
         ("direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
-         f"smooth sign of the speed, within ω_0 = {rest:.3g} rad/s of rest", "",
-         lambda r, s: contact.smooth_sign(s.speed_wheel, rest)),
+         f"smooth sign of the speed, within ω_0 = {speed_at_rest:.3g} rad/s of rest", "",
+         lambda r, s: contact.smooth_sign(s.speed_wheel, speed_at_rest)),
         ("back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces", "",
          lambda r, s: r.motor.voltage_back(s.speed_motor)),
         ("winding", "electrical", "V", "U_R = R_rot I", "voltage across the winding", "current",
@@ -373,7 +375,7 @@ def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
 
 
 def memory_grows(part: Part) -> bool:
-    """True if a part's memory grows without end, as a phase does: it has no settled value but its mean, 0."""
+    """True if a part's memory grows without limit, as a phase does. Instead of a settled value it has the mean 0."""
     return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
 
 
@@ -390,7 +392,7 @@ def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float
 def channels_of(joint: DriveJoint) -> tuple[Any, ...]:
     """Channels of the robot's instruments that settled runs show, in the order of their table.
 
-    A rig without any, such as a servo whose angle alone is read, is compared by current and speed of the motor.
+    A rig without any, such as a servo with only an angle sensor, is compared by current and speed of the motor.
     """
     settled = [c for c in EVERY if c.settled]
     own_channels = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)

@@ -26,16 +26,16 @@ from mmrjax.model.signals import Signals
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_in
 from sweeps.export.joint import VARIABLES, DriveJoint, Part, mean_surroundings
 
-#: Draws of the posterior by which intervals are found, and the shares of them below their ends.
+#: Draws from the posterior for intervals, and quantiles of their ends.
 DRAWS, ENDS = 4000, (0.025, 0.975)
 OF_POSTERIOR, OF_PRIOR = "95 % interval", "from the prior (± two sds): no posterior available"
 
 
 def posterior_next_to(joint: DriveJoint) -> Posterior | None:
-    """Returns the posterior next to the robot's file, None if there is no such file.
+    """Posterior next to the robot's file. None if there is no such file.
 
     Raises:
-        BadData: it cannot be read, or is of another robot.
+        BadData: it cannot be read, or belongs to another robot.
     """
     source = Path(joint.file.source)
     path = source.with_name(posterior_file.FILE)
@@ -96,7 +96,7 @@ def _interval_of(
     return max(value - 2 * sd, low), min(value + 2 * sd, high), kind
 
 
-#: Name of the constant of a controller's supply.
+#: Name of the constant with a controller's supply voltage.
 SUPPLY = "controller.supply_voltage"
 _ARGUMENTS = (*VARIABLES, "load", "pull")
 
@@ -106,10 +106,10 @@ class LawConstant:
     """A number of the law.
 
     Attributes:
-        name: dotted.
-        value: [SI].
-        unit, meaning, source: in words.
-        low, high: limits of its interval, None: not known.
+        name: dotted name.
+        value: value [SI].
+        unit, meaning, source: description in words.
+        low, high: limits of its interval. None: not known.
         kind: kind of interval, in words.
     """
 
@@ -124,7 +124,7 @@ class LawConstant:
 
     @property
     def interval(self) -> str:
-        """Its interval in words, empty if unknown."""
+        """Interval in words, empty if unknown."""
         return "" if self.low is None else f"{self.low:.4g} to {self.high:.4g} ({self.kind})"
 
 
@@ -154,12 +154,12 @@ def function_arguments(symbol: Symbol) -> list[str]:
 
 
 def quoted(word: str) -> str:
-    """A word as a literal of Python."""
+    """Word as a Python literal."""
     return f'"{word}"' if re.fullmatch(r"[\w.-]+", word) else repr(word)
 
 
 def _docstring(text: str) -> str:
-    """A text as a docstring: names in it come from users, so nothing in it can end the literal."""
+    """Text as a docstring, escaped because names come from users and could end the literal."""
     return '"""' + printable(text).replace("\\", "\\\\").replace('"', '\\"') + '"""'
 
 
@@ -278,8 +278,8 @@ _PENDING = 'state["pending"]'
 
 def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
     """Lines of the controller: the voltage for a goal, and the states after the step."""
-    imposed, own, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
-    assert own is not None
+    imposed, controller, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
+    assert controller is not None
     shown = {"goal_angle": "angle", "goal_speed": "joint_velocity", "goal_current": 'state["current"]'}[imposed]
     last = (
         '- p["controller.kd"] * joint_velocity'
@@ -287,17 +287,17 @@ def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
         else '+ p["controller.feed_forward"] * command'
     )
     limit = 'p["controller.limit"]'
-    if own.rate:
+    if rate := controller.rate:
         return [
-            f"# Controller: acts every {1 / own.rate:g} s, in the nearest step, and holds its share of the supply.",
+            f"# Controller: acts every {1 / rate:g} s, in the nearest step, and holds its share of the supply.",
             f"error = command - {shown}",
             f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
             f"demanded = {library.clipped('wanted', limit)}",
             f'due, limited = state["clock"] < 0.5 * dt, ({prefix}.abs(demanded) >= {limit}) & (demanded * error > 0)',
-            f'integral = state["integral"] + {prefix}.where(due & ~limited, error, 0.0 * error) / {own.rate!r}',
-            f'duty = {prefix}.where(due, {_PENDING if own.samples_late else "demanded"}, state["duty"])',
-            *([f"pending = {prefix}.where(due, demanded, {_PENDING})"] if own.samples_late else []),
-            f'clock = {prefix}.where(due, state["clock"] + {1 / own.rate!r}, state["clock"]) - dt',
+            f'integral = state["integral"] + {prefix}.where(due & ~limited, error, 0.0 * error) / {rate!r}',
+            f'duty = {prefix}.where(due, {_PENDING if controller.samples_late else "demanded"}, state["duty"])',
+            *([f"pending = {prefix}.where(due, demanded, {_PENDING})"] if controller.samples_late else []),
+            f'clock = {prefix}.where(due, state["clock"] + {1 / rate!r}, state["clock"]) - dt',
             f'voltage = p["{SUPPLY}"] * duty',
         ]
     return [
@@ -312,7 +312,7 @@ def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
                 'duty = state["duty"] + (demanded - state["duty"]) * dt / (p["controller.lag"] + dt)',
                 f'voltage = p["{SUPPLY}"] * duty',
             ]
-            if own.lags
+            if controller.lags
             else [f'voltage = p["{SUPPLY}"] * demanded']
         ),
     ]
@@ -322,7 +322,7 @@ def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) ->
     """Lines of the torque between motor and load (`Shaft.torque_joint`), one implicit Euler step of the motor's side.
 
     Args:
-        lost: text of what effects of the gearbox lose.
+        lost: text of the losses by gearbox effects.
     """
     value = lambda name: f"p[{quoted(f'{joint.configuration}.{name}')}]"  # noqa: E731
     if joint.load.stiffness > 0:
@@ -350,7 +350,7 @@ def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) ->
         lines += [
             f"half = 0.5 * {value('backlash')}",
             f"beyond = later - {library.clipped('later', 'half')}",
-            # As in the model, damping sets in over a tenth of the backlash, and flanks never pull.
+            # As in the model, damping starts over a tenth of the backlash, and flanks never pull.
             f"share = {library.clipped(f'{prefix}.abs(beyond) / (0.2 * half + 1e-4)', '1.0')}",
             f"stiffness, damping = {prefix}.where(beyond != 0, stiffness, 0.0 * stiffness), share * damping",
         ]
@@ -373,9 +373,11 @@ def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) ->
 
 
 def _inertia_lines(joint: DriveJoint) -> list[str]:
-    """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not.
+    """Lines for the torques that accelerate rotor and wheel. The joint contains their inertia, but losses by torque
+    do not.
 
-    As in the model, the gearbox transmits what is left after the rotor, and its sign is the direction of power.
+    As in the model, the gearbox transmits the torque that remains after the rotor. Its sign is the direction of
+    power.
     """
     wheel = [f"p[{quoted(f'{joint.configuration}.inertia')}]", *map(call_text, joint.of("inertia"))]
     return [
@@ -387,8 +389,8 @@ def _inertia_lines(joint: DriveJoint) -> list[str]:
     ]
 
 
-#: Inertia of the rotor at the output. A load sees it as J i² η or J i² / η, by the direction of power. With their
-#: mean as the joint's armature, the torque left for either one lags a step, and is stable at any load.
+#: Inertia of the rotor at the output: J i² η or J i² / η, depending on the direction of power. With their mean as the
+#: joint's armature, the remaining torque lags by a step and is stable at any load.
 TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
 ARMATURE = f'{TURNING} * 0.5 * (p["gearbox.efficiency_load"] + 1.0 / p["gearbox.efficiency_load"])'
 
@@ -409,14 +411,10 @@ def constants_text(constants: Sequence[LawConstant], name: str = "PARAMS") -> st
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
     lines = [f"{name} = {{"]
     for c in constants:
-        lines += [f"    # {text}" for text in textwrap.wrap(printable(_constant_comment(c)), 106)]
+        comment = f"{c.meaning} [{c.unit}]{f'; {c.interval}' * bool(c.interval)}; {c.source}"
+        lines += [f"    # {text}" for text in textwrap.wrap(printable(comment), 106)]
         lines.append(f"    {quoted(c.name)}: {c.value!r},")
     return "\n".join([*lines, "}"])
-
-
-def _constant_comment(c: LawConstant) -> str:
-    interval = f"; {c.interval}" if c.interval else ""
-    return f"{c.meaning} [{c.unit}]{interval}; {c.source}"
 
 
 def _module_header(joint: DriveJoint, what: str, notes: Sequence[str]) -> str:
@@ -469,7 +467,9 @@ def _module_text(
     volts = "voltage at the driver's output [V]: its duty times the voltage of the supply"
     document = _DOCUMENT.replace("{command}", f"goal of the controller: {goal}" if goal else volts)
     rotor = '0.0 * p["motor.inertia"]' if joint.loose else ARMATURE
-    own = "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² (η + 1/η) / 2"
+    armature_words = (
+        "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² (η + 1/η) / 2"
+    )
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
@@ -478,7 +478,7 @@ def _module_text(
         f"{_module_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
         f"{functions_text(joint, library.dialect)}\n\n\n"
         f"def armature(params):\n"
-        f'    """{own}, for the joint\'s own armature [kg·m²]."""\n'
+        f'    """{armature_words}, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
         f"    return {rotor}{added}\n\n\n"
         f"def initial_state({shape_arguments}):\n"
@@ -494,7 +494,8 @@ def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
     """Module of the source of a law.
 
     Raises:
-        BadConfiguration: it has more than an import, literals, and functions that call each other and the library.
+        BadConfiguration: the source has more than an import, literals, and functions that call each other and the
+            library.
     """
     tree = ast.parse(source)
     if not _states_a_law(tree):

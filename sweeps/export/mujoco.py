@@ -1,4 +1,4 @@
-"""A drive as a `<dcmotor>` of MuJoCo: an MJCF fragment to include, a scene that runs, its law in steady travel."""
+"""A drive as a `<dcmotor>` of MuJoCo: an MJCF fragment to include, a runnable scene, and its law in steady travel."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant
 from sweeps.export.situation import ComparisonRuns, JointResult
 
-#: First version that has `<dcmotor>`.
+#: First version with `<dcmotor>`.
 FIRST = (3, 7, 0)
-#: Effects that the format has a term for, and which.
+#: Effects for which the format has a term, and the term.
 TERMS = {
     "series_resistance": "resistance",
     "supply_sag": "resistance, for all motors together at equal currents",
@@ -37,22 +37,22 @@ TERMS = {
     "cogging": "cogging, which does not fade at speed",
     "presliding": "lugre",
 }
-#: Friction that falls with speed: amplitude at the motor's shaft; true if its speed is the motor's.
+#: Friction that falls with speed: amplitude at the motor shaft, and True if its speed is that of the motor.
 STRIBECK = {
     "stribeck_motor": (True, True),
     "stribeck_gear": (False, True),
     "stribeck_track": (False, False),
     "stribeck_exponent": (False, False),
 }
-#: Turn of the joint over which a bristle yields where nothing states it [rad].
+#: Default angle of the joint over which a bristle yields [rad].
 YIELD = 0.02
-#: Least friction at speed of a bristle, as a share of what falls with speed.
+#: Smallest friction of a bristle at speed, as a share of the friction that falls with speed.
 LEAST_SHARE = 0.05
 #: Fixed-point steps of heat and falling friction.
 STEPS = 12
-#: Names of what is no effect.
+#: Names of base terms.
 PLAY, CONTROLLER = "backlash and elasticity", "controller"
-#: Impedance of a tendon's limit: so low that the limit is a spring and a damper, which adds to other torques.
+#: Impedance of a tendon's limit, so low that the limit acts as a spring and a damper in addition to other torques.
 IMPEDANCE = 1e-3
 #: Names of the format's parameters.
 RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE = (
@@ -64,8 +64,8 @@ EXCESS, FADE, HEAT = "lugre F_S - F_C", "lugre v_S", "thermal R"
 class MujocoLaw(eqx.Module):
     """Steady law of `<dcmotor>` on a joint with friction loss and damping.
 
-    U = R' I' + g K ω, g K I' = M + f sign ω + d ω, and I = c I'. Its `ratio` is g, and `coefficient` that of
-    the resistance's temperature [1/K]. Further attributes: as of `comparison.FormatLaw`.
+    U = R' I' + g K ω, g K I' = M + f sign ω + d ω, and I = c I'. `ratio` is g, and `coefficient` the temperature
+    coefficient of the resistance [1/K]. Further attributes are as in `comparison.FormatLaw`.
     """
 
     names: Names = eqx.field(static=True)
@@ -104,7 +104,7 @@ def _effect_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> dict[
 
 
 def mujoco_law_function(normal: float) -> Any:
-    """Returns the function from a joint and amplitudes to its law, at a normal load of one side [N]."""
+    """Function of a joint and amplitudes that returns its law, at a normal load of one side [N]."""
 
     def law(joint: DriveJoint, amplitudes: Mapping[str, float]) -> MujocoLaw:
         return translate_law(joint, normal, amplitudes)
@@ -146,7 +146,7 @@ def translate_law(joint: DriveJoint, normal: float, amplitudes: Mapping[str, flo
 
 
 def stribeck_friction(joint: DriveJoint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
-    """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint, None without such effects."""
+    """Excess friction at low speed [N·m] and its fading speed [rad/s], at the joint. None without such effects."""
     gear = joint.robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
     bristles = [
@@ -191,15 +191,15 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     if joint.loose:
         how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
         fates.append(EffectFate(PLAY, HELD, how))
-    if own := joint.controller:
-        fates.append(_controller_fate(joint, float(own.lag), float(own.ki), own.rate))
+    if controller := joint.controller:
+        fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki), controller.rate))
     if joint.limit is not None:
         fates.append(EffectFate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]
 
 
 def _controller_fate(joint: DriveJoint, lag: float, ki: float, rate: float) -> EffectFate:
-    """Fate of a controller in `<dcmotor>`, whose own follows the motor's angle, at once, with a limited integral."""
+    """Fate of a controller in `<dcmotor>`, which follows the motor's angle without lag, with a limited integral."""
     imposed = joint.robot.rig.imposed
     if imposed != "goal_angle":
         how = (
@@ -238,10 +238,10 @@ class MjcfMotor:
 
     Attributes:
         values: refitted parameters by name [SI].
-        ratio, inductance, armature: [-], [H], [kg·m²].
+        ratio, inductance, armature: values of these attributes [-], [H], [kg·m²].
         added: inertia that effects add to the joint, part of the armature [kg·m²].
-        thermal, lugre, cogging: attributes of `<dcmotor>`, at the motor's shaft, empty where it has none.
-        limit: largest torque of the motor by its driver's limit [N·m]. None: no limit.
+        thermal, lugre, cogging: attributes of `<dcmotor>` at the motor shaft, empty if it has none.
+        limit: largest torque of the motor by its driver limit [N·m]. None: no limit.
     """
 
     values: Mapping[str, float]
@@ -276,7 +276,7 @@ def mjcf_motor(joint: DriveJoint, values: Mapping[str, float]) -> MjcfMotor:
     bristle = max(number("presliding"), 0.0)
     excess = values.get(EXCESS, 0.0)
     if bristle or excess:
-        # All dry friction goes through the bristle if it falls with speed: its steady curve needs a positive end.
+        # All dry friction goes through the bristle if it falls with speed, because its steady curve must end above 0.
         coulomb = max(values[FRICTION], LEAST_SHARE * excess) if excess else min(bristle, values[FRICTION])
         turn = number("presliding", "angle_breakaway") or YIELD
         stiffness = (coulomb + excess) / turn
@@ -295,20 +295,29 @@ def mjcf_motor(joint: DriveJoint, values: Mapping[str, float]) -> MjcfMotor:
 def _controller_gains(joint: DriveJoint, found: MjcfMotor) -> tuple[float, ...]:
     """Gains of the controller of `<dcmotor>`: kp, ki, kd of a torque, -, limits of integral and voltage.
 
-    It wants U = (R/K) (kp e + ki ∫ e dt - kd ω_m) + K ω_m, of the motor's angle. Empty: it gets a voltage.
+    U = (R/K) (kp e + ki ∫ e dt - kd ω_m) + K ω_m, for the motor's angle. Empty if the command is a voltage.
     """
-    own = joint.controller
-    if own is None or joint.robot.rig.imposed != "goal_angle":
+    controller = joint.controller
+    if controller is None or joint.robot.rig.imposed != "goal_angle":
         return ()
     constant = found.values[CONSTANT]
-    volts, kp, ki, kd = (own.supply_voltage * float(g) / found.ratio for g in (1.0, own.kp, own.ki, own.kd))
+    volts, kp, ki, kd = (
+        controller.supply_voltage * float(g) / found.ratio for g in (1.0, controller.kp, controller.ki, controller.kd)
+    )
     torque = constant / found.values[RESISTANCE]
-    most = float(own.limit) * found.ratio / float(own.ki) if ki else 0.0
-    return kp * torque, ki * torque, (kd + constant) * torque, 0.0, most, volts * found.ratio * float(own.limit)
+    integral_limit = float(controller.limit) * found.ratio / float(controller.ki) if ki else 0.0
+    return (
+        kp * torque,
+        ki * torque,
+        (kd + constant) * torque,
+        0.0,
+        integral_limit,
+        volts * found.ratio * float(controller.limit),
+    )
 
 
 def _backlash_body(joint: DriveJoint, found: MjcfMotor, name: str, at: str) -> str:
-    """Text of the motor's side as a body of its own, and of the tendon between its joint and the load's."""
+    """Text of a separate body for the motor's side, and of the tendon between its joint and that of the load."""
     load, motor = joint.load, found.armature - found.added
     rate = 1 / motor + 1 / (float(load.inertia) + found.added)
     if load.stiffness > 0:
@@ -339,12 +348,12 @@ def _numbers_text(*numbers: float) -> str:
     return " ".join(f"{x:.9g}" for x in numbers)
 
 
-#: Command that shows the scene. It has no double hyphen, which an XML comment cannot hold.
+#: Command that shows the scene. It has no double hyphen, which XML comments must not contain.
 VIEWER = "python -c \"import mujoco.viewer as v; v.launch_from_path('scene.xml')\""
 
 
 def _comment_lines(lines: Sequence[str], indent: str) -> str:
-    """Lines as XML comments. Names in them come from users, so nothing in them can end the comment."""
+    """Lines as XML comments, escaped because names come from users and could end the comment."""
     text = [re.sub("-(?=-)", "- ", t) for line in lines for t in textwrap.wrap(printable(line), 104 - len(indent))]
     return "".join(f"{indent}<!-- {t} -->\n" for t in text)
 
@@ -361,8 +370,8 @@ def mjcf_fragment(
     """Text of the fragment that a model includes.
 
     Args:
-        volts: highest voltage seen or allowed [V], which the control's range states and does not enforce.
-        about: words for the source and interval of each attribute.
+        volts: highest voltage seen or allowed [V], which the control's range states but does not enforce.
+        about: source and interval of each attribute, in words.
         notes: notes of the header.
         name: name of the actuator and the default class.
         at: name of the joint.
@@ -395,7 +404,7 @@ def mjcf_fragment(
     about_motor = [
         f"{key}: {about[key]}" for key in ("gear", *(k for k, x in attributes.items() if x)) if key in about
     ]
-    # What turns apart from the motor has the friction of the load; the motor's side has the rest.
+    # A load that turns separately has its own friction, and the motor's side has the rest.
     numbers = [max(found.friction, 0.0), v[DAMPING], found.armature]
     sides = [("", numbers, at)]
     if joint.loose:
@@ -426,7 +435,7 @@ def _version_text() -> str:
 
 
 def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: float, load: float) -> str:
-    """Text of a model of one joint that runs: what the drive moves as a body that turns with it.
+    """Text of a runnable model of one joint: the load of the drive is a body that turns with it.
 
     A vehicle rolls without sliding, so one side's share of its mass acts at the wheel as m r². The actuator
     `load` gives the torque of slope and ground.
@@ -487,11 +496,13 @@ def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: floa
 
 
 def _body_text(inertia: float, weight: float, angle: float) -> str:
-    """Inertia of the body about its joint [kg·m²], its centre of mass where an arm hangs at `angle` [rad]."""
+    """Text of a body with an inertia about its joint [kg·m²], and the centre of mass of an arm that hangs at `angle`
+    [rad].
+    """
     if weight <= 0:
         return f'      <inertial pos="0 0 0" mass="1" diaginertia="{_numbers_text(inertia, inertia, inertia)}"/>\n'
     gravity = 9.81  # MuJoCo's default
-    arm = inertia * gravity / (2 * weight)  # half of the inertia is that of the mass on its arm
+    arm = inertia * gravity / (2 * weight)  # the mass on its arm has half of the inertia
     mass = weight / (gravity * arm)
     rest = inertia - mass * arm**2
     place = _numbers_text(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
@@ -538,10 +549,10 @@ def attribute_notes(
 
 
 def mujoco_module() -> Any:
-    """Returns the module of MuJoCo.
+    """Module of MuJoCo.
 
     Raises:
-        BadConfiguration: it is missing, or older than `<dcmotor>`.
+        BadConfiguration: MuJoCo is missing, or too old for `<dcmotor>`.
     """
     try:
         import mujoco as found
@@ -553,7 +564,7 @@ def mujoco_module() -> Any:
             f"expected {_version_text()} or later: "
             "pip install -U mujoco"
         )
-    found.set_mju_user_warning(lambda text: None)  # else MuJoCo writes a file in the working folder
+    found.set_mju_user_warning(lambda text: None)  # otherwise MuJoCo writes a file in the working folder
     return found
 
 
@@ -563,7 +574,7 @@ def angles_in_mujoco(
     """Angles of the joint [rad] at instants after a start from rest in MuJoCo C under a constant control.
 
     Args:
-        timestep: [s]. None: that of the scene.
+        timestep: time step [s]. None: that of the scene.
     """
     assets = {name: text.encode() for name, text in files.items()}
     mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
@@ -584,10 +595,10 @@ def settle_in_mujoco(
     """Current and speed of some runs, settled in MuJoCo C by the scene.
 
     Args:
-        expected: by the steady law, near which each run begins.
-        rows: which runs.
+        expected: values from the steady law, near which each run begins.
+        rows: indices of the runs.
     """
-    # Model of a scene and the fragment that it includes, in memory
+    # model of a scene and its included fragment, in memory
     assets = {name: text.encode() for name, text in files.items()}
     mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
     model.opt.gravity[:] = 0  # an arm's weight is part of the stated load
@@ -602,7 +613,7 @@ def settle_in_mujoco(
         mujoco.mj_resetData(model, data)
         data.ctrl[:] = at.command[row], at.load[row]
         data.qvel[:] = 0.9 * expected.speed[row]
-        if found.thermal:  # in its settled state, as the steady law
+        if found.thermal:  # in its settled state, as in the steady law
             heat = found.values[RESISTANCE] * (expected.current[row] / found.values[SHARE]) ** 2 * found.thermal[0]
             data.act[0] = heat / (1 - found.thermal[3] * heat)
         if model.na:

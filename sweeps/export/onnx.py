@@ -15,9 +15,9 @@ from calibration.data.input_errors import BadConfiguration
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 
-#: Version of the operators, which onnxruntime has had since 1.14.
+#: Version of the operators, supported by onnxruntime since 1.14.
 OPSET = 18
-#: Random states with which the model is compared with JAX, and their seed.
+#: Number of random states for the comparison with JAX, and their seed.
 STATES, SEED = 10_000, 0
 EXTRA = 'pip install "mmrjax[export]"'
 
@@ -38,17 +38,17 @@ def _single_precision() -> Iterator[None]:
 
 
 def step_function(joint: DriveJoint, constants: Sequence[LawConstant]) -> tuple[Any, list[str], list[str]]:
-    """Returns the step as a function of arrays, and the names of its inputs and outputs.
+    """The step as a function of arrays, and the names of its inputs and outputs.
 
-    Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the step's
-    length, of shape (1,). Outputs are torque, state, voltage taken and power.
+    Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the time step,
+    of shape (1,). Outputs are torque, state and power.
     """
     module = module_from_source(jax_source(joint, constants))
     states = joint.states
 
     def step(*given: Any) -> tuple[Any, ...]:
-        state, rest = dict(zip(states, given, strict=False)), given[len(states) :]
-        command, position, velocity, dt = rest
+        state, inputs = dict(zip(states, given, strict=False)), given[len(states) :]
+        command, position, velocity, dt = inputs
         params = {name: jnp.asarray(value, velocity.dtype) for name, value in module.PARAMS.items()}
         torque, after, info = module.actuator(params, state, command, position, velocity, dt)
         return (torque, *(after[s] for s in states), info["power"])

@@ -17,7 +17,7 @@ from sweeps.export import mujoco
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant
 
-#: Limits of draws: as many as environments that are trained at the same time.
+#: Smallest and largest number of draws, typical numbers of environments in training.
 MOST = 1_000_000
 
 
@@ -32,8 +32,8 @@ def draw_parameters(
 ) -> Columns:
     """Draws by format and name, `mujoco/resistance` and `actuator/motor.resistance`, each of shape (draws,).
 
-    All numbers of a draw belong together, so they are correlated as the posterior is. A parameter of MuJoCo is
-    translated from the draw, times the ratio of its refitted to its translated value at the posterior's centre.
+    All numbers of a draw belong together, with the correlation of the posterior. A parameter of MuJoCo is translated
+    from the draw, and multiplied by the ratio of its refitted to its translated value at the posterior's centre.
 
     Raises:
         BadConfiguration: there is no posterior.

@@ -49,14 +49,14 @@ class ComparisonRuns:
     Attributes:
         joint: the drive.
         source: source of the runs, in words.
-        runs: the table, its rows chosen.
+        runs: selected rows of the table.
         conditions: conditions of all rows of the table.
         kept: True for compared rows.
-        signals: signals of the joint's own model, with the effects inside alone, of shape (runs,).
+        signals: signals of the joint's own model with only the effects inside it, of shape (runs,).
         native: readings of the whole model [SI], shape (runs, channels).
-        measured: likewise, NaN if missing.
+        measured: measured readings in the same form, NaN if missing.
         command: mean voltage at the driver's output [V].
-        load: torque that the joint has to give at the wheel [N·m].
+        load: torque that the joint must supply at the wheel [N·m].
     """
 
     joint: DriveJoint
@@ -95,7 +95,7 @@ class ComparisonRuns:
     def readings(self, found: JointResult) -> np.ndarray:
         """Readings of the instruments for an exported drive [SI], shape (runs, channels).
 
-        The wheel or shaft is read at its rim: what slips on the ground is the simulator's.
+        The wheel or shaft is read at its rim, because slip belongs to the simulator.
         """
         robot = self.joint.file.robot
         radius, ratio = float(self.joint.load.radius), float(robot.gearbox.ratio)
@@ -131,11 +131,12 @@ def _solve_runs(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signa
 
 
 def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> ComparisonRuns:
-    """Returns the runs of a table in the joint's configuration, or of a grid where there is no table.
+    """Runs of a table in the joint's configuration, or of a grid if there is no table.
 
     Raises:
-        BadData: a table that is refused, without runs of this configuration, or of a robot that is no single joint.
-        BadConfiguration: no table, and a robot whose file states no limit of the voltage for a grid.
+        BadData: the table is rejected, has no runs in this configuration, or belongs to a robot that is not a single
+            joint.
+        BadConfiguration: there is no table, and the robot file states no voltage limit for a grid.
     """
     robot = joint.file.robot
     if data is None:
@@ -178,7 +179,7 @@ def export_grid(joint: DriveJoint) -> Runs:
     """Operating points in both directions, with loads that oppose the motion.
 
     Voltages are Table 8's or thirds of the motor's limit. A vehicle climbs the slopes of Table 8. A shaft carries
-    shares of its stall torque at each voltage, up to half of it, where a motor gives its greatest power.
+    shares of its stall torque at each voltage, up to half of it, where the power of a motor is largest.
     """
     robot = joint.file.robot
     slopes = SLOPES_DEG if robot.has_ground else None

@@ -1,4 +1,5 @@
-"""Pages of run folders, each with its figures, and the words that they and the console use."""
+"""Pages of run folders with their figures, and words that pages and terminal share."""
 
-#: Draw each figure a second time, narrow and with its panels stacked, for phones. Tests switch it off to save time.
+#: True to draw each figure a second time for phones, narrow and with stacked panels. Tests set it to False to save
+#: time.
 FOR_PHONES = True

@@ -1,4 +1,4 @@
-"""Figures of a sweep into a store: how an output spreads, and how it follows what varies."""
+"""Figures of a sweep into a store: distribution of an output, and its dependence on the varied quantities."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sweeps.pages.figure_style import (
 from sweeps.points.climbs import SIZE
 from sweeps.points.zarr_store import Layout
 
-#: Bins of a histogram, and along a name at most; at least, and points of each that more need.
+#: Bins of a histogram. Most and fewest bins along a quantity, and points per bin required for more than the fewest.
 BARS, BINS = 40, 24
 LEAST, EACH = 6, 5
 #: Colours of verdicts, in the order of their codes.
@@ -61,12 +61,12 @@ def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: Layo
 
 
 def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, VariedQuantity]) -> Figure:
-    """Histogram of an output, its median over the two names that it follows most, and over both together.
+    """Histogram of an output, its median against the two quantities that it depends on most, and against both.
 
     Args:
         output: output of the points that settled.
         label: label with its unit.
-        varied: by name, at these points.
+        varied: varied quantities by name, at these points.
     """
     names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
     fig, ((histogram, *others),) = new_figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
@@ -133,7 +133,9 @@ def _number_of_bins(values: np.ndarray, most: int) -> int:
 
 
 def bin_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bin of each value, and the bins' middles: its levels where there are few, else equal numbers of points."""
+    """Bin of each value, and the middles of the bins: the levels if there are few, otherwise bins with equal numbers
+    of points.
+    """
     levels, number = np.unique(values), _number_of_bins(values, BINS)
     if len(levels) <= number:
         return np.searchsorted(levels, values), levels
@@ -142,7 +144,7 @@ def bin_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def variance_share(values: np.ndarray, output: np.ndarray) -> float:
-    """Share of an output's variance that lies between the bins of a name: its first-order index, roughly."""
+    """Share of an output's variance between the bins of a quantity, approximately its first-order index."""
     bin_index, middles = bin_values(values)
     count = np.bincount(bin_index, minlength=len(middles))
     mean = np.bincount(bin_index, output, minlength=len(middles)) / np.maximum(count, 1)
@@ -153,7 +155,8 @@ def variance_share(values: np.ndarray, output: np.ndarray) -> float:
 def variance_share_by_chance(values: np.ndarray) -> float:
     """Share of the variance between the bins of a quantity without effect that is exceeded in 1 of 100 samples [-].
 
-    Of normal outputs the share is then a beta variable, 0 for a single bin, 1 where every value has a bin of its own.
+    For normal outputs this share has a beta distribution. It is 0 for a single bin, and 1 if every value has its own
+    bin.
     """
     within, between = len(values) - (bin_count := len(np.unique(bin_values(values)[0]))), bin_count - 1
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)

@@ -1,4 +1,4 @@
-"""Figures of a climb: silhouettes at its decisive instants, currents and margin on the way, and its film."""
+"""Figures of a climb: silhouettes at decisive instants, currents and margin over time, and the film."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from sweeps.pages.figure_style import (
 from sweeps.report.climb_report import FILMED as IN_TITLE
 from sweeps.report.climb_report import ClimbResult, Seen, footing_coordinates
 
-#: What can be drawn.
+#: File types that can be written.
 Drawable = ClimbResult | Seen
 
 _GROUND = "#b8a98f"
-#: Silhouettes of a page at most; frames of a film a second, and how often it is slower than life.
+#: Most silhouettes on a page. Frames of a film per second, and slow-motion factor.
 SHOWN, RATE, SLOW = 6, 12, 2.0
-#: Share of the time within which numbers of silhouettes are joined, in a wide and in a narrow figure.
+#: Numbers of silhouettes closer than this share of the time are joined, in wide and narrow figures.
 NEAR = (0.03, 0.09)
 
 
@@ -173,7 +173,7 @@ def draw_size_search(found: ClimbResult) -> Figure:
 
 
 class ClimbFilm(NamedTuple):
-    """A climb as `mmrjax.undercarriage.rendering` draws it."""
+    """A climb in the form that `mmrjax.undercarriage.rendering` draws."""
 
     found: Drawable
 

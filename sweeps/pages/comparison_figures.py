@@ -54,7 +54,7 @@ def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) 
     """Simulated over measured, one panel a channel. A reading that is missing is not drawn.
 
     Args:
-        band: whether ±5 % are shaded.
+        band: True to shade ±5 %.
     """
     fig, grid = new_figure(1, len(channels), 3.6)
     look = configuration_looks(table["configuration"])
@@ -94,9 +94,9 @@ def draw_errors_over_conditions(
     """Error (35) of each channel over each condition, or over the row number if no condition varies.
 
     Args:
-        beside: further columns than conditions, with their words, where errors are in units.
-        in_units: errors in the unit of the channel instead, with a band of two sds where they are known. Over those
-            conditions that vary.
+        beside: columns in addition to conditions, with their headings, for errors in units.
+        in_units: True for errors in the unit of the channel, with a band of two sds if known, over conditions that
+            vary.
     """
     errors_by_condition = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",

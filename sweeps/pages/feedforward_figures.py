@@ -11,11 +11,11 @@ from sweeps.pages.figure_style import BLUE, INK, ORANGE, new_figure
 
 
 def quasistatic(found: Feedforward) -> Figure:
-    """Voltage less kA·a over velocity, of windows of the quasistatic tests."""
+    """Voltage minus kA·a over velocity, for windows of the quasistatic tests."""
     w, k = found.windows, found.constants
     slow = w["quasistatic"] if w["quasistatic"].any() else np.ones(len(w["velocity"]), bool)
-    rest = w["voltage_V"] - k["kA"] * w["acceleration"]
-    fig, axes = _points(w["velocity"][slow], rest[slow], f"velocity [{found.unit}/s]", "V - kA·a [V]")
+    voltage = w["voltage_V"] - k["kA"] * w["acceleration"]
+    fig, axes = _points(w["velocity"][slow], voltage[slow], f"velocity [{found.unit}/s]", "V - kA·a [V]")
     for sign in (-1, 1):
         v = w["velocity"][slow & (w["direction"] * sign > 0)]
         if len(v):
@@ -25,11 +25,11 @@ def quasistatic(found: Feedforward) -> Figure:
 
 
 def dynamic(found: Feedforward) -> Figure:
-    """Voltage less kS and kV·v over acceleration."""
+    """Voltage minus kS and kV·v over acceleration."""
     w, k = found.windows, found.constants
-    rest = w["voltage_V"] - k["kV"] * w["velocity"] - k["kS"] * w["direction"]
+    voltage = w["voltage_V"] - k["kV"] * w["velocity"] - k["kS"] * w["direction"]
     a = w["acceleration"]
-    fig, axes = _points(a, rest, f"acceleration [{found.unit}/s²]", "V - kS - kV·v [V]")
+    fig, axes = _points(a, voltage, f"acceleration [{found.unit}/s²]", "V - kS - kV·v [V]")
     ends = np.array([a.min(), a.max()])
     axes.plot(ends, k["kA"] * ends + (k.get("kG", 0.0) if found.mechanism == "elevator" else 0.0), color=ORANGE)
     return fig

@@ -1,4 +1,4 @@
-"""One look for every figure: sizes, colours that colour-blind readers tell apart, labels at the line's end."""
+"""Common style of all figures: sizes, colours that colour-blind readers can distinguish, labels of lines."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from sweeps import pages
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
-# Okabe and Ito (2008), without the yellow that white paper swallows.
+# Okabe and Ito (2008), without yellow, which is hard to see on white paper.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 _CYCLE = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANGE, "v"), (SKY, "P"))
-#: Number of looks that differ. More configurations share them, so a legend would not tell which is which.
+#: Number of different styles. More configurations would share them, and a legend could not distinguish them.
 LOOKS = len(_CYCLE)
 
 
 def configuration_looks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Colour and marker of each configuration, in the order in which they first come."""
+    """Colour and marker of each configuration, in order of first occurrence."""
     return {name: _CYCLE[k % len(_CYCLE)] for k, name in enumerate(dict.fromkeys(map(str, names)))}
 
 
@@ -52,7 +52,7 @@ def axis_label(channel: Channel) -> str:
 
 
 _RC: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib; browsers without it have Verdana, of the same widths
+    "font.family": "DejaVu Sans",  # part of matplotlib; browsers without it use Verdana, which has the same widths
     "font.size": 9.5,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -78,11 +78,11 @@ _RC: dict[Any, Any] = {
 
 #: Width of a figure with stacked panels, for phones [inches].
 NARROW = 4.3
-#: Letters of a line across it, and of a line of the names at its left.
+#: Letters in a line across the figure, and in a line of names at its left.
 LETTERS, NAMES = 42, 20
-#: Layouts of a narrow figure at most, and height added by one of them [inches].
+#: Most layout passes of a narrow figure, and height that each adds [inches].
 LAYOUTS, TALLER = 5, 4.0
-#: Height of a line of a legend [inches].
+#: Height of a legend line [inches].
 LINE = 0.2
 
 
@@ -104,7 +104,7 @@ def is_narrow() -> bool:
 
 
 def new_figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
-    """A figure of the width of `figure_settings` and its axes, shape (rows, columns)."""
+    """Figure with the width of `figure_settings`, and its axes, shape (rows, columns)."""
     stacked = is_narrow()
     size = WIDTH, height
     if stacked and columns > 1:
@@ -182,7 +182,7 @@ def fit_for_phones(fig: Figure) -> Figure:
 
 
 def _break_name(name: str) -> str:
-    """A name in lines of at most `NAMES` letters if it can be broken at spaces, dots and underlines."""
+    """Name broken into lines of at most `NAMES` letters, at spaces, dots and underscores."""
     lines = [""]
     for part in re.findall(r"[^ ._\n]*[ ._\n]*", name):  # panels that share an axis break its names again
         if lines[-1] and len(lines[-1] + part.rstrip()) > NAMES:
@@ -196,37 +196,37 @@ def has_colour_scale(fig: Figure) -> bool:
     return bool(fig.findobj(lambda artist: isinstance(artist, AxesImage | QuadMesh)))
 
 
-#: Least size of text in a figure [pt], the same in a narrow figure, which is 11 px on a phone of 390 px, and least
-#: contrast of a text's colour to white paper (WCAG 2, AA).
+#: Smallest text size in a figure [pt], and in a narrow figure, where it is 11 px on a phone of 390 px. Smallest
+#: contrast of text to white paper (WCAG 2, AA).
 LEAST, LEAST_NARROW, CONTRAST = 8.5, 10.0, 4.6
 
 
 def figure_as_svg(fig: Figure) -> str:
-    """The figure as an SVG document that refers to nothing outside itself. Its text is text.
+    """The figure as a self-contained SVG document. Its text is stored as text.
 
-    `data-axes` of the document says where its axes are and what they run over, so that a page can show values.
+    `data-axes` of the document has the positions and ranges of its axes, so that a page can show values.
     """
-    least = LEAST_NARROW if fig.get_figwidth() == NARROW else LEAST
+    smallest_font = LEAST_NARROW if fig.get_figwidth() == NARROW else LEAST
     for written in fig.findobj(lambda artist: isinstance(artist, Text)):
         assert isinstance(written, Text)
-        written.set_fontsize(max(written.get_fontsize(), least))
-        # A text's colour, darkened until it can be read on white paper; what is near white is for a dark ground,
-        # and stays
+        written.set_fontsize(max(written.get_fontsize(), smallest_font))
+        # colour of a text, darkened until it is readable on white paper; colours near white are for dark backgrounds
+        # and stay
         colour = written.get_color()
         channels = np.array(to_rgb(colour))
         while 1.25 < 1.05 / (_luminance(channels) + 0.05) < CONTRAST:
             channels = channels * 0.97
         written.set_color(tuple(channels))
     if (engine := fig.get_layout_engine()) is not None:
-        fig.set_dpi(72)  # that of SVG
+        fig.set_dpi(72)  # of SVG
         engine.execute(fig)
-        if least == LEAST_NARROW:
+        if smallest_font == LEAST_NARROW:
             for _ in range(LAYOUTS):
                 if not _wrap_texts(fig) | _make_room_for_names(fig):
                     break
                 engine.execute(fig)
-        _separate_texts(fig, move=least == LEAST_NARROW)
-        fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
+        _separate_texts(fig, move=smallest_font == LEAST_NARROW)
+        fig.set_layout_engine(None)  # otherwise savefig would draw everything once more for the layout
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
@@ -239,22 +239,24 @@ def figure_as_svg(fig: Figure) -> str:
 
 
 def _wrap_texts(fig: Figure) -> bool:
-    """Break horizontal texts that reach beyond the figure, True if there is any."""
+    """Breaks horizontal texts that extend beyond the figure. Returns True if there are any."""
     width, wrapped = 72 * fig.get_figwidth(), False
     for written in fig.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible()):
         assert isinstance(written, Text)
         text, box = written.get_text(), Text.get_window_extent(written)  # without an arrow
-        beyond = max(box.x1 - width, -box.x0, 0.0)
-        if beyond > 0 and " " in text and written.get_rotation() == 0:
+        excess_width = max(box.x1 - width, -box.x0, 0.0)
+        if excess_width > 0 and " " in text and written.get_rotation() == 0:
             longest = max(map(len, text.split("\n")))
-            room = 1 - (2 if written.get_horizontalalignment() == "center" else 1) * beyond / box.width
+            room = 1 - (2 if written.get_horizontalalignment() == "center" else 1) * excess_width / box.width
             written.set_text("\n".join(textwrap.wrap(text, max(12, int(longest * room) - 2))))
             wrapped = True
     return wrapped
 
 
 def _make_room_for_names(fig: Figure) -> bool:
-    """Enlarge the figure to separate names at y axes, and turn names at x axes upright, True if any changed."""
+    """Enlarges the figure to separate names at y axes, and turns names at x axes upright. Returns True if anything
+    changed.
+    """
     more, has_rotated = 0.0, False
     for axes in filter(Axes.get_visible, fig.axes):
         for axis, low, high in ((axes.xaxis, "x0", "x1"), (axes.yaxis, "y0", "y1")):
@@ -277,7 +279,7 @@ def _make_room_for_names(fig: Figure) -> bool:
 
 
 def _separate_texts(fig: Figure, move: bool) -> None:
-    """Separates texts inside axes from other texts: numbers that lie over one are hidden, words are moved.
+    """Separates overlapping texts inside axes: numbers are hidden, words are moved.
 
     A map shows all its numbers or none. Without `move` only maps are changed.
     """
@@ -314,7 +316,7 @@ def _separate_texts(fig: Figure, move: bool) -> None:
 
 
 def _is_number(text: Text) -> bool:
-    """True for a number in a cell or a bar, which a table shows too."""
+    """True for a number in a cell or a bar, which is also in a table."""
     return re.fullmatch(r"[-−+.\d ]+%?", text.get_text()) is not None
 
 
@@ -348,7 +350,7 @@ def _has_names(axis: Axis) -> bool:
 
 
 def _axis_range(axis: Axis) -> Json:
-    """Ends of an axis, whether it is logarithmic, and the names of its ticks if they have names."""
+    """Ends of an axis, True if it is logarithmic, and the names of its ticks if any."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
     axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
     if _has_names(axis):
@@ -359,7 +361,7 @@ def _axis_range(axis: Axis) -> Json:
 
 
 def label_line_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:
-    """Write `words` at the last finite point of a line, in the line's colour."""
+    """Writes `words` at the last finite point of a line, in its colour."""
     finite = np.nonzero(np.isfinite(y))[0]
     if finite.size:
         offset = keywords.pop("offset", (5, 0))
@@ -377,6 +379,6 @@ def label_line_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour:
 
 
 def add_corner_note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
-    """A remark in a corner of the axes (axes fractions)."""
+    """Adds a remark in a corner of the axes. Coordinates are axes fractions."""
     keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
     axes.text(x, y, words, transform=axes.transAxes, **keywords)

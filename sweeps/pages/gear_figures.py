@@ -26,7 +26,7 @@ from sweeps.pages.figure_style import (
     new_figure,
 )
 
-TAIL = 0.3  # of a run at its end that is looked at for ripple [s]
+TAIL = 0.3  # duration at the end of a run that is evaluated for ripple [s]
 SHOWN = 0.15  # and drawn [s]
 
 
@@ -36,10 +36,11 @@ class GearRun:
 
     Attributes:
         name: heading.
-        on_tracks: or on wheels, status.
+        on_tracks: True on tracks, False on wheels.
+        status: status of the run.
         radius: radius of the pulleys [m].
-        time: [s].
-        signals, reactions: over it.
+        time: time of the samples [s].
+        signals, reactions: signals and reactions at these times.
         guide_share: guide share on average at the end [-].
     """
 
@@ -57,7 +58,7 @@ class GearRun:
         return slice(int(np.searchsorted(self.time, self.time[-1] - seconds)), None)
 
     def settled_since(self, instant: float) -> bool:
-        """True if the run after that instant [s] is long enough to look for ripple."""
+        """True if the run after this instant [s] is long enough to evaluate ripple."""
         return bool(instant <= self.time[-1] - TAIL)
 
     @property
@@ -67,7 +68,9 @@ class GearRun:
 
     @property
     def period(self) -> float:
-        """Eq. (34) [s], at the mean speed of the driving pulley. The belt runs on the pulley on wheels too."""
+        """Period of eq. (34) [s] at the mean speed of the driving pulley. The belt also runs on the pulley of wheeled
+        robots.
+        """
         speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
         return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
@@ -127,8 +130,8 @@ def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):
-        last, expected = gear.tail(SHOWN), gear.period
-        time, current = gear.time[last], gear.signals.total_current[last]
+        shown_samples, expected = gear.tail(SHOWN), gear.period
+        time, current = gear.time[shown_samples], gear.signals.total_current[shown_samples]
         axes.plot(1e3 * (time - time[0]), current, color=look[gear.name][0])
         axes.axhline(current.mean(), color=FAINT, lw=0.9)
         low, high = current.min(), current.max()
@@ -147,19 +150,21 @@ def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
 def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Figure:
     """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
     fig, grid = new_figure(2, 1, 5.0, sharex=True)
-    last = gear.tail(SHOWN)
-    time = 1e3 * (gear.time[last] - gear.time[last][0])
-    lands = ripple_peaks.touchdown_times(time, gear.reactions.grouser[last], gear.reactions.place[last])
+    shown_samples = gear.tail(SHOWN)
+    time = 1e3 * (gear.time[shown_samples] - gear.time[shown_samples][0])
+    lands = ripple_peaks.touchdown_times(
+        time, gear.reactions.grouser[shown_samples], gear.reactions.place[shown_samples]
+    )
     upper, lower = grid[:, 0]
-    upper.plot(time, gear.signals.total_current[last], color=BLUE)
+    upper.plot(time, gear.signals.total_current[shown_samples], color=BLUE)
     upper.set(ylabel="total current [A]")
     upper.set_title(title)
     shades = (BLUE, ORANGE, GREEN)
-    loads = gear.reactions.grouser[last]
+    loads = gear.reactions.grouser[shown_samples]
     for j in range(loads.shape[1]):
-        bears = loads[:, j] > 0
-        if bears.any():
-            lower.plot(time, np.where(bears, loads[:, j], np.nan), color=shades[j % 3], lw=1.0)
+        is_loaded = loads[:, j] > 0
+        if is_loaded.any():
+            lower.plot(time, np.where(is_loaded, loads[:, j], np.nan), color=shades[j % 3], lw=1.0)
     lower.set(xlabel="time [ms]", ylabel="normal reaction of a grouser [N]", ylim=(0, None))
     for axes in (upper, lower):
         for instant in lands:
@@ -172,27 +177,27 @@ def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
     fig, grid = new_figure(1, len(shown), 3.2)
     look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):
-        last, colour = gear.tail(SHOWN), look[gear.name][0]
+        shown_samples, colour = gear.tail(SHOWN), look[gear.name][0]
         loads = gear.reactions
         lines = (
             {
-                "all grousers": (loads.grouser[last].sum(-1), colour),
-                "lower guide": (loads.guided[last].sum(-1), ORANGE),
+                "all grousers": (loads.grouser[shown_samples].sum(-1), colour),
+                "lower guide": (loads.guided[shown_samples].sum(-1), ORANGE),
             }
             if gear.on_tracks
             else {
-                "both wheels": (loads.support[last].sum(-1), colour),
-                "front wheel": (loads.support[last, 0], BLUE),
-                "rear wheel": (loads.support[last, 1], GREEN),
+                "both wheels": (loads.support[shown_samples].sum(-1), colour),
+                "front wheel": (loads.support[shown_samples, 0], BLUE),
+                "rear wheel": (loads.support[shown_samples, 1], GREEN),
             }
         )
-        time = 1e3 * (gear.time[last] - gear.time[last][0])
+        time = 1e3 * (gear.time[shown_samples] - gear.time[shown_samples][0])
         top = 0.0
         for words, (values, shade) in lines.items():
             axes.plot(time, values, color=shade, lw=1.4, alpha=0.9)
             if not gear.on_tracks:
-                apart = {"front wheel": 7, "rear wheel": -7}.get(words, 0)  # they nearly coincide
-                label_line_end(axes, time, np.asarray(values), words, shade, offset=(5, apart))
+                label_offset = {"front wheel": 7, "rear wheel": -7}.get(words, 0)  # they nearly coincide
+                label_line_end(axes, time, np.asarray(values), words, shade, offset=(5, label_offset))
             top = max(top, float(np.max(values)))
         axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
         axes.set_title(title.format(gear.name))

@@ -1,4 +1,4 @@
-"""Figures of runs from standstill: current and speeds over time, the inrush marked, the stages of a start shaded."""
+"""Figures of runs from standstill: current and speeds over time, with inrush and stages of the start marked."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from sweeps.pages.figure_style import (
 from sweeps.report.run_tables import UNITS
 from sweeps.report.settle_report import IMPOSED
 
-#: Samples of a segment of a frequency response, and least coherence of a point that is drawn.
+#: Samples per segment of a frequency response, and smallest coherence of drawn points.
 SEGMENT, COHERENT = 256, 0.7
-#: Least rows of a run for a frequency response.
+#: Fewest rows of a run for a frequency response.
 SHORTEST = 32
-#: Most points of a line of a figure, in pairs of the least and the greatest of as many samples.
+#: Most points of a line in a figure, in pairs of the smallest and largest of equally many samples.
 POINTS = 3000
 
 
@@ -114,8 +114,7 @@ class StartRun:
         time: [s].
         current: current of all motors [A].
         speed, theoretical: V and r_k ω_k [mm/s].
-        stages: stages of the start. Current and speeds are drawn, and kept here, times its `sense`. None without
-            numbers.
+        stages: stages of the start. Current and speeds are stored multiplied by its `sense`. None without numbers.
     """
 
     name: str
@@ -154,14 +153,14 @@ class StartRun:
 
     @property
     def peak(self) -> float:
-        """Largest current [A], with the sign that it is drawn with."""
+        """Largest current [A], with the drawn sign."""
         return _largest_magnitude(self.time, self.current)
 
     @property
     def ended(self) -> tuple[float, float]:
-        """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
-        last = last_samples(self.time)
-        return float(self.current[last].mean()), float(self.speed[last].mean())
+        """Current [A] and speed [mm/s] at the end, as means over the last 0.15 s because of ripple."""
+        last_instants = last_samples(self.time)
+        return float(self.current[last_instants].mean()), float(self.speed[last_instants].mean())
 
 
 def start_runs(
@@ -196,7 +195,7 @@ def start_runs(
 
 
 def draw_starts(shown: list[StartRun], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
-    """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded.
+    """One row for each run: inrush enlarged, total current, V and shaft speed, with the stages shaded.
 
     For a run that ends backward, backward is drawn positive.
     """
@@ -231,13 +230,15 @@ def draw_starts(shown: list[StartRun], current_title: str = "total current", spe
 
 
 def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
-    last, peak = float(start.time[-1]), float(start.current.max())
+    end_time, peak = float(start.time[-1]), float(start.current.max())
     run = start.current[start.time > start.starting]
     run = run[len(run) // 20 :] if len(run) > 20 else start.current
     top = max(1.75 * float(run.max()), 0.1)
     cut = peak > top
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
-    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3)))
+    axes.set(
+        xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3))
+    )
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _shade_stages(axes, start)
     if cut:
@@ -245,41 +246,41 @@ def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
     during = (start.time > start.starting) & (start.time < start.slipping)
     middle = float(np.median(start.current[during])) if during.any() else 0.0
     if (
-        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * last
+        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * end_time
         and start.gets_under_way
     ):
         label_time = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (label_time, middle), xytext=(0, 5), textcoords="offset points", ha="center")
     crest = start.current[last_samples(start.time)].max()
     axes.annotate(
-        f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
+        f"{start.ended[0]:.2f} A", (0.98 * end_time, crest), xytext=(0, 5), ha="right", textcoords="offset points"
     )
 
 
 def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
-    last, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
+    end_time, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
     axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
     axes.plot(start.time, start.speed, color=colour)
-    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
+    axes.set(xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
     axes.set_ylabel("speed [mm/s]")
     _shade_stages(axes, start)
-    axes.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
-    if 0 < start.settled < last and start.gets_under_way:
+    axes.text(0.02 * end_time, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
+    if 0 < start.settled < end_time and start.gets_under_way:
         axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
         text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
-        axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
-    # Right of the line at t', where that is beside the curve, else of the curve.
+        axes.text(start.settled + 0.02 * end_time, 0.1 * start.speed[-1], text, fontsize=8.5)
+    # Right of the line at t' if it is next to the curve, otherwise right of the curve.
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
-    beside = 0 < start.settled < 0.5 * last and start.gets_under_way
-    label_place = (start.settled if beside else start.time[half], start.speed[half])
-    place = (6, 6) if beside else (6, -12)
+    has_room = 0 < start.settled < 0.5 * end_time and start.gets_under_way
+    label_place = (start.settled if has_room else start.time[half], start.speed[half])
+    place = (6, 6) if has_room else (6, -12)
     axes.annotate("$V_x$ (robot)", label_place, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 
 
 def draw_slip(shown: list[StartRun]) -> Figure:
-    """A row for each run: V_x and V_x_teor until after the start, and the slip (33).
+    """One row for each run: V_x and V_x_teor until after the start, and the slip (33).
 
     The slip's mean is drawn over each stage and over t'. For a run that ends backward, backward is drawn positive.
     """
@@ -292,8 +293,12 @@ def draw_slip(shown: list[StartRun]) -> Figure:
             add_corner_note(speeds, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
-        last = float(start.time[-1])
-        upto = min(1.6 * max(start.settled, start.slipping, 0.02 * last), last) if start.gets_under_way else last
+        end_time = float(start.time[-1])
+        upto = (
+            min(1.6 * max(start.settled, start.slipping, 0.02 * end_time), end_time)
+            if start.gets_under_way
+            else end_time
+        )
         speeds.fill_between(start.time, start.speed, start.theoretical, color=colour, alpha=0.15, lw=0)
         speeds.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
         speeds.plot(start.time, start.speed, color=colour)
@@ -323,7 +328,7 @@ def draw_slip(shown: list[StartRun]) -> Figure:
 
 
 def _draw_slip_means(speeds: Axes, slip: Axes, start: StartRun, upto: float) -> None:
-    """Mark t' and draw the mean slip of each stage as a level."""
+    """Marks t' and draws the mean slip of each stage as a level."""
     assert start.stages is not None
     for axes in (speeds, slip):
         if 0 < start.settled < upto:
@@ -345,7 +350,7 @@ def _draw_slip_means(speeds: Axes, slip: Axes, start: StartRun, upto: float) -> 
 
 
 def _shade_stages(axes: Axes, start: StartRun, scale: float = 1.0) -> None:
-    """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
+    """Shades the stages behind a plot over time (unit 1/`scale` s), and labels them at the top."""
     if not start.gets_under_way:
         return
     bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
@@ -395,7 +400,7 @@ class ShaftRun:
 
 
 def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[ShaftRun]:
-    """Members of a batch of runs as their instruments show them.
+    """Members of a batch of runs, with the readings of their instruments.
 
     Args:
         read: channels of the robot.
@@ -416,7 +421,7 @@ def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names:
 
 
 def draw_readings_over_time(shown: list[ShaftRun]) -> Figure:
-    """A row for each run, a panel for each channel."""
+    """One row for each run, one panel for each channel."""
     read = channels.channels_named(shown[0].readings)
     fig, grid = new_figure(len(shown), len(read), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
@@ -434,7 +439,7 @@ def frequency_response(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Response of readings to a drive by Welch's method, averaged over runs (the H1 estimate).
 
-    Bendat and Piersol, Random Data (2010), ch. 6. Runs are read at even times, a median interval apart.
+    Bendat and Piersol, Random Data (2010), ch. 6. Runs are resampled at even times, one median interval apart.
 
     Args:
         runs: time [s], shape (rows,), drive, shape (rows,), and readings, shape (readings, rows), of each run.
@@ -445,15 +450,15 @@ def frequency_response(
     """
     from scipy import signal
 
-    apart = float(np.median(np.concatenate([np.diff(time) for time, _, _ in runs])))
-    length = min(SEGMENT, *(int(np.ptp(time) / apart) + 1 for time, _, _ in runs))
+    time_step = float(np.median(np.concatenate([np.diff(time) for time, _, _ in runs])))
+    length = min(SEGMENT, *(int(np.ptp(time) / time_step) + 1 for time, _, _ in runs))
     spectra: Any = 0.0
     for time, drive, readings in runs:
-        even = time[0] + apart * np.arange(int(np.ptp(time) / apart) + 1)
-        resampled_drive = drive[np.searchsorted(time, even + 1e-3 * apart, side="right") - 1]
+        even = time[0] + time_step * np.arange(int(np.ptp(time) / time_step) + 1)
+        resampled_drive = drive[np.searchsorted(time, even + 1e-3 * time_step, side="right") - 1]
         series = np.stack([resampled_drive, *(np.interp(even, time, reading) for reading in readings)])
-        frequency, cross = signal.csd(resampled_drive, series, 1 / apart, nperseg=length)
-        _, power = signal.welch(series, 1 / apart, nperseg=length)
+        frequency, cross = signal.csd(resampled_drive, series, 1 / time_step, nperseg=length)
+        _, power = signal.welch(series, 1 / time_step, nperseg=length)
         spectra = spectra + len(even) * np.stack([cross, power + 0j])
     cross, power = spectra[0, 1:, 1:], spectra[1, :, 1:].real
     coherence = np.abs(cross) ** 2 / np.maximum(power[0] * power[1:], 1e-300)
@@ -461,7 +466,7 @@ def frequency_response(
 
 
 def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
-    """Gain and phase of each channel over the frequency of the drive: measured as points, simulated as lines.
+    """Gain and phase of each channel over frequency: measured as points, simulated as lines.
 
     Args:
         runs: runs with measured and simulated columns.

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from calibration.data import Columns
 from calibration.data.courses import applied_drive
 from calibration.data.table import Runs
-from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import place_in_words
@@ -28,18 +28,16 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
-    add_corner_note,
     colour_bar,
     configuration_looks,
     is_narrow,
     new_figure,
     outer_legend,
 )
-from sweeps.pages.words import short_name
 from sweeps.report.fit_tables import Change
 from sweeps.report.run_tables import UNITS, imposed_column
 
-#: Effects on the ladder and on the map of look-alikes.
+#: Most effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
 DEFECT_WORDS = {
     "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
@@ -48,7 +46,7 @@ DEFECT_WORDS = {
 }
 
 
-#: The same of a rig, whose output need be no pulley.
+#: The same for a rig, whose output may be no pulley.
 RIG_WORDS = {"track": "torque missing at the output"}
 IMPOSED_WORDS = {
     "supply_voltage_V": "supply voltage [V]",
@@ -67,18 +65,18 @@ CONDITION_WORDS = {
 }
 
 
-#: Letters of labels that stand side by side below a figure.
+#: Letters of labels that fit side by side below a figure.
 ABREAST = 110
 
 
 def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every reading in sigmas, before and after. Runs grouped by configuration and voltage."""
+    """Residual of every reading in sigmas, before and after. Runs are grouped by configuration and voltage."""
     own_column = imposed_column(table)
     beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
     order = np.lexsort((*(table[c] for c in beside), table[own_column], table["configuration"]))
     fig, grid = new_figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own_column]).size
-    few = levels <= 8 or own_column == "supply_voltage_V"  # else a group by configuration alone
+    few = levels <= 8 or own_column == "supply_voltage_V"  # otherwise grouped only by configuration
     names_configurations = not few or np.unique(table["configuration"]).size > 1
     groups = [
         ", ".join(
@@ -110,12 +108,12 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
     grid[-1, 0].grid(axis="x", visible=False)
     varied = own_column == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
     words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
-    within = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
-    grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
+    grouping = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
+    grid[-1, 0].set_xlabel(f"runs, in each group {grouping}; band: ±2σ of the instruments")
     return fig
 
 
-#: Runs of histories whose residual is drawn, and samples over which it is averaged.
+#: Most histories whose residual is drawn, and samples over which it is averaged.
 RUNS_SHOWN, AVERAGED = 8, 5
 
 
@@ -125,8 +123,9 @@ def _range_text(x: np.ndarray) -> str:
 
 
 def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every history over time in sigmas, before and after. One column a run, samples as dots and their
-    running mean as a line. The `table` is of the rows of `runs`."""
+    """Residual of every history over time in sigmas, before and after. One column for each run, with samples as dots
+    and their running mean as a line. `table` has the rows of `runs`.
+    """
     names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
     count = len(channels)
     fig, grid = new_figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
@@ -146,9 +145,9 @@ def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Chan
                     axes.plot(table["time_s"][run_rows][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
             if column == 0:
                 axes.set_ylabel(f"{channel.label} [σ]")
-        first = run_rows[0]
+        first_row = run_rows[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {_range_text(table[imposed_column(table)][run_rows])} "
+            f"{name}\n{table['configuration'][first_row]} {_range_text(table[imposed_column(table)][run_rows])} "
             f"{UNITS[imposed_column(table)]}"
             + (f" {_range_text(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
         )  # fmt: skip
@@ -190,7 +189,7 @@ def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], ve
 
 #: Most lags of a correlation with the input [samples].
 LAGS = 20
-#: Most curves of the figure of power.
+#: Most curves in the figure of power.
 CURVES = 5
 
 
@@ -199,8 +198,8 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
     fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
     rows_of_runs = list(runs.rows_by_run().values())
     applied = applied_drive(runs)
-    most = min(LAGS, min(map(len, rows_of_runs)) - 1)
-    lags = np.arange(-most, most + 1)
+    largest_lag = min(LAGS, min(map(len, rows_of_runs)) - 1)
+    lags = np.arange(-largest_lag, largest_lag + 1)
     centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
     for axes, channel in zip(grid[0], channels, strict=True):
         limit = 2 / np.sqrt(len(table["time_s"]))
@@ -222,11 +221,11 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
 def draw_gains(found: DiscoveryResult) -> Figure:
     """Hold-out gain over the refit of each set of effects, by their number, with its standard error."""
     fig, grid = new_figure(1, 1, 2.8)
-    axes, last = grid[0, 0], len(found.gains) - 1
+    axes, last_index = grid[0, 0], len(found.gains) - 1
     axes.axhline(0, color=FAINT, lw=0.8)
     axes.plot(0, 0, "s", ms=5, color=INK, label="refit, nothing added")
     for k, (names, gain) in enumerate(found.gains):
-        proposed = k == last
+        proposed = k == last_index
         error = gain.se if np.isfinite(gain.se) else 0.0
         axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
                       label="proposed, ± standard error" if proposed else None)  # fmt: skip
@@ -237,15 +236,17 @@ def draw_gains(found: DiscoveryResult) -> Figure:
 
 
 def draw_power(found: DiscoveryResult) -> Figure:
-    """Chance that an effect would have been noticed, over its size, for the most visible one of each equation."""
+    """Probability that an effect would have been noticed, over its size, for the most visible effect of each
+    equation.
+    """
     level = found.before.kinds["single"].threshold
     visible = sorted((s for s in found.scores if s.balance in EQUATION), key=lambda s: s.sigmas_per_prior_sd)
     strongest = {EQUATION[s.balance]: s for s in visible if s.sigmas_per_prior_sd > 0}
-    first = {s.name: s for s in visible if s in strongest.values()}
+    shown_effects = {s.name: s for s in visible if s in strongest.values()}
     fig, grid = new_figure(1, 1, 3.2)
     axes, size = grid[0, 0], np.geomspace(0.03, 30, 200)
-    for name, (colour, _) in list(configuration_looks(first).items())[-CURVES:]:
-        shift = size * first[name].sigmas_per_prior_sd
+    for name, (colour, _) in list(configuration_looks(shown_effects).items())[-CURVES:]:
+        shift = size * shown_effects[name].sigmas_per_prior_sd
         chance = scipy.stats.norm.sf(level - shift) + scipy.stats.norm.cdf(-level - shift)
         axes.plot(size, 100 * chance, color=colour, label=name)
     axes.set(xscale="log", xlabel="size [typical sizes]", ylabel="would have been noticed [%]", ylim=(0, 103))
@@ -255,7 +256,7 @@ def draw_power(found: DiscoveryResult) -> Figure:
 
 
 def draw_effect_scores(found: DiscoveryResult) -> Figure:
-    """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
+    """Score of every effect at the base fit, with the threshold that noise rarely exceeds."""
     rungs = found.scores[:RUNGS]
     effect_names = {e.name for e in found.effects}
     alike = {n for e in found.effects for n in e.members} - effect_names
@@ -275,30 +276,8 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     return fig
 
 
-#: Kinds of evidence that are drawn, and what their statistics are.
-KINDS = {
-    "single": "strongest effect [σ]",
-    "curve": "strongest curve [normal deviate]",
-    "chi2": "χ² of the residuals",
-}
-
-
-def draw_bootstrap_statistics(before: Evidence) -> Figure:
-    """The strongest statistics among bootstrap tables in which nothing is missing, and those of the data."""
-    fig, grid = new_figure(1, len(KINDS), 2.5)
-    for axes, (name, text) in zip(grid[0], KINDS.items(), strict=True):
-        kind = before.kinds[name]
-        axes.hist(kind.null, bins=30, color="#c9c9c9")
-        axes.axvline(kind.threshold, color=ORANGE, lw=1.6)
-        axes.axvline(kind.found, color=BLUE, lw=2)
-        axes.set_xlabel(text)
-        axes.set_yticks([])
-    add_corner_note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
-    return fig
-
-
 def draw_errors(found: DiscoveryResult) -> Figure:
-    """rms error before and after, fitted and held out by every kind of block."""
+    """rms error before and after, fitted, and held out by each kind of block."""
     lines = {"fitted": found.errors}
     lines |= {f"held out by\n{blocks.kind_in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
     fig, grid = new_figure(1, len(found.channels), 2.9, sharey=False)
@@ -319,10 +298,10 @@ def draw_errors(found: DiscoveryResult) -> Figure:
     return fig
 
 
-#: Of the range of a variable, over which the change by an effect is averaged when it is asked how smooth it runs.
+#: Share of a variable's range over which the change by an effect is averaged to measure its smoothness.
 NEAR = 1 / 12
-#: Roughness up to which the change by an effect is drawn as one line over its variable, else as a line for each level
-#: of the imposed quantity.
+#: Roughness up to which the change by an effect is drawn as a single line. A rougher change has one line for each
+#: level of the imposed quantity.
 SMOOTH = 0.02
 
 
@@ -335,7 +314,9 @@ def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
 
 
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
-    """Share of the variance of y that its mean over the other rows near x leaves [-], inf where x is constant."""
+    """Share of the variance of y that remains after subtracting the mean of other rows near x [-]. inf if x is
+    constant.
+    """
     if not np.ptp(x) > 0:
         return np.inf
     near = np.exp(-0.5 * ((x[:, None] - x) / (NEAR * np.ptp(x))) ** 2) * (1 - np.eye(len(x)))
@@ -343,7 +324,7 @@ def roughness(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def conditions_and_readings(table: Columns) -> Columns:
-    """Variables in which rows differ, by label: imposed quantity, payload, slope and readings.
+    """Variables that vary between rows, by label: imposed quantity, payload, slope and readings.
 
     A variable of each side also appears as mean and difference.
     """
@@ -368,8 +349,8 @@ def driving_variable(table: Columns, change: np.ndarray, driver: str = "") -> tu
     """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
-        change: change of the reading, shape (rows,), NaN where a row does not count.
-        driver: driver of the effect; variables with that word are preferred.
+        change: change of the reading, shape (rows,), NaN for excluded rows.
+        driver: driver of the effect. Variables with that word are preferred.
     """
     use = np.isfinite(change)
     columns = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
@@ -387,10 +368,10 @@ def _turns_once(values: np.ndarray) -> bool:
 
 
 def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
-    """Law of each effect found, plotted over its condition: readings minus those of the robot without the effect.
+    """Law of each effect found, over its condition: readings minus those of the robot without the effect.
 
     The figure shows measurements with ±2 sd, the refit without effects, and the law with the 95 % band of its
-    amplitude. Backward runs have hollow dots and a separate line.
+    amplitude. Backward runs have hollow dots and their own line.
     """
     fig, grid = new_figure(1, len(changes), 3.4)
     readings, is_included = found.readings_of_rows, found.included
@@ -414,22 +395,22 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
         for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
             if not way.any():
                 continue
-            rows, first = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
+            rows, is_labelled = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
             axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
                           label=words)  # fmt: skip
-            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if first else None)
+            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if is_labelled else None)
             is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
             levels = np.zeros(len(rows)) if is_line else imposed[rows]
             by_level = "" if is_line else f" at each {imposed_label.partition(' [')[0]}"
             for line in (rows[levels == level] for level in np.unique(levels)):
-                law_words = f"new law{by_level}, band of 95 % (±{share:.2g} %)" if first else None
+                law_words = f"new law{by_level}, band of 95 % (±{share:.2g} %)" if is_labelled else None
                 if not (is_line or _turns_once(law[line])):
                     axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
                                   alpha=0.6, label=law_words)  # fmt: skip
                 else:
                     axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_words)
                     axes.fill_between(x[line], (law - band)[line], (law + band)[line], color=BLUE, alpha=0.3, lw=0)
-                first = False
+                is_labelled = False
         axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
     outer_legend(grid[0, 0], "upper left")
     return fig
@@ -442,7 +423,7 @@ def defects_by_side(table: Columns, when: str, balance: str) -> Columns:
 
 
 def closed_equations(table: Columns) -> list[str]:
-    """Equations that the readings close: those with a defect somewhere, at least one."""
+    """Equations whose defects the readings determine: those with a nonzero defect, at least one."""
     balances = [
         b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_by_side(table, "before", b).values())
     ]
@@ -465,10 +446,10 @@ def _defect_variable(table: Columns, column: str, label: str, side: str = "") ->
 
 
 def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Figure:
-    """Defect of each equation by run, over the variable that shows it, before and after.
+    """Defect of each equation by run, over the variable that shows it best, before and after.
 
     Args:
-        crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
+        crosses_zero: True if readings may cross zero (`Layout.crosses_zero`). Only closed equations are then drawn.
     """
     whens = ("before",) if verdict in ("none", *WITHOUT_NAME) else ("before", "after")
     panels = {b: DEFECT_WORDS[b] for b in (closed_equations(table) if crosses_zero else DEFECT_WORDS)}
@@ -498,7 +479,7 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
 
 
 def draw_similar_effects(found: DiscoveryResult) -> Figure:
-    """|cos| between what the base leaves of two effects' signatures, for the effects that score highest."""
+    """|cos| between the signatures of two effects after projection off the base, for the highest scores."""
     names = [s.name for s in found.scores if s.score > 0][:ALIKE]
     cosine = found.cosine[: len(names), : len(names)]
     fig, grid = new_figure(1, 1, 5.6)
@@ -516,27 +497,8 @@ def draw_similar_effects(found: DiscoveryResult) -> Figure:
     return fig
 
 
-def draw_parameter_shifts(found: DiscoveryResult) -> Figure:
-    """Each base parameter in prior sds, before and after the effects were added."""
-    shift = found.base_shift
-    fig, grid = new_figure(1, 1, 1.0 + 0.27 * len(shift))
-    axes = grid[0, 0]
-    axes.axvspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
-    axes.axvline(0, color=FAINT, lw=0.9)
-    for row, p in enumerate(shift.values()):
-        axes.plot([p.shift_before, p.shift_after], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
-        axes.plot(p.shift_before, row, "o", ms=6, mfc="white", color=ORANGE)
-        axes.plot(p.shift_after, row, "o", ms=5, color=BLUE)
-    axes.set_yticks(range(len(shift)), [short_name(n) for n in shift])
-    axes.invert_yaxis()
-    axes.grid(axis="y", visible=False)
-    axes.set(xlabel="shift from the prior [prior sds]")
-    axes.set_title("orange: before, blue: after. A large shift probably absorbs a missing effect")
-    return fig
-
-
 def draw_unnamed_curve(found: UnnamedDiscrepancy) -> Figure:
-    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
+    """The unnamed defect, run by run over the variable that shows it best, with the smooth curve and its band."""
     variable = found.variable if found.window is None else str(found.window["axis"])
     abscissa = EVERY_VARIABLE.get(variable, Variable("rad", 0.0, 0.0, "", f"phase of the wave, {variable}", "rad"))
     words, scale = abscissa.label, 1 / abscissa.shown

@@ -1,4 +1,4 @@
-"""Figures of missions: speed, slope, current, duty, temperatures and charge over time, and where the energy goes."""
+"""Figures of missions: speed, slope, current, duty, temperatures and charge over time, and uses of energy."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from sweeps.pages.figure_style import (
 )
 from sweeps.points.imposed import UNLIMITED
 
-#: Units of a time axis: how long a mission is for it [s], its size [s], its name.
+#: Units of a time axis: shortest mission [s], size [s], name.
 _TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
-#: Colours of where energy goes.
+#: Colours of uses of energy.
 _COLOURS = {
     "battery": INK, "other": FAINT, "driver": FAINT, "winding": VERMILION, "motor": ORANGE, "gearbox": PURPLE,
     "track": BLUE, "sliding": SKY, "rolling": SKY, "lift": GREEN,
@@ -36,13 +36,13 @@ _COLOURS = {
 
 
 def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
-    """A run over its profile, a row a subject. With several cycles, the first one is also drawn.
+    """A run over its profile, one row for each subject. With several cycles, the first one is also drawn.
 
     Args:
         rows: rows of history.csv of one run.
-        cycle: end of its first cycle [s], None where it has one only.
+        cycle: end of the first cycle [s]. None if there is only one.
         limit: limit of the winding's temperature [°C].
-        linear: whether the profile's values are, between rows.
+        linear: True if the profile is linear between rows.
         sides: number of motors.
     """
     spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
@@ -53,27 +53,27 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
         _, size, unit = next(t for t in _TIMES if span >= t[0])
         shown_rows = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
         time = shown_rows["time_s"] / size
-        first = column == 0
+        is_first_column = column == 0
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
-        _draw_speed(axes[0], time, shown_rows, linear, legend=first)
+        _draw_speed(axes[0], time, shown_rows, linear, legend=is_first_column)
         sizes = ", sizes of both sides" if "duty_left" in rows else ""
-        axes[1].set_title(f"current of all motors, and duty{sizes}" if first else "current, and duty")
-        _draw_current(axes[1], time, shown_rows, sides, legend=first)
+        axes[1].set_title(f"current of all motors, and duty{sizes}" if is_first_column else "current, and duty")
+        _draw_current(axes[1], time, shown_rows, sides, legend=is_first_column)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
-        beyond = (
+        limit_words = (
             ""
             if unlimited or _limit_is_near(shown_rows, limit)
             else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
-        axes[2].set_title("temperatures" + (beyond if first else ""))
-        _draw_temperatures(axes[2], time, shown_rows, limit, legend=first)
+        axes[2].set_title("temperatures" + (limit_words if is_first_column else ""))
+        _draw_temperatures(axes[2], time, shown_rows, limit, legend=is_first_column)
         _draw_source(axes[3], time, shown_rows)
         axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
     return fig
 
 
 def draw_sides(rows: Columns) -> Figure:
-    """Current and duty of either side, and the yaw rate, over time.
+    """Current and duty of each side, and the yaw rate, over time.
 
     Args:
         rows: rows of history.csv of one run with sides.
@@ -94,7 +94,7 @@ def draw_sides(rows: Columns) -> Figure:
 
 
 def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
-    """Axes with a scale of their own at the right."""
+    """Axes with their own scale at the right."""
     other = axes.twinx()
     other.grid(False)
     other.spines["right"].set_visible(True)
@@ -108,18 +108,18 @@ def _draw_legend(axes: Axes, *others: Axes) -> None:
     labels = [str(h.get_label()) for h in handles]
     axes.legend(handles, labels, loc="upper center", ncols=legend_columns(labels), fontsize=8)
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
+    axes.set_ylim(low, high + 0.22 * (high - low))  # room for the label
 
 
-#: Turns of a curve's slope above which it is drawn as its envelope, and number of parts of the time then: long ones,
-#: so that the envelope has no gaps.
+#: Reversals above which a curve is drawn as its envelope, and number of time parts of the envelope: so few that it
+#: has no gaps.
 TURNS, PARTS = 200, 40
 
 
 def _draw_curve(
     axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0
 ) -> None:
-    """A curve over time, or its range and its mean over each part of the time if many cycles would fill the panel."""
+    """A curve over time, or its range and mean in each part of the time if many cycles would fill the panel."""
     if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= TURNS:
         axes.plot(time, values, color=colour, lw=width, label=label)
         return
@@ -149,8 +149,8 @@ def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legen
     slope.plot(
         time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="default" if linear else "steps-post"
     )
-    most = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
-    slope.set_ylim(-most, most)
+    largest_slope = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
+    slope.set_ylim(-largest_slope, largest_slope)
     if legend:
         _draw_legend(axes, slope)
 
@@ -171,7 +171,7 @@ def _draw_current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, leg
 
 
 def mean_of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
-    """Of a motor on average. Of motors of two sides, which cancel one another on the spot, of their sizes."""
+    """Mean over motors. For two sides, which cancel each other when turning on the spot, mean of the magnitudes."""
     of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in SIDES if f"{name}_{side}{unit}" in rows]
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
@@ -213,8 +213,8 @@ def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     span = float(charge.max() - charge.min())
     if span > 0.05:
         axes.set_ylim(0, 105)
-    beside = _right_axes(axes, "voltage [V]", BLUE)
-    _draw_curve(beside, time, volts, BLUE, "voltage", 0.8)
+    right_axes = _right_axes(axes, "voltage [V]", BLUE)
+    _draw_curve(right_axes, time, volts, BLUE, "voltage", 0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
         add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
@@ -224,7 +224,7 @@ def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> 
     """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
 
     Args:
-        run: its row of runs.csv.
+        run: row of the run in runs.csv.
     """
     energy = float(run["energy_drawn_Wh"])
     source = "drawn from the battery's charge" if on_battery else "drawn from the supply"

@@ -1,4 +1,4 @@
-"""The page of every report: figures drawn once and inlined in one offline HTML file."""
+"""Page of a report: one offline HTML file with inline figures."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class FigureAlbum:
         self.overlays = False
 
     def add(self, name: str, draw: Callable[[], Any]) -> None:
-        """Draw one figure, and a narrow one for phones if its panels stand side by side.
+        """Draws a figure, and a narrow one for phones if its panels are side by side.
 
         Args:
-            draw: returns the figure, or an overlay over time.
+            draw: function that returns the figure, or an overlay over time.
         """
         with figure_settings():
             figure = draw()
@@ -66,7 +66,7 @@ class FigureAlbum:
         )
 
     def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
-        """Draw readings over time, as a figure for print and with the data of an interactive one."""
+        """Draws readings over time, as a static figure with the data of an interactive one."""
         self.add(name, overlay.draw)
         self.overlays = True
         self.pictures[name] += Markup(
@@ -75,7 +75,7 @@ class FigureAlbum:
 
 
 def _inline_svg(svg: str, name: str, looks: str) -> str:
-    """An SVG document as an element of a page, with the classes `looks`. Ids that are referred to are its own."""
+    """An SVG document as an element of a page, with the classes `looks` and unique ids."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
     element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
     used_ids = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
@@ -86,7 +86,7 @@ def _inline_svg(svg: str, name: str, looks: str) -> str:
 def robot_section(file: RobotFile) -> Json:
     """The `robot`'s name, its section of a page (`about_robot`), and `warnings` of remarks and unnamed curves.
 
-    A packaged robot with other parameters is called changed.
+    A packaged robot with other parameters is marked as changed.
     """
     from mmrjax.model.paper_robots import ROBOTS
 
@@ -100,13 +100,13 @@ def robot_section(file: RobotFile) -> Json:
 def _parameter_section(file: RobotFile, nominal: Robot) -> Section:
     """Parameters of a rig, or those in which a robot differs from the nominal one."""
     end = (Column("unit"), Column("meaning"))
-    first, value = Column("parameter"), "{:.6g}"
+    name_column, value = Column("parameter"), "{:.6g}"
     if not file.robot.rig.inherits:
-        columns = (first, Column("value", form=value), *end, Column("source"))
+        columns = (name_column, Column("value", form=value), *end, Column("source"))
         text = "Its parameters (SI units). Losses and limits that are not in its file are left out."
         rows, table = capabilities.rig_parameters(file), "own"
     else:
-        columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
+        columns = (name_column, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
         rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
     if not rows:
@@ -117,7 +117,7 @@ def _parameter_section(file: RobotFile, nominal: Robot) -> Section:
 
 
 def render_page(folder: Path, album: FigureAlbum, **known: Any) -> Path:
-    """Write `report.html` from the album's pictures and the values of `document.html.j2`.
+    """Writes `report.html` from the album's pictures and the values of `document.html.j2`.
 
     Adds the parts of every page: contents after the answer, files of the folder (`files`: unusual meanings), tables
     that scroll.
@@ -160,7 +160,7 @@ _HEADING = re.compile(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", re.S)
 
 
 def _add_contents(page: str) -> str:
-    """A page with links to its headings before the first of them."""
+    """Adds links to the headings before the first heading."""
     links = []
 
     def with_id(found: re.Match[str]) -> str:
@@ -170,18 +170,18 @@ def _add_contents(page: str) -> str:
         return f'<h2 id="{name}">{found[2]}</h2>'
 
     page = _HEADING.sub(with_id, page)
-    first = page.index("<h2")
-    return f'{page[:first]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'
+    begin = page.index("<h2")
+    return f'{page[:begin]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[begin:]}'
 
 
 def marked_html(text: str) -> Markup:
-    """A text as HTML, with its bold words and names."""
+    """Text as HTML, with bold words and names."""
     html = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", str(escape(text)))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", html))
 
 
 def download_link(table: Table) -> Markup:
-    """A link that saves a table as CSV: the file of the run folder that holds more rows, or the table itself."""
+    """Link that saves a table as CSV: the file in the run folder if it has more rows, otherwise the table itself."""
     if len(table.rows) > ROWS:
         return Markup('<a class="csv" download href="{0}">all rows as CSV</a>').format(table.file)
     return Markup('<a class="csv" download="{}.csv" href="data:text/csv;charset=utf-8,{}">CSV</a>').format(

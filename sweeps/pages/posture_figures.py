@@ -1,4 +1,4 @@
-"""Silhouettes of a robot at rest and on the highest step of its posture, and the map of steps over lever angles."""
+"""Silhouettes of a robot at rest and on its highest step, and the map of steps over lever angles."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from sweeps.report.check_report import (
 )
 from sweeps.report.words.posture_words import Drawn, Postures, StepMap
 
-#: Margins beyond are drawn so far [%]; their number says how large they are.
+#: Larger margins are drawn with this length [%], with their value as a number.
 LONGEST = 100.0
 
 
 def draw_margins(found: CheckResult) -> Figure:
-    """A bar for each requirement: its margin in percent of what is required, right where it is met.
+    """One bar for each requirement: margin in percent of the required value, to the right if it is met.
 
     Phone versions omit the values, which are in the page's table.
     """
@@ -43,11 +43,11 @@ def draw_margins(found: CheckResult) -> Figure:
         share = 100 * o.margin / max(abs(requirement_limit(o)), 1e-12)
         length = float(np.clip(share, -LONGEST, LONGEST))
         ax.barh(k, length, height=0.62, color=GREEN if o.met else VERMILION)
-        beyond = "" if abs(share) <= LONGEST or is_narrow() else " (beyond the axis)"
+        beyond_words = "" if abs(share) <= LONGEST or is_narrow() else " (beyond the axis)"
         right = length >= 0
         reached = "" if is_narrow() else f"{reached_value_text(o)}, "
         ax.annotate(
-            f"{reached}{share:+.0f} %{beyond}", (length, k), xytext=(5 if right else -5, 0),
+            f"{reached}{share:+.0f} %{beyond_words}", (length, k), xytext=(5 if right else -5, 0),
             textcoords="offset points", va="center", ha="left" if right else "right", fontsize=8.5, color=INK,
         )  # fmt: skip
     ax.set_yticks(range(len(rows)), [f"{requirement_label(o)} {required_value_text(o)}" for o in rows])
@@ -69,14 +69,14 @@ _CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], 1)
 
 def belt_outline(side: SideOutline, belt: tuple[int, int]) -> np.ndarray:
     """Corners of the belt around a pair of circles, over its grousers [m]."""
-    wide = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
+    radii = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
     outline = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]
-    points = np.concatenate([c + r * _CIRCLE for c, r in zip(outline, wide, strict=True)])
+    points = np.concatenate([c + r * _CIRCLE for c, r in zip(outline, radii, strict=True)])
     return points[ConvexHull(points).vertices]
 
 
 def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
-    """Draw a robot on its ground, uphill and forward to the right [mm]. Its centre of mass with gravity's line."""
+    """Draws a robot on its ground, uphill and forward to the right [mm], with centre of mass and line of gravity."""
     side, cosine, sine = shown.side, np.cos(shown.slope), np.sin(shown.slope)
     tilt = np.array([[cosine, sine], [-sine, cosine]])
 
@@ -103,7 +103,7 @@ def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
     axes.set(title=title, aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="mm", ylabel="mm")
 
 
-#: What a robot does where requirements of its geometry ask about it.
+#: Posture of each geometric requirement, in words.
 ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length_mm": "Folded"}
 
 
@@ -128,8 +128,9 @@ def draw_rest_and_step(found: Postures) -> Figure:
 
 
 def draw_highest_steps(over: StepMap) -> Figure:
-    """Highest step and margin of tipping over the angles of front and rear levers, the run's own marked, and the
-    posture of the highest step."""
+    """Highest step and margin of tipping over the angles of front and rear levers, with those of the run marked, and
+    the posture of the highest step.
+    """
     fig, grid = new_figure(2, 2, 7.6)
     maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
     for axes, (values, label) in zip(grid[:, 0], maps, strict=True):

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns, Json
+from calibration.data.table import Runs
 from mmrjax.fidelities.outputs import output_columns
 from mmrjax.fidelities.simulation import simulate
 from mmrjax.model.conditions import Conditions
@@ -19,9 +20,9 @@ from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import is_done
 from sweeps.export.joint import UNLIMITED
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
 
-#: Where power goes, with its colour: losses in the order of the chain, then what is left.
+#: Uses of power and their colours: losses in the order of the drivetrain, then useful power.
 ITEMS = {
     "winding and motor friction": ORANGE,
     "gearbox": PURPLE,
@@ -56,12 +57,12 @@ def drawable_runs(runs: Columns) -> np.ndarray:
     )
 
 
-#: Words of an item where the load is a shaft, which takes all that the gearboxes pass on.
+#: Name of an item if the load is a shaft, which receives all output power of the gearboxes.
 ON_SHAFT = {"track and slip": "load"}
 
 
 def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -> Figure:
-    """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
+    """One bar for each run [W], from the motor's losses to the power that lifts the robot or that the load takes."""
     fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], power_by_item(runs)
     labels = {} if has_ground else ON_SHAFT
@@ -93,30 +94,32 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     axes.set_yticks(place, names, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    beyond = 1.35 if (slope > 1e-6).any() else 1.1
-    axes.set(xlabel="power [W]", xlim=(0, beyond * float(total.max())))
+    axis_factor = 1.35 if (slope > 1e-6).any() else 1.1
+    axes.set(xlabel="power [W]", xlim=(0, axis_factor * float(total.max())))
     outer_legend(axes, "upper center")
     return fig
 
 
-#: Loads of a curve of the drive, and balances whose effects it has.
+#: Loads of a drive curve, and balances whose effects it includes.
 LOADS = 60
 INSIDE = ("duty", "supply", "electrical", "motor", "gearbox")
 
 
-def drive_curves(robot: Robot, voltage: float) -> Columns:
-    """Torque at the gearbox output, speed, current and efficiency of one motor and gear at a supply voltage.
-
-    They are computed with the robot's equations and a frictionless shaft as the load, from no load to the current
-    limit or to stall.
-    """
+def _on_a_shaft(robot: Robot) -> Robot:
+    """The robot's drive with a frictionless shaft as its load."""
     shaft = Shaft(inertia=1e-3, loss_coulomb=0.0)
     inside = tuple(e for e in robot.effects if e.balance in INSIDE and e.acts_everywhere)
-    bench = dataclasses.replace(robot, configurations=Configurations({"shaft": shaft}), effects=inside)
+    return dataclasses.replace(robot, configurations=Configurations({"shaft": shaft}), effects=inside)
+
+
+def drive_curves(robot: Robot, voltage: float) -> Columns:
+    """Torque at the gearbox output, speed, current and efficiency of one motor and gear at a supply voltage, from no
+    load to the current limit or to stall.
+    """
     motor, gearbox = robot.motor, robot.gearbox
     current = min(float(motor.current_stall(voltage)), float(robot.driver.current_limit))
     torque = np.linspace(0, 1, LOADS, endpoint=False) ** 2 * float(motor.torque_constant * gearbox.ratio) * current
-    runs = simulate(bench, Conditions(0, voltage, load_torque=torque))
+    runs = simulate(_on_a_shaft(robot), Conditions(0, voltage, load_torque=torque))
     speed, drawn = np.asarray(runs.motor_speed), np.asarray(runs.total_current) / float(robot.sides)
     settled = np.asarray(is_done(np.asarray(runs.status))) & (speed > 0)
     efficiency = 100 * torque * speed / float(gearbox.ratio) / np.maximum(voltage * drawn, 1e-9)
@@ -125,7 +128,7 @@ def drive_curves(robot: Robot, voltage: float) -> Columns:
 
 
 def operating_points(robot: Robot, runs: Columns) -> Columns:
-    """Torque at the gearbox output, speed and current of one motor in settled runs, out of columns of `runs.csv`."""
+    """Torque at the gearbox output, speed and current of one motor in settled runs, from columns of `runs.csv`."""
     radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
     output = runs["theoretical_speed_mm_s"] / 1e3 / radius
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -135,7 +138,7 @@ def operating_points(robot: Robot, runs: Columns) -> Columns:
 
 
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
-    """The chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
+    """Chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
     keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
     single_corners = (
         corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys)
@@ -182,12 +185,19 @@ def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -
             continue
         continuous = float(np.interp(bears, curves["motor_A"], curves["torque_Nm"]))
         if style == "-":
-            most = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
+            largest_torque = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
             for axes in grid[0]:
-                axes.axvspan(0, min(continuous, most), color=GREEN, alpha=0.18, lw=0, label="continuous")
-                axes.axvspan(min(continuous, most), most, color=ORANGE, alpha=0.12, lw=0, label="short time")
-                axes.set_xlim(0, most)
-        shown = curves["torque_Nm"] <= most
+                axes.axvspan(0, min(continuous, largest_torque), color=GREEN, alpha=0.18, lw=0, label="continuous")
+                axes.axvspan(
+                    min(continuous, largest_torque),
+                    largest_torque,
+                    color=ORANGE,
+                    alpha=0.12,
+                    lw=0,
+                    label="short time",
+                )
+                axes.set_xlim(0, largest_torque)
+        shown = curves["torque_Nm"] <= largest_torque
         for axes, (name, label) in zip(grid[0], panels.items(), strict=True):
             axes.plot(curves["torque_Nm"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
             axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)
@@ -198,3 +208,70 @@ def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -
         grid[0, 1].axhline(limit, color=ORANGE, lw=1, label="driver's limit")
     outer_legend(grid[0, 1], "upper left")
     return fig
+
+
+#: Efficiencies of the lines in the plane of drive and back-drive.
+EFFICIENCIES = (0.9, 0.75, 0.5)
+
+
+def torque_of_motor(robot: Robot, voltage: float, load: np.ndarray) -> np.ndarray:
+    """Torque of a motor at the gearbox input, times the ratio [N·m], for each torque of the load. NaN at rest."""
+    runs = simulate(_on_a_shaft(robot), Conditions(0, voltage, load_torque=load))
+    speed = np.asarray(runs.motor_speed)
+    moves = np.asarray(is_done(np.asarray(runs.status))) & (speed * np.sign(voltage) > 0)
+    torque = np.asarray(runs.power_motor) / float(robot.sides) / np.where(moves, speed, np.nan)
+    return np.asarray(float(robot.gearbox.ratio) * torque)
+
+
+def draw_drive_plane(robot: Robot, voltage: float, points: Columns | None = None) -> Figure:
+    """Torque of the motor against that of the load, and the efficiency of the gearbox each way.
+
+    Args:
+        voltage: supply voltage at which the gearbox runs.
+        points: torques of the motor in runs, simulated and measured, and their direction. The simulated one gives
+            the torque of the load.
+    """
+    motor, gearbox = robot.motor, robot.gearbox
+    bears = min(float(motor.current_continuous), 0.5 * float(motor.current_stall(voltage)))
+    most = float(motor.torque_constant * gearbox.ratio * gearbox.efficiency_load) * bears
+    most = most if points is None else float(np.nanmax(np.abs(points["simulated_Nm"])))
+    load = np.linspace(-most, most, 2 * LOADS + 1)
+    forward, backward = (torque_of_motor(robot, v, load) for v in (voltage, -voltage))
+    fig, ((plane, share),) = new_figure(1, 2, 3.6)
+    plane.fill_between(load, backward, forward, color="#e3e3e3", lw=0, label="at rest, friction holds the load")
+    for efficiency in EFFICIENCIES:
+        plane.plot([0, most], [0, most / efficiency], ":", color=FAINT, lw=1)
+        plane.plot([-most, 0], [-most * efficiency, 0], ":", color=FAINT, lw=1)
+        plane.annotate(f"{100 * efficiency:.0f} %", (most, most / efficiency), (2, 0), textcoords="offset points",
+                       fontsize=8, color=INK, va="center", annotation_clip=False)  # fmt: skip
+    plane.plot(load, load, "--", color=FAINT, lw=1, label="without losses")
+    plane.plot(load, forward, color=BLUE, label="runs forward")
+    plane.plot(load, backward, color=ORANGE, label="runs backward")
+    if points is not None:
+        at_load = [np.interp(points["simulated_Nm"], way, load) for way in (forward, backward)]
+        x = np.where(points["forward"], *at_load)
+        plane.plot(x, points["measured_Nm"], "o", ms=4, color=INK, label="measured")
+    plane.set(xlabel="torque of the load [N·m]", ylabel="motor torque × ratio [N·m]", title="drive and back-drive")
+    plane.set_xlim(-most, most)
+    ahead, behind = load > 0, load < 0
+    share.plot(load[ahead], 100 * load[ahead] / forward[ahead], color=BLUE, label="motor drives the load")
+    returned = 100 * np.maximum(forward[behind] / load[behind], 0)
+    share.plot(-load[behind], returned, "--", color=BLUE, label="load drives the motor")
+    share.set(xlabel="torque of the load [N·m]", ylabel="efficiency [%]", ylim=(0, 103), title="efficiency each way")
+    share.legend(loc="lower right")
+    outer_legend(plane, "upper left")
+    return fig
+
+
+def draw_measured_drive_plane(robot: Robot, runs: Runs) -> Figure:
+    """The plane of drive and back-drive with settled runs, at the voltage of the fastest."""
+    results = simulate(robot, runs.conditions(robot))
+    speed, ratio = np.asarray(results.motor_speed), float(robot.gearbox.ratio)
+    channel = next(c for c in robot.channels if c.name in ("motor_current", "total_current"))
+    motors = float(robot.sides) if channel.name == "total_current" else 1.0
+    beyond = (runs[channel.column] * channel.factor - np.asarray(getattr(results, channel.name))) / motors
+    with np.errstate(divide="ignore", invalid="ignore"):
+        simulated = ratio * np.asarray(results.power_motor) / float(robot.sides) / speed
+    measured = simulated + ratio * float(robot.motor.torque_constant) * beyond
+    points = {"forward": speed > 0, "simulated_Nm": simulated, "measured_Nm": measured}
+    return draw_drive_plane(robot, float(np.nanmax(np.abs(runs["supply_voltage_V"]))), points)

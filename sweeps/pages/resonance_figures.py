@@ -1,4 +1,4 @@
-"""Figure of a resonance map: a Campbell diagram above ripple over speed and payload, on one axis of speed."""
+"""Figure of a resonance map: Campbell diagram, and below it ripple over speed and payload, on a common speed axis."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     for order in range(1, ORDERS + 1):
         at_end = order * fastest * MM / parts.travel
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
-        inside, last = at_end <= top, place
-        place = fastest if inside else fastest * 0.985 * top / at_end
-        if last - place < (0.08 if is_narrow() else 0.03) * fastest and not inside:
-            break  # labels and lines would cover one another
+        is_inside, last = at_end <= top, place
+        place = fastest if is_inside else fastest * 0.985 * top / at_end
+        if last - place < (0.08 if is_narrow() else 0.03) * fastest and not is_inside:
+            break  # labels and lines would overlap
         axes.annotate(
-            f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if inside else (0, -2),
-            textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if inside else "top",
-            bbox=None if inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
+            f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if is_inside else (0, -2),
+            textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if is_inside else "top",
+            bbox=None if is_inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
         )  # fmt: skip
     _draw_mode_bands(axes, found)
     for name, (colour, marker) in _MARKS.items():
@@ -107,12 +107,12 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
 
 
 def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
-    """A band for each mode, from the least to the greatest frequency over payloads and positions of the belt."""
-    others = iter(_OTHERS * 3)
+    """One band for each mode, from the smallest to the largest frequency over payloads and positions of the belt."""
+    other_colours = iter(_OTHERS * 3)
     names = dict.fromkeys(m.name for modes in found.modes.values() for m in modes if m.resonant)
     for name in names:
         modes = [(p, m) for p, members in found.modes.items() for m in members if m.name == name and m.resonant]
-        colour = _BANDS.get(name) or next(others)
+        colour = _BANDS.get(name) or next(other_colours)
         low, high = min(m.low for _, m in modes), max(m.high for _, m in modes)
         axes.axhspan(low, high, color=colour, alpha=0.13, lw=0, zorder=0)
         ends = (modes[0], modes[-1]) if len(modes) > 1 else (modes[0],)
@@ -133,8 +133,8 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")
     shown_ripple = ripple[settled] if settled.any() else ripple[found.read]
-    most = float(np.nanmax(shown_ripple)) or 1.0
-    norm = colors.Normalize(0, most)
+    largest_ripple = float(np.nanmax(shown_ripple)) or 1.0
+    norm = colors.Normalize(0, largest_ripple)
     guess = found.travel
     for row, payload in enumerate(payloads):
         rows = np.flatnonzero(table["payload_kg"] == payload)
@@ -167,10 +167,10 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     axes.set(ylim=(-0.5, len(payloads) - 0.5), ylabel="payload [kg]")
     axes.set_yticks(range(len(payloads)), [f"{p:g}" for p in payloads])
     axes.grid(False)
-    others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
-    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in others)
+    other_statuses = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
+    kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in other_statuses)
     label = SIGNALS[name].label
-    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
+    remarks = [] if largest_ripple >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
     remarks += [kinds] if kinds else []
     axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():

@@ -1,4 +1,4 @@
-"""Figures of a sensitivity study: who decides what, tornadoes, heat maps over conditions, convergence, next runs."""
+"""Figures of a sensitivity study: who decides what, tornadoes, heat maps over conditions."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.sensitivity.replicates import IntervalEstimate
-from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
-from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, add_corner_note, legend_columns, new_figure
+from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, legend_columns, new_figure
 from sweeps.pages.words import short_name
 
-#: Inputs that a figure shows at most, and operating points of a tornado.
+#: Most inputs in a figure, and most operating points in a tornado.
 SHOWN, TALLEST, PANELS = 8, 10, 4
 _MAP = "Blues"
 
@@ -39,7 +38,7 @@ def draw_input_shares(found: SensitivityResult) -> Figure:
 
 
 def _draw_heat_map(ax: Axes, shares: np.ndarray, labelled: int) -> None:
-    """A heat map of shares, each cell with its percent where there are few columns."""
+    """Heat map of shares. Cells show their percentage if there are few columns."""
     ax.grid(False)
     hidden = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
     ax.imshow(np.sqrt(hidden), cmap=_MAP, vmin=0, vmax=1, aspect="auto", interpolation="nearest")
@@ -56,7 +55,7 @@ def _draw_heat_map(ax: Axes, shares: np.ndarray, labelled: int) -> None:
 
 def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     """The output with a single input at the ends of its 95 % interval, at a few operating points."""
-    # Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between
+    # Operating points of a tornado: the gentlest and the hardest of each configuration, or between
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))
     panel_rows = max(PANELS // len(kinds), 1)
@@ -81,12 +80,12 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                 if np.isfinite(end):
                     ax.barh(-place, end - value[n], left=value[n], color=colour, height=0.66)
                 else:
-                    beside = np.nanmax([value[n], *swing[:, n, i]])
-                    ax.text(beside, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
+                    right_end = np.nanmax([value[n], *swing[:, n, i]])
+                    ax.text(right_end, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
         ax.set_title(_split_label(found.points.label(panel_points[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
-        ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # of few digits, so that they do not touch
+        ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # few digits, so that numbers do not touch
         ax.grid(axis="y", visible=False)
     axes[0, 0].set_yticks([-p for p in range(len(top))], [short_name(found.names[i]) for i in top], fontsize=8.5)
     axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)
@@ -94,8 +93,8 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
 
 
 def _split_label(label: str) -> str:
-    first, *rest = label.split(", ")
-    return f"{first}\n{', '.join(rest)}"
+    first, *other_words = label.split(", ")
+    return f"{first}\n{', '.join(other_words)}"
 
 
 def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
@@ -109,7 +108,7 @@ def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
     return fig
 
 
-#: Names of indices as legends say them, and their colours.
+#: Names of indices in legends, and their colours.
 _WORDS = {
     "first": ("alone (first order)", BLUE), "total": ("with others (total)", ORANGE),
     "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
@@ -143,7 +142,7 @@ def _draw_index_bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top
     )
     ax.grid(axis="y", visible=False)
     columns = legend_columns(ax.get_legend_handles_labels()[1], 2)
-    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=7.5)  # beside no bar
+    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=7.5)  # no bar here
 
 
 def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
@@ -174,62 +173,9 @@ def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityRes
     inner = [
         f"{word} {_range_text(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1
     ]
-    within = f"; within each {' and '.join(inner)}" if inner else ""
-    ax.set_xlabel(f"{along}{within}; grey: no index there", fontsize=8.5)
+    within_words = f"; within each {' and '.join(inner)}" if inner else ""
+    ax.set_xlabel(f"{along}{within_words}; grey: no index there", fontsize=8.5)
 
 
 def _range_text(values: np.ndarray) -> str:
     return f"{values.min():g}-{values.max():g}"
-
-
-def draw_convergence(found: SensitivityResult) -> Figure:
-    """The main index of the leading inputs of each output against the model evaluations spent."""
-    studies = [s for s in found.outputs.values() if s.convergence][:6]
-    rows = -(-len(studies) // 3)
-    fig, axes = new_figure(rows, min(3, len(studies)), 2.1 * rows + 0.4)
-    for ax, study in zip(axes.ravel(), studies, strict=False):
-        counts = np.array([count for count, _ in study.convergence])
-        for k, colour in zip(leading_inputs(study.overall_share, 3), (BLUE, VERMILION, GREEN), strict=False):
-            series = [e[k] for _, e in study.convergence]
-            low, high = np.array([e.low for e in series]), np.array([e.high for e in series])
-            ax.fill_between(counts, low, high, color=colour, alpha=0.18, linewidth=0)
-            ax.plot(
-                counts,
-                [float(e.value) for e in series],
-                "o-",
-                color=colour,
-                markersize=3,
-                label=short_name(found.names[k]),
-            )
-        ax.set_xscale("log")
-        ax.set_xticks(counts, [f"{count / 1000:.0f}k" for count in counts])
-        ax.minorticks_off()
-        ax.set_ylim(bottom=0)
-        ax.set_title(study.row.label)
-        ax.legend(fontsize=7.5, loc="best")
-    for ax in axes.ravel()[len(studies) :]:
-        ax.set_visible(False)
-    axes[-1, 0].set_xlabel("model evaluations")
-    axes[-1, 0].set_ylabel("total index [-]")
-    return fig
-
-
-def draw_next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
-    """Remaining share of each input's sd after each proposed run."""
-    remaining_sd = runs.sd[-1]
-    moving = [k for k in np.argsort(remaining_sd, kind="stable") if remaining_sd[k] < 0.99][:10]
-    fig, axes = new_figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
-    ax = axes[0, 0]
-    for place, k in enumerate(moving):
-        ax.barh(-place, 1.0, color="#e9ecef", height=0.66)
-        ax.barh(-place, remaining_sd[k], color=BLUE, height=0.66)
-        ax.text(remaining_sd[k] + 0.01, -place, f"{100 * remaining_sd[k]:.0f} %", va="center", fontsize=8.5)
-    ax.set_yticks([-p for p in range(len(moving))], [short_name(found.names[k]) for k in moving])
-    ax.set_xlim(0, 1.02)
-    ax.set_xlabel(
-        f"standard deviation after {count_noun(len(runs.points), 'such run')}, as a share of that before [-]"
-    )
-    ax.grid(axis="y", visible=False)
-    if not moving:
-        add_corner_note(ax, "these runs give no information on these inputs")
-    return fig

@@ -1,4 +1,4 @@
-"""Figures of a sizing: the chart of limits over payload and slope, and the Pareto front."""
+"""Figures of a design search: chart of limits over payload and slope, and Pareto front."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564
 
 
 def draw_nearest_limits(found: SizeResult, charts: dict[str, MarginChart]) -> Figure:
-    """One panel per robot. The colour shows which limit is nearest, the line where it is reached."""
+    """One panel per robot. The colour shows the nearest limit, and the line where it is reached."""
     fig, axes = new_figure(1, len(charts), 4.6, sharex=True, sharey=True)
     e = found.asked.envelope
     palette = ListedColormap([_COLOURS[name] for name in LIMITS])
@@ -50,7 +50,7 @@ def draw_nearest_limits(found: SizeResult, charts: dict[str, MarginChart]) -> Fi
 
 
 def draw_pareto_front(found: SizeResult) -> Figure:
-    """The Pareto front of two objectives, its motors named."""
+    """Pareto front of two objectives, with the names of motors."""
     first, second = found.objectives
     fig, axes = new_figure(1, 1, 3.8)
     ax = axes[0, 0]

@@ -17,22 +17,22 @@ from sweeps.pages import words
 from sweeps.pages.figure_style import FAINT, INK, add_corner_note, axis_label, colour_bar, new_figure
 from sweeps.report.run_tables import UNITS, imposed_column, reading_text
 
-_PANELS = 3  # voltages drawn of a configuration
-_CELLS = 12  # along an axis up to which cells are labelled
-#: Of text in a cell, which has no part in the layout of the figure.
+_PANELS = 3  # most voltages drawn for a configuration
+_CELLS = 12  # most cells along an axis for which cells are labelled
+#: Settings of text in a cell, which does not affect the layout of the figure.
 _INSIDE: Json = {"ha": "center", "va": "center", "in_layout": False}
 
 
 def on_ground(runs: Columns) -> bool:
-    """True for runs of a vehicle, with slope and payload."""
+    """True for runs of a vehicle, which have slope and payload."""
     return "slope_deg" in runs and "payload_kg" in runs
 
 
 def panels_by_imposed(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
     """Panels of a figure by imposed quantity: a title and a mask for each of at most three panels.
 
-    Up to three voltages each have a panel. A grid with more has the least, a middle and the greatest. If nearly every
-    run has its own voltage, the panels are thirds of the range.
+    Up to three voltages each have a panel. A grid with more has panels for the lowest, a middle and the highest. If
+    nearly every run has its own voltage, the panels are thirds of the range.
     """
     if np.isnan(voltages).all():
         return [("battery", np.ones(len(voltages), bool))]
@@ -120,7 +120,7 @@ def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _cover_cells(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
-    """Rectangles (i, j, width, height) that cover the cells. Joined where they touch, or one a cell."""
+    """Rectangles (i, j, width, height) that cover the cells, merged if cells touch, otherwise one per cell."""
     if not joined:
         return [(i, j, 1, 1) for i, j in sorted(cells)]
     blocks = []
@@ -153,7 +153,7 @@ def _name_missing_cells(axes: Axes, missing: dict[tuple[int, int], str], each: b
 
 
 def _set_ticks(setter: Any, levels: np.ndarray) -> None:
-    """Every level, or round numbers between the first and the last where there are many."""
+    """Sets ticks at every level, or at round numbers if there are many levels."""
     if levels.size <= 8:
         setter(range(levels.size), [f"{v:.3g}" for v in levels])
         return
@@ -203,9 +203,9 @@ def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
                 color=shade,
                 label=volt or None,
             )
-            gone = pick[~np.isfinite(line)]
-            for status in np.unique(runs["status"][gone]):
-                rows_of_status = gone[runs["status"][gone] == status]
+            missing_rows = pick[~np.isfinite(line)]
+            for status in np.unique(runs["status"][missing_rows]):
+                rows_of_status = missing_rows[runs["status"][missing_rows] == status]
                 axes.plot(
                     runs[variable][rows_of_status],
                     np.full(rows_of_status.size, 0.03 + 0.05 * k),

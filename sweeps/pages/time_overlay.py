@@ -49,8 +49,8 @@ class TimeOverlay:
         return float(np.nanmean(shares)) if np.isfinite(shares).any() else float("nan")
 
     def _residual(self, channel: Channel) -> np.ndarray:
-        first = next(iter(self.simulated))
-        return np.asarray(self.table[first + channel.column] - self.table[channel.column])
+        first_prefix = next(iter(self.simulated))
+        return np.asarray(self.table[first_prefix + channel.column] - self.table[channel.column])
 
     def draw(self) -> Figure:
         """Figure of the worst run: for each channel the readings, and below them simulated minus measured."""
@@ -60,8 +60,8 @@ class TimeOverlay:
         count = len(self.channels)
         fig, grid = new_figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
         for k, channel in enumerate(self.channels):
-            above, below = grid[2 * k, 0], grid[2 * k + 1, 0]
-            above.plot(
+            reading_axes, residual_axes = grid[2 * k, 0], grid[2 * k + 1, 0]
+            reading_axes.plot(
                 time,
                 self.table[channel.column][rows],
                 ".",
@@ -71,11 +71,11 @@ class TimeOverlay:
                 rasterized=len(rows) > 500,
             )
             for (prefix, words), colour in zip(self.simulated.items(), COLOURS, strict=False):
-                above.plot(time, self.table[prefix + channel.column][rows], color=colour, lw=1.3, label=words)
-            below.axhline(0, color=FAINT, lw=0.8)
-            below.plot(time, self._residual(channel)[rows], color=BLUE, lw=1)
-            above.set_ylabel(axis_label(channel))
-            below.set_ylabel("residual")
+                reading_axes.plot(time, self.table[prefix + channel.column][rows], color=colour, lw=1.3, label=words)
+            residual_axes.axhline(0, color=FAINT, lw=0.8)
+            residual_axes.plot(time, self._residual(channel)[rows], color=BLUE, lw=1)
+            reading_axes.set_ylabel(axis_label(channel))
+            residual_axes.set_ylabel("residual")
         grid[0, 0].legend(loc="best")
         grid[0, 0].set_title(f"run {name}" if len(self.rows) > 1 else "")
         grid[-1, 0].set_xlabel("time [s]")
@@ -83,12 +83,12 @@ class TimeOverlay:
 
     def to_json(self) -> str:
         """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
-        most = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
+        points_per_curve = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
         runs: Json = {}
         spent = 0
         worst = self.worst
         for name in (worst, *(name for name in self.rows if name != worst)):
-            rows = self._thinned(self.rows[name], most)
+            rows = self._thinned(self.rows[name], points_per_curve)
             spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
             if runs and spent > 2 * POINTS:
                 break

@@ -119,8 +119,8 @@ def draw_turn_course(history: History) -> Figure:
     for axes, label in zip(grid[:, 0], ("current [A]", "motor speed [rpm]", "yaw rate [rad/s]"), strict=True):
         axes.set_ylabel(label, color=INK)
     steady = read["motor_current_left"][time > 0.1 * time[-1]], read["motor_current_right"][time > 0.1 * time[-1]]
-    most = float(np.nanmax(np.abs(np.concatenate(steady)), initial=0.1))
-    grid[0, 0].set_ylim(-2.5 * most, 2.5 * most)
+    axis_limit = float(np.nanmax(np.abs(np.concatenate(steady)), initial=0.1))
+    grid[0, 0].set_ylim(-2.5 * axis_limit, 2.5 * axis_limit)
     grid[0, 0].legend(ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1], 2))
     grid[-1, 0].set_xlabel("time [s]", color=INK)
     return fig
@@ -134,15 +134,15 @@ def draw_yaw_rates(turns: Columns, row: Json) -> Figure:
         # On the spot the curvature is without limit, the yaw rate is not.
         return np.asarray(motion["yaw_rate_rad_s"], float)
 
-    rest = {name: np.asarray(values)[1:] for name, values in turns.items()}
-    order = np.argsort(rate(rest))
+    other_turns = {name: np.asarray(values)[1:] for name, values in turns.items()}
+    order = np.argsort(rate(other_turns))
     for side, color in SIDES:
         column = f"motor_current_{side}_A"
-        grid[0, 0].plot(rate(rest)[order], rest[column][order], color=color, label=side)
+        grid[0, 0].plot(rate(other_turns)[order], other_turns[column][order], color=color, label=side)
         grid[0, 0].plot(rate(row), float(row[column]), marker="o", color=color, ls="none")
     grid[0, 0].set_ylabel("current of a motor [A]", color=INK)
     grid[0, 0].legend()
-    grid[0, 1].plot(rate(rest)[order], rest["power_supply_W"][order], color=INK)
+    grid[0, 1].plot(rate(other_turns)[order], other_turns["power_supply_W"][order], color=INK)
     grid[0, 1].plot(rate(row), float(row["power_supply_W"]), marker="o", color=INK, ls="none")
     grid[0, 1].set_ylabel("power of the supply [W]", color=INK)
     for axes in grid[0]:

@@ -1,1 +1,1 @@
-"""The paper's figures and tables, remade for a robot: the rooms of `mmrjax reproduce`."""
+"""The paper's figures and tables for a robot, as written by `mmrjax reproduce`."""

@@ -27,18 +27,19 @@ CONFIGURATION = {TRACKED: BLUE, WHEELED: VERMILION}
 MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}
 
 
-#: No load of the maker's sheet of RE30 310007: speed [rpm], current [A].
+#: No-load speed [rpm] and current [A] in the maker's sheet of RE30 310007.
 SHEET_NO_LOAD = (8810.0, 0.165)
-_GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measured rows, about
+_GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # approximate motor speeds of the measured rows
 
 
 def draw_gearbox_efficiency(robots: dict[str, Robot], rows: data.PaperRows | None) -> Figure:
-    """Fig. 5a: efficiency over output torque. The first robot at two speeds, the others where they differ."""
+    """Fig. 5a: efficiency over output torque. The first robot at two speeds, the others if they differ."""
     fig, grid = new_figure(1, 1, 3.9)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
     colour = MODEL.get(name, PURPLE)
-    top = 1.25 * max(2.0, 0.0 if rows is None else _largest_gear_torque(robot, rows))
+    torques = [2.0] if rows is None else [2.0, *_gear_torque(robot, rows)]
+    top = 1.25 * float(np.nanmax(torques))
     for (volts, speed), line in zip(_GEAR_SPEEDS.items(), ("-", "--"), strict=True):
         idle = float(robot.gearbox.torque_idle(speed * data.RPM, 1.0))
         inputs = idle + np.geomspace(1e-5, top / float(robot.gearbox.ratio * robot.gearbox.efficiency_load), 300)
@@ -104,11 +105,6 @@ def _kind(rows: data.PaperRows) -> np.ndarray:
     return rows.conditions["configuration"]
 
 
-def _largest_gear_torque(robot: Robot, rows: data.PaperRows) -> float:
-    torque = _gear_torque(robot, rows)
-    return float(np.nanmax(torque)) if np.isfinite(torque).any() else 2.0
-
-
 def _mark_rows(axes: Axes, robot: Robot, rows: data.PaperRows) -> None:
     torque = _gear_torque(robot, rows)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -143,9 +139,11 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
         label_line_end(left, current, voltage, words, colour)
     constant = [m for m in ("sm1", "sm2") if m in robots]
     if constant:
-        flat = data.cell_voltage(robots[constant[0]], current, 0.0)
-        left.plot(current, flat, color=MODEL["sm1"])
-        left.text(11.9, flat[-1] + 0.02, "SM-1, SM-2: constant", color=MODEL["sm1"], fontsize=8.5, ha="right")
+        constant_voltage = data.cell_voltage(robots[constant[0]], current, 0.0)
+        left.plot(current, constant_voltage, color=MODEL["sm1"])
+        left.text(
+            11.9, constant_voltage[-1] + 0.02, "SM-1, SM-2: constant", color=MODEL["sm1"], fontsize=8.5, ha="right"
+        )
     left.set(xlabel="load current $I_b$ [A]", ylabel="cell voltage [V]", xlim=(0, 12))
     left.set_title(f"a) cell under load: R = {float(robot.battery.resistance) * 1e3:.0f} mΩ a cell")
     left.set_ylim(top=4.35)
@@ -191,9 +189,9 @@ def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
         axes.plot(speed, torque, color=colour)
         words = "SM-1, SM-2 (constant)" if name in ("sm1", "sm2") else displayed_robot_name(name)
         label_line_end(axes, speed, torque, words, colour)
-    first = next(iter(robots.values()))
+    first_robot = next(iter(robots.values()))
     rpm, current = SHEET_NO_LOAD
-    sheet = 1e3 * current * float(first.motor.torque_constant)
+    sheet = 1e3 * current * float(first_robot.motor.torque_constant)
     axes.plot(rpm, sheet, "D", color=INK, ms=6)
     axes.annotate(
         f"maker's sheet, no load at 24 V:\n{rpm:.0f} rpm, {current * 1e3:.0f} mA, so {sheet:.2f} mN·m",
@@ -203,7 +201,7 @@ def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
         fontsize=8.5,
         ha="right",
     )
-    limit = float(first.motor.speed_limit) / data.RPM
+    limit = float(first_robot.motor.speed_limit) / data.RPM
     axes.axvline(limit, color=FAINT, lw=1, ls=":")
     axes.text(limit - 60, 0.15, f"permissible {limit:,.0f} rpm", color=INK, fontsize=8.5, ha="right")
     axes.set(xlabel="motor speed [rpm]", ylabel=r"friction torque $M_{df}$ [mN·m]", xlim=(0, 12_500), ylim=(0, 5.4))
@@ -211,7 +209,7 @@ def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
 
 
 def draw_idle_track(robots: dict[str, Robot]) -> Figure:
-    """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a line through it."""
+    """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a straight line."""
     fig, grid = new_figure(1, 1, 3.6)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
@@ -227,9 +225,11 @@ def draw_idle_track(robots: dict[str, Robot]) -> Figure:
         label_line_end(axes, speed, line, f"{words}\nline: R² = {certainty:.4f}", colour)
         for other in ("sm1", "sm2"):
             if other in robots and other != name and kind == TRACKED:
-                flat = data.idle_current(robots[other], kind, speed)
-                axes.plot(speed, flat, color=MODEL[other], lw=1.4)
-                label_line_end(axes, speed, flat, f"{displayed_robot_name(other)}, three tracks", MODEL[other])
+                constant_current = data.idle_current(robots[other], kind, speed)
+                axes.plot(speed, constant_current, color=MODEL[other], lw=1.4)
+                label_line_end(
+                    axes, speed, constant_current, f"{displayed_robot_name(other)}, three tracks", MODEL[other]
+                )
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26))
     axes.set_ylim(bottom=0)
     add_corner_note(axes, f"dots: {displayed_robot_name(name)}; lines: straight fits")

@@ -1,4 +1,4 @@
-"""The numbers behind the paper's figures and tables: every one asked of mmrjax, none computed here twice."""
+"""Numbers for the paper's figures and tables, all computed by mmrjax."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import StartRun
 
-_CHUNK = 256  # one compiled shape for every question that the report asks of `steady`
+_CHUNK = 256  # one compiled shape for all calls of `steady` in the report
 #: Surface of Table 5 that stands for "adhesion raised": the first on which all 20 measured rows climb.
 RAISED_SURFACE = "smooth_concrete_floor"
-RAISED_MARGIN = 1.06  # where that is not enough for a robot: least adhesion over the largest demand
+RAISED_MARGIN = 1.06  # if that is not enough for a robot: smallest ratio of adhesion to the largest demand
 FIG_23, FIG_24 = "Fig. 23: total current", r"Fig. 24: $V_x$ and $V_{x\,teor}$"  # titles
-#: Loading modes of Fig. 28: supply voltage [V], payload [kg].
+#: Loading modes of Fig. 28: supply voltage [V] and payload [kg].
 MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
@@ -40,7 +40,7 @@ def shown_configurations(robot: Robot) -> Names:
 
 
 def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
-    """A batch of conditions with configurations by name. The total mass, if not given, is the robot's own."""
+    """Batch of conditions with configurations by name. The default total mass is that of the robot."""
     conditions = Conditions(np.asarray(configuration), **given).resolved(robot)
     if conditions.total_mass is not None:
         return conditions
@@ -73,7 +73,7 @@ def channels_of_paper() -> tuple[Channel, ...]:
 
 
 def stack_channels(table: Columns) -> np.ndarray:
-    """The paper's channels of a table, in their columns' units, shape (rows, channels)."""
+    """The paper's channels in a table, in the units of their columns, shape (rows, channels)."""
     return np.stack([np.asarray(table[c.column], float) for c in channels_of_paper()], 1)
 
 
@@ -83,10 +83,10 @@ class PaperRows:
 
     Attributes:
         conditions: the measured table.
-        measured, paper: shape (rows, channels), of the bench and of the paper's own simulation.
-        plain: this robot on its own adhesion, mass as printed.
-        raised: the same on the raised adhesion.
-        weighed: raised, and with the robot's own mass instead of the printed one.
+        measured, paper: readings of the bench and of the paper's own simulation, shape (rows, channels).
+        plain: this robot with its own adhesion and the printed mass.
+        raised: the same with raised adhesion.
+        weighed: with raised adhesion and the robot's own mass.
         ratio: factor by which adhesion is raised, by configuration.
     """
 
@@ -99,14 +99,13 @@ class PaperRows:
     ratio: dict[str, float]
 
     def adhesion(self) -> np.ndarray:
-        """The raised adhesion's ratio for each row."""
+        """Ratio of the raised adhesion for each row."""
         return np.array([self.ratio[c] for c in self.conditions["configuration"]])
 
 
 def simulate_measured_rows(robot: Robot) -> PaperRows | None:
-    """Simulate the measured rows with `robot`: as it is, with adhesion raised, and with its own mass.
-
-    None where the robot has none of their configurations.
+    """Simulates the measured rows with `robot`: unchanged, with raised adhesion, and also with its own mass. None if
+    the robot has none of their configurations.
     """
     if not paper_configurations(robot):
         return None
@@ -137,7 +136,7 @@ def simulate_measured_rows(robot: Robot) -> PaperRows | None:
 
 
 def raised_adhesion_words(robot: Robot, ratio: dict[str, float]) -> str:
-    """The raised coefficients in words, with their source."""
+    """Raised adhesion coefficients in words, with their source."""
     surface = SURFACES[RAISED_SURFACE]
     parts = []
     for c, raised in ratio.items():
@@ -152,7 +151,7 @@ def raised_adhesion_words(robot: Robot, ratio: dict[str, float]) -> str:
 
 
 def channel_percent_errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
-    """Errors (35) of the paper's channels [%], shape (rows, channels), NaN where there is no number."""
+    """Errors (35) of the paper's channels [%], shape (rows, channels), NaN for missing numbers."""
     return simulation_errors.relative_error(stack_channels(simulated), measured)
 
 
@@ -191,8 +190,8 @@ def motor_friction(robot: Robot, speed_rpm: np.ndarray) -> np.ndarray:
 def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> np.ndarray:
     """Current of one motor [A] that keeps a lifted side turning at pulley speed [rad/s].
 
-    No ground, no weight on the guides: the balances have zero normal load and traction. Their
-    net torque is linear in the current while the motor drives, so two currents give the root.
+    Without ground and weight on the guides, normal load and traction are zero. The net torque is linear in the
+    current while the motor drives, so two currents give the root.
     """
     from mmrjax.model import balances
     from mmrjax.model.signals import State
@@ -226,7 +225,7 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[StartRun]:
-    """From standstill on the flat with `drive`, each of the paper's configurations."""
+    """Starts from standstill on the flat with `drive`, for each of the paper's configurations."""
     from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
@@ -237,7 +236,7 @@ def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -
 
 
 def starts_from_standstill(robot: Robot, history: Any, status: Any) -> list[StartRun]:
-    """Runs of the paper's configurations from standstill, of any fidelity that has histories.
+    """Runs of the paper's configurations from standstill, for any fidelity with histories.
 
     Args:
         history: time, signals and reactions (None where contacts are not resolved).
@@ -274,11 +273,11 @@ def rows_of_mode(rows: PaperRows, kind: str, mode: int) -> np.ndarray:
 
 
 def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
-    """R² (A1) of the current over slope, of each configuration and loading mode with measured rows.
+    """R² (A1) of the current over slope, for each configuration and loading mode with measured rows.
 
     Returns:
-        Configuration, mode, and R² of a straight line through the points and of the robot on its own adhesion. Then
-        the number of rows that settle on it, and R² with the adhesion raised and with the robot's own mass.
+        Configuration, mode, R² of a straight line through the points and of the robot with its own adhesion, the
+        number of rows that settle with it, and R² with raised adhesion and with the robot's own mass.
     """
     found = []
     for kind in rows.ratio:
@@ -300,7 +299,7 @@ def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
 def supply_errors(robot: Robot, ratio: float, rows_of: PaperRows, battery: bool) -> dict[int, np.ndarray]:
     """Errors (35) over the five slopes of 6T2A in modes 1 and 2 of Fig. 29: mode → shape (5, 3).
 
-    On battery there is mode 2 alone: a full battery of 8 cells gives about the 33 V of the bench.
+    On battery there is only mode 2: a full battery of 8 cells gives about the 33 V of the bench.
     """
     answer = {}
     for mode, voltage in ((1, 15.0), (2, 33.0)):
@@ -323,7 +322,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: PaperRows, battery: bool)
     return answer
 
 
-#: Where the supply's power goes, from the motor to the ground, with the word on the figure.
+#: Uses of the supply's power, from the motor to the ground, with their names in the figure.
 SPLIT = ("winding", "motor friction", "gearbox", "track and guides", "slip", "rolling resistance", "lift")
 
 
@@ -331,7 +330,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     """Operating points, and the power [W] of each item of `SPLIT`.
 
     Returns:
-        The points, and item → power. `other` is what effects beyond the paper's terms take.
+        Points, and item → power. `other` is the power of effects beyond the paper's terms.
     """
     import equinox as eqx
 
@@ -367,7 +366,7 @@ class EnergyUse(NamedTuple):
     """Breakdown of the supply's power at operating points.
 
     Attributes:
-        labels: labels of the points, with a star where the robot slides on its own adhesion, so that it is raised.
+        labels: labels of the points, with a star if the adhesion is raised because the robot would slide.
         power: item of `SPLIT`, and `other` → [W].
         total: power of the supply [W].
         status: status of each point.
@@ -383,7 +382,7 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
     """Breakdown of the supply's power at twelve operating points.
 
     Args:
-        ratio: factor by which adhesion is raised where the robot would slide, by configuration.
+        ratio: factor by which adhesion is raised if the robot would slide, by configuration.
     """
     cases = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*cases, strict=True))
@@ -394,17 +393,17 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
         )
         return energy_split(robot, conditions)
 
-    slides = at(np.ones(len(cases)))[0]["status"] == "slides"
-    points, power = at(np.where(slides, [ratio[k] for k in kind], 1.0))
+    is_sliding = at(np.ones(len(cases)))[0]["status"] == "slides"
+    points, power = at(np.where(is_sliding, [ratio[k] for k in kind], 1.0))
     labels = [
         f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(slid)
-        for (c, u, p, s), slid in zip(cases, slides, strict=True)
+        for (c, u, p, s), slid in zip(cases, is_sliding, strict=True)
     ]
     return EnergyUse(labels, power, points["power_supply_W"], points["status"])
 
 
 def paper_rows_table(rows: PaperRows) -> Columns:
-    """The paper's rows side by side: measured, the paper's simulation, and the robot three ways."""
+    """The paper's rows side by side: measured, the paper's simulation, and three variants of the robot."""
     conditions = rows.conditions
     columns = {key: conditions[key] for key in ("configuration", *runs.CONDITIONS)}
     for k, channel in enumerate(channels_of_paper()):
@@ -416,7 +415,7 @@ def paper_rows_table(rows: PaperRows) -> Columns:
 
 
 def bench_error_summary(rows: PaperRows) -> dict[str, Json]:
-    """Errors (35) of every channel against the bench: of the robot three ways, and of the paper's simulation."""
+    """Errors (35) of every channel against the bench: of three robot variants and of the paper's simulation."""
     ways = {
         name: channel_percent_errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")
     }

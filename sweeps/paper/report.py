@@ -1,4 +1,4 @@
-"""The report of `reproduce`: the paper's figures and tables for a robot, compared with the bench and the paper."""
+"""Report of `reproduce`: the paper's figures and tables for a robot, compared with the bench and the paper."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from sweeps.report.runs_report import ripple_table, starts_table
 # --- Figures 23-27 from the track model -----------------------------------------------------------
 
 
-SECONDS = 1.5  # of a run
-SAMPLE = 5e-4  # of its record [s]
+SECONDS = 1.5  # duration of a run [s]
+SAMPLE = 5e-4  # interval of its record [s]
 
 
 def simulate_gear_runs(robot: Robot) -> Any:
-    """The paper's configurations from standstill on the flat at 33 V without payload, in NumPy.
+    """Starts of the paper's configurations from standstill on the flat at 33 V without payload, in NumPy.
 
-    A robot too stiff for the model's usual step is run with a smaller one.
+    A robot that is too stiff for the usual step is simulated with a smaller one.
     """
     import jax
 
@@ -48,7 +48,7 @@ def simulate_gear_runs(robot: Robot) -> Any:
 
 
 def gear_blocks(robot: Robot) -> Iterator[Block]:
-    """Figures and the table of ripple. If a run does not get under way, the statuses of all and no figures."""
+    """Figures and table of ripple. If a run does not get under way, only the statuses of all runs."""
     run, names = simulate_gear_runs(robot), data.shown_configurations(robot)
     configuration_indices = [robot.configurations.index(c) for c in names]
     status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
@@ -76,14 +76,14 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
 
 
 def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRows | None]:
-    """The report on a robot, next to the nominal robots.
+    """Report on a robot, compared with the nominal robots.
 
     Args:
-        file: file of any robot, without one of the paper's configurations it is not compared with the bench.
-        gear: whether its fidelity resolves the running gear, so that there are Figs. 23-27 from it too.
+        file: file of any robot. Without one of the paper's configurations it is not compared with the bench.
+        gear: True if the fidelity resolves the running gear, to add its Figs. 23-27.
 
     Returns:
-        The report, and the robot's results for the paper's rows, None without one of their configurations.
+        Report, and the robot's results for the paper's rows (None without one of their configurations).
     """
     robot, name = file.robot, capabilities.displayed_name(file)
     name = file.name if name == words.displayed_robot_name(file.name) else name
@@ -174,12 +174,12 @@ def _error_table(errors: list[Json]) -> Block:
 
 
 def _sliding(robot: Robot, rows: data.PaperRows) -> Iterator[Block]:
-    """Note on the rows that have no operating point on the robot's own adhesion, if there are any."""
-    slides, table = rows.plain["status"] != "converged", rows.conditions
+    """Note on rows without an operating point with the robot's own adhesion, if there are any."""
+    is_sliding, table = rows.plain["status"] != "converged", rows.conditions
     sentences = [
         f"{table['configuration'][k]} {table['supply_voltage_V'][k]:.0f} V {table['slope_deg'][k]:.0f}° "
         f"{words.short_status(str(rows.plain['status'][k]))}"
-        for k in np.flatnonzero(slides)
+        for k in np.flatnonzero(is_sliding)
     ]
     if sentences:
         raised = data.raised_adhesion_words(robot, rows.ratio)
@@ -203,8 +203,8 @@ def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows]
 def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
     current = table["total_current_A"]
-    back = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
-    return robot.sides * (table["supply_voltage_V"] - back) / current
+    back_emf = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
+    return robot.sides * (table["supply_voltage_V"] - back_emf) / current
 
 
 def _paper_rows_table(rows: data.PaperRows) -> Block:
@@ -265,7 +265,7 @@ def row_reasons(nominal: Robot, rows: data.PaperRows) -> Iterator[list[str]]:
 
 
 def _variants(name: str, rows: dict[str, data.PaperRows]) -> Columns:
-    """Errors of the rows under the names that the table of errors shows."""
+    """Errors of the rows by variant, with the names in the table of errors."""
     own_rows, shown = rows[name], words.displayed_robot_name(name)
     error = data.channel_percent_errors
     answer = {

@@ -1,4 +1,4 @@
-"""Figures of the paper's runs: over slope (Figs. 28, 29), row by row, and where the energy goes."""
+"""Figures of the paper's runs: over slope (Figs. 28, 29), row by row, and uses of power."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def current_over_slope(robot: Robot, rows: data.PaperRows, certainty: Sequence[S
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1).
 
     Args:
-        certainty: certainty from `data.slope_certainty`.
+        certainty: R² from `data.slope_certainty`.
     """
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
@@ -146,7 +146,7 @@ def draw_energy(used: data.EnergyUse) -> Figure:
     for item in (*data.SPLIT, "other"):
         share = 100 * used.power[item] / used.total
         share = np.where(np.isfinite(share), share, 0.0)
-        if np.abs(share).max() < 0.05:  # not to be seen, and in no legend
+        if np.abs(share).max() < 0.05:  # invisible, and not in the legend
             continue
         axes.barh(
             height, share, left=bar_starts, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6
@@ -171,20 +171,20 @@ def draw_energy(used: data.EnergyUse) -> Figure:
     axes.set_yticks(height, used.labels, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    remark = "\n* slides on its own adhesion; shown with adhesion raised" if "*" in "".join(used.labels) else ""
+    remark = "\n* slides with its own adhesion; shown with raised adhesion" if "*" in "".join(used.labels) else ""
     axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
     outer_legend(axes, "upper center")
     return fig
 
 
 def row_parity(rows: data.PaperRows, name: str) -> Figure:
-    """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
+    """Simulated over measured readings for every channel, with raised adhesion and both masses for 4W2T."""
     channels_shown = data.channels_of_paper()
     fig, grid = new_figure(1, len(channels_shown), 3.7)
     kind = rows.conditions["configuration"]
     raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
     has_other_mass = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
-    slides = rows.plain["status"] == "slides"
+    is_sliding = rows.plain["status"] == "slides"
     for k, (axes, channel) in enumerate(zip(grid[0], channels_shown, strict=True)):
         measured = rows.measured[:, k]
         span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
@@ -192,8 +192,8 @@ def row_parity(rows: data.PaperRows, name: str) -> Figure:
         axes.plot(span, span, color="#666666", lw=0.9)
         for c in rows.ratio:
             for pick, face, label in (
-                ((kind == c) & ~slides, CONFIGURATION[c], c),
-                ((kind == c) & slides, "white", f"{c}, adhesion raised"),
+                ((kind == c) & ~is_sliding, CONFIGURATION[c], c),
+                ((kind == c) & is_sliding, "white", f"{c}, adhesion raised"),
             ):
                 axes.plot(
                     measured[pick],

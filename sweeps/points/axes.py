@@ -113,10 +113,10 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
         )
     _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
-    simulated = [robot.configurations.names[int(k)] for k in configuration_indices]
-    imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
+    configuration_names = [robot.configurations.names[int(k)] for k in configuration_indices]
+    imposed.check_turning(robot, {*fixed, *design.names}, configuration_names, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
-        for name in simulated:
+        for name in configuration_names:
             if why := reason_without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own_axis = AXIS[robot.rig.imposed]
@@ -344,8 +344,8 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     _check_within(np.array([v for k, v in numbers.items() if not k.startswith("sd")]), axis, where)
     if kind == "prior":
         if not axis.prior_sd or axis.value is None:
-            others = ", ".join(k for k in DISTRIBUTIONS if k != kind)
-            raise BadConfiguration(f"{where}: {name} has no prior; expected one of {others}")
+            other_names = ", ".join(k for k in DISTRIBUTIONS if k != kind)
+            raise BadConfiguration(f"{where}: {name} has no prior; expected one of {other_names}")
         return _prior(name, robot)
     return _truncate(kind, numbers, axis.bounds, where)
 
@@ -385,10 +385,10 @@ def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float],
     # normal in the value or its logarithm, truncated at the bounds
     if kind == "normal":
         mean, sd = numbers["mean"], numbers["sd"]
-        first, last = (special.ndtr((b - mean) / sd) for b in bounds)
-        return lambda u: np.clip(mean + sd * special.ndtri(first + (last - first) * u), *bounds)
+        lower, upper = (special.ndtr((b - mean) / sd) for b in bounds)
+        return lambda u: np.clip(mean + sd * special.ndtri(lower + (upper - lower) * u), *bounds)
     median, sd = numbers["median"], numbers["sd_log"]
     if median <= 0:
         raise BadConfiguration(f"{where}.median: got {median:g}; expected more than 0")
-    first, last = (special.ndtr(math.log(b / median) / sd) if b > 0 else 0.0 for b in bounds)
-    return lambda u: np.clip(median * np.exp(sd * special.ndtri(first + (last - first) * u)), *bounds)
+    lower, upper = (special.ndtr(math.log(b / median) / sd) if b > 0 else 0.0 for b in bounds)
+    return lambda u: np.clip(median * np.exp(sd * special.ndtri(lower + (upper - lower) * u)), *bounds)

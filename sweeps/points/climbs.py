@@ -95,10 +95,10 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
         wants = "find searches for it" if obstacle.find else f"expected an axis {SIZE}, or find = true"
         raise BadConfiguration(f"{where}, {SIZE}: got {'it' if obstacle.find else 'none'}; {wants}")
     sizes = varied.get(SIZE, ())
-    if obstacle.kind == "stairs" and 2 * obstacle.nose_mm >= (least := min([obstacle.tread_mm, *sizes])):
+    if obstacle.kind == "stairs" and 2 * obstacle.nose_mm >= (shortest := min([obstacle.tread_mm, *sizes])):
         raise BadConfiguration(
             f"{where}, obstacle.nose_mm: got {obstacle.nose_mm:g}; expected less than half of rise and tread, "
-            f"{least / 2:g} mm"
+            f"{shortest / 2:g} mm"
         )
     one = None if obstacle.sequence is None else terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
     for name in ("levers_front_deg", "levers_rear_deg"):
@@ -197,14 +197,14 @@ def _until_verdict(found: ClimbRuns) -> Columns:
     def most(values: Any) -> np.ndarray:
         return np.max(np.where(during, np.nan_to_num(np.asarray(values)), -np.inf), axis=1)
 
-    last = np.maximum(during.sum(axis=1) - 1, 0)[:, None]
+    last_sample = np.maximum(during.sum(axis=1) - 1, 0)[:, None]
     energy = np.asarray(r.energy["supply"] + r.energy["levers"])
     return {
         VERDICT: found.verdict,
-        "time_s": np.take_along_axis(np.asarray(r.time), last, 1)[:, 0],
+        "time_s": np.take_along_axis(np.asarray(r.time), last_sample, 1)[:, 0],
         "furthest_mm": 1000 * np.asarray(found.furthest),
         "pitch_most_deg": np.degrees(most(-np.asarray(r.motion.q)[..., PITCH])),
-        "energy_J": np.take_along_axis(energy, last, 1)[:, 0],
+        "energy_J": np.take_along_axis(energy, last_sample, 1)[:, 0],
         "traction_current_most_A": most(np.abs(r.current)),
         "front_current_most_A": most(np.abs(r.lever_current[..., 0])),
         "rear_current_most_A": most(np.abs(r.lever_current[..., 1])),
@@ -227,9 +227,9 @@ def _search_all(
     )
     for k in range(rounds):
         verdicts = run(sizes, functools.partial(_report_share, told, k, rounds)).verdict
-        gone = verdicts == OVER
-        climbed, beyond = np.where(gone, sizes, climbed), np.where(gone, beyond, sizes)
-        verdict = np.where(gone, verdict, verdicts)
+        is_over = verdicts == OVER
+        climbed, beyond = np.where(is_over, sizes, climbed), np.where(is_over, beyond, sizes)
+        verdict = np.where(is_over, verdict, verdicts)
         sizes = (np.maximum(climbed, low) + beyond) / 2
     return {VERDICT: verdict, LARGEST: climbed}
 

@@ -31,12 +31,12 @@ def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
     One row for each point, in order. Numbers that are not finite become empty cells.
     """
     path = folder / f"runs.{kind}"
-    aside = path.with_name(path.name + ".writing")
+    temporary = path.with_name(path.name + ".writing")
     try:
-        _WRITERS[kind](aside, chunk_tables(folder / STORE, layout))
-        os.replace(aside, path)
+        _WRITERS[kind](temporary, chunk_tables(folder / STORE, layout))
+        os.replace(temporary, path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return path
 
 

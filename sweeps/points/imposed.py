@@ -50,8 +50,8 @@ def imposed_limit(robot: Robot) -> float | None:
         return None
     if robot.rig.imposed == "voltage":
         return robot.motor.voltage_limit
-    most = min(float(robot.motor.speed_limit), float(robot.gearbox.speed_limit))
-    return most / RPM if most < UNLIMITED else None
+    speed_limit = min(float(robot.motor.speed_limit), float(robot.gearbox.speed_limit))
+    return speed_limit / RPM if speed_limit < UNLIMITED else None
 
 
 def _digits(value: float) -> float:
@@ -68,10 +68,10 @@ def imposed_default(robot: Robot, option: str) -> float:
     """
     if Layout.of(robot).uses_paper_conditions:
         return VOLTAGE
-    most = imposed_limit(robot)
-    if most is None:
+    limit = imposed_limit(robot)
+    if limit is None:
         raise BadConfiguration(_missing_limit_message(robot, option, SAID[robot.rig.imposed].one))
-    return most if robot.rig.imposed == "voltage" else _digits(most)
+    return limit if robot.rig.imposed == "voltage" else _digits(limit)
 
 
 def imposed_example(robot: Robot) -> float:
@@ -93,10 +93,10 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     """
     if Layout.of(robot).uses_paper_conditions:
         return VOLTAGES_V
-    most = imposed_limit(robot)
-    if most is None:
+    limit = imposed_limit(robot)
+    if limit is None:
         raise BadConfiguration(_missing_limit_message(robot, option, SAID[robot.rig.imposed].several))
-    levels = tuple(_digits(share * most) for share in SHARES)
+    levels = tuple(_digits(share * limit) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
         notes.append(

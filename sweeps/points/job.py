@@ -130,8 +130,10 @@ def store_layout(config: Campaign, job: scale.Job) -> Layout:
     for name in {axes.CONFIGURATION} & set(coordinates):
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
-    about = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
-    return Layout(job.plan.design, job.blocks, tuple(variables), coordinates, labels, about, config.compression)
+    group_attributes = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
+    return Layout(
+        job.plan.design, job.blocks, tuple(variables), coordinates, labels, group_attributes, config.compression
+    )
 
 
 def _store_attributes(about: Json) -> Json:

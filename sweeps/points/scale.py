@@ -111,8 +111,8 @@ class Compiled:
         self.size = share * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
         tree = (job.plan.varied(job.robot), job.plan.fixed())
-        arrays, rest = eqx.partition(tree, eqx.is_array)
-        self._variation, self._fixed = eqx.combine(jax.device_put(arrays, everywhere), rest)
+        arrays, static_parts = eqx.partition(tree, eqx.is_array)
+        self._variation, self._fixed = eqx.combine(jax.device_put(arrays, everywhere), static_parts)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesion_ratios(job.robot, job.plan.surface)
@@ -220,11 +220,11 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
     def program(
         variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
     ) -> dict[str, Array]:
-        arrays, rest = eqx.partition((variation, profile), eqx.is_array)
+        arrays, static_parts = eqx.partition((variation, profile), eqx.is_array)
         sharding = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()
 
         def part(arrays: Any, conditions: Conditions, values: Array) -> dict[str, Array]:
-            variation, profile = eqx.combine(arrays, rest)
+            variation, profile = eqx.combine(arrays, static_parts)
             return _one_device(variation, conditions, values, asked, profile)
 
         # Each device has its own loops, so no device waits for another inside a loop.
@@ -272,16 +272,16 @@ def produce_chunks(
         advance: callback for the number of further points that are done, for chunks that are computed in parts.
     """
     with Threads(1) as maker:
-        ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
+        prepared = deque[tuple[int, concurrent.futures.Future[Any]]]()
         for chunk in chunks:
-            ahead.append((chunk, maker.submit(compiled.points, chunk)))
-            if len(ahead) > 1:
-                yield _started(compiled, *ahead.popleft(), times, advance)
-        while ahead:
-            yield _started(compiled, *ahead.popleft(), times, advance)
+            prepared.append((chunk, maker.submit(compiled.points, chunk)))
+            if len(prepared) > 1:
+                yield _start_chunk(compiled, *prepared.popleft(), times, advance)
+        while prepared:
+            yield _start_chunk(compiled, *prepared.popleft(), times, advance)
 
 
-def _started(
+def _start_chunk(
     compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times, advance: Advance | None
 ) -> Piece:
     start = time.perf_counter()
@@ -321,10 +321,10 @@ def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] |
     design, samples = job.plan.design, job.plan.design.samples
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
         return None
-    along = job.blocks.box(piece.chunk)[-1]
+    sample_range = job.blocks.box(piece.chunk)[-1]
     if piece.values is not None:  # samples vary fastest
-        return piece.values[: along.stop - along.start, len(design.axes) :].T
-    return samples.values(along.start, along.stop - along.start)
+        return piece.values[: sample_range.stop - sample_range.start, len(design.axes) :].T
+    return samples.values(sample_range.start, sample_range.stop - sample_range.start)
 
 
 def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:

@@ -95,8 +95,8 @@ def _summary(columns: Columns, counts: np.ndarray) -> Columns:
 
 def interval_ranges(table: Columns, found: Intervals) -> list[str]:
     """Range of every channel over the runs, each end with its sd, and the number of draws that do not converge."""
-    first = found.channels[0].column
-    finite = np.isfinite(found.sd(first)) & np.isfinite(table[first])
+    first_column = found.channels[0].column
+    finite = np.isfinite(found.sd(first_column)) & np.isfinite(table[first_column])
     ranges = []
     for c in found.channels if finite.any() else ():
         value, sd, rows = table[c.column], found.sd(c.column), np.flatnonzero(finite)

@@ -425,9 +425,9 @@ class SweepStore(Folder):
         for chunk, records in self._records().items():
             if chunk in self._sound:
                 continue
-            sound = next((record for record in records if self._wrong_file(record) is None), None)
-            if sound is not None:
-                self._sound[chunk] = sound
+            undamaged = next((record for record in records if self._wrong_file(record) is None), None)
+            if undamaged is not None:
+                self._sound[chunk] = undamaged
             elif chunk not in self._damaged and not self.finished:
                 self._damaged.add(chunk)
                 print_message(f"{self._wrong_file(records[-1])}: damaged, so it is computed again")

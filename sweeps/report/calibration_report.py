@@ -9,18 +9,25 @@ import numpy as np
 
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
+from calibration.described import as_paragraph
 from calibration.inference import blocks
+from calibration.inference.feedforward import Feedforward
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import METHOD, CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from sweeps.pages import words
-from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report import catalogue, feedforward_report, fit_tables, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
 
+#: Prefixes of simulated readings of a log, and their names.
+LINES = {"after_": "calibrated", "before_": "before"}
 
-def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
+
+def calibration_document(
+    found: CalibrationResult, robot_name: str, voltage_fit: Feedforward | None = None
+) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
     chi, about = found.chi_square, found.identifiability
@@ -29,7 +36,9 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
         "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
         chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
     )  # fmt: skip
-    search = Note(f"{found.starts.statement()}.", "" if found.converged else "warn", "search", terminal=True)
+    search = Note(
+        as_paragraph([found.starts.statement()]), "" if found.converged else "warn", "search", terminal=True
+    )
     rms = [fit_tables.rms_table(found.rms, found.channels)] if sized else []
     answer = fit_words.calibration_answer(found)
     before_after = catalogue.figure("calibration.before_after", found, finding=answer, words=(OF_SIZE,))
@@ -40,6 +49,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
         answer,
         (
             Note(f"{found.adequacy.statement}.", "lead", "adequate", terminal=True),
+            *([catalogue.figure("fit.overlay", table, found.channels, LINES, finding=answer)] if found.axis else []),
             _parameters(found),
             _errors(found),
             *rms,
@@ -53,6 +63,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
             Section("Errors before and after, seen and unseen", (before_after,)),
             *_over_rows(found, sized),
+            *([feedforward_report.voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
             Section("How sure", tuple(_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
@@ -99,32 +110,27 @@ def _shifts(found: CalibrationResult) -> Iterable[Block]:
 
 
 def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
-    """Sections: histories over time, simulated against measured readings, residuals over each condition."""
-    table = found.rows()
-    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
-    answer, panels = fit_words.calibration_answer(found), found.channels
+    """Sections: frequency response of a log, simulated against measured readings, residuals over each condition."""
+    table, panels = found.rows(), found.channels
+    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in panels}
     if found.axis:
-        lines = {"after_": "calibrated", "before_": "before"}
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
-        overlay = catalogue.figure("fit.overlay", table, panels, lines, finding=answer)
-        yield Section("Histories", (overlay, *fit_tables.frequency_response(runs, panels, lines)))
+        for figure in fit_tables.frequency_response(runs, panels, LINES):
+            yield Section("Frequency response", (figure,))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
         catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
-    yield from (
-        Section(h, (f,)) for h, f in zip(("Parity", "Residuals against every condition"), figures, strict=True)
-    )
+    headings = "Parity", "Residuals against every condition"
+    yield from (Section(heading, (figure,)) for heading, figure in zip(headings, figures, strict=True))
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:
     if found.profiled:
         yield catalogue.figure("calibration.profiles", found)
     yield catalogue.figure("calibration.correlations", found)
-    if len(found.posterior) > 1:
-        yield catalogue.figure("calibration.pairs", found)
     weak = [
         (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
         for value, parts in found.identifiability.weak_directions()

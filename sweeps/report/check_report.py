@@ -17,7 +17,7 @@ from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from sweeps.pages import words
-from sweeps.report import catalogue
+from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table
 from sweeps.report.words.posture_words import Drawn
 
@@ -141,7 +141,11 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
     corners = [o.at for o in found.outcomes]
-    sections.append(Section("Motor and gear", (catalogue.figure("run.chart_of_corners", found.robot, corners),)))
+    robot, figures = found.robot, [catalogue.figure("run.chart_of_corners", found.robot, corners)]
+    if float(robot.gearbox.efficiency_load) < 1 or run_tables.lost_by_load(robot):
+        volts = float(robot.battery.voltage_no_load(0.0))
+        figures.append(catalogue.figure("run.drive_plane", robot, volts, words=(volts,)))
+    sections.append(Section("Motor and gear", tuple(figures)))
     blocks: tuple[Block, ...] = (Note(lead, "lead"), margins, *_postures(found))
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 

@@ -185,8 +185,8 @@ class ClimbResult:
     @property
     def slopes(self) -> list[Json] | None:
         """Derivatives, one row for each output and variable. None unless requested."""
-        along, derivatives = self.along, self.derivatives
-        if along is None or derivatives is None:
+        variables, derivatives = self.along, self.derivatives
+        if variables is None or derivatives is None:
             return None
         variable_keys = ("by", "by_unit", "by_value", "by_width")
         names = ("output", "unit", "value", *variable_keys, "derivative", "slope", "slope_sd")
@@ -196,7 +196,7 @@ class ClimbResult:
         return [
             dict(zip(names, (n, unit, derivatives.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
             for n, (unit, _) in OUTPUTS.items()
-            for k, row in enumerate(along.rows)
+            for k, row in enumerate(variables.rows)
         ]
 
     def statement(self) -> str:
@@ -205,9 +205,9 @@ class ClimbResult:
             if self.largest is None:
                 smallest = min(size for size, _ in self.tried)
                 return f"It cannot climb any {self.sought} that was tried. The smallest was {smallest:.0f} mm."
-            beyond = [(s, v) for s, v in self.tried if s > self.largest]
-            least = min(beyond, default=None)
-            why = "" if least is None else f"; at {least[0]:.0f} mm it {VERDICTS[least[1]][0]}"
+            larger_sizes = [(s, v) for s, v in self.tried if s > self.largest]
+            next_larger = min(larger_sizes, default=None)
+            why = "" if next_larger is None else f"; at {next_larger[0]:.0f} mm it {VERDICTS[next_larger[1]][0]}"
             return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{why}."
         short, meaning = VERDICTS[self.verdict]
         return f"The robot {short}: {self.obstacle}" + ("." if self.over else f"; {meaning}.")

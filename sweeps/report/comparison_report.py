@@ -89,6 +89,8 @@ def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = N
     nothing = np.full(len(measured), np.nan)
     for channel in measured.channels:
         table[channel.column] = measured.columns.get(channel.column, nothing)
+        if measured.has(channel.sd_column):
+            table[channel.sd_column] = measured[channel.sd_column]
         table[f"simulated_{channel.column}"] = simulated[channel.column]
         table[f"error_{channel.name}_percent"] = residual.sized_error(
             simulated[channel.column], table[channel.column]
@@ -140,7 +142,10 @@ def comparison_document(found: Comparison) -> Document:
             if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
         ),
     )
-    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=_strongest_trend(found))
+    known_sd = any(np.isfinite(found.table.get(c.sd_column, [])).any() for c in found.channels)
+    band = " Band: ±2 standard deviations of the readings." * known_sd
+    trend = _strongest_trend(found)
+    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=trend, more=band)
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",

@@ -64,7 +64,7 @@ def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterabl
 def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
     """rms errors in the units of their channels, by fit."""
     rows = [(FITS[fit], *(rms_by_channel.get(c.name) for c in shown)) for fit, rms_by_channel in rms.items()]
-    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
+    return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .4g" for c in shown))
 
 
 def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, str]) -> Table:

@@ -47,7 +47,7 @@ class Missions:
 
     def to_json(self) -> Json:
         """Content of `result.json`: for one run its numbers by name, for several a list of them."""
-        missions = [self._one(k) for k in range(len(self.table["status"]))]
+        missions = [self._run_as_json(k) for k in range(len(self.table["status"]))]
         about = {
             "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
             "segments": self.source.segment_count, "cycles": self.source.cycles,
@@ -55,7 +55,7 @@ class Missions:
         }  # fmt: skip
         return {"profile": about, **(missions[0] if len(missions) == 1 else {"missions": missions})}
 
-    def _one(self, row: int) -> Json:
+    def _run_as_json(self, row: int) -> Json:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
         numbers = {
             c: float(self.table[c][row])
@@ -88,9 +88,9 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     """Report of finished missions. The first run is shown in detail."""
     table, source = found.table, found.source
     shown_columns = capabilities.drop_inapplicable_columns(file.robot, table)
-    first, names = {key: value[0] for key, value in table.items()}, _names(table)
+    first_run, names = {key: value[0] for key, value in table.items()}, _names(table)
     answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
-    fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
+    fed = "battery" if np.isfinite(first_run["state_of_charge"]) else "supply"
     cycles, per_cycle = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
     lead = (
@@ -102,7 +102,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
         "runs", shown_columns, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
     )
     endings = run_tables.endings_table(Counter(map(str, table["status"])))
-    is_complete = len(names) == 1 and first["status"] == "converged"
+    is_complete = len(names) == 1 and first_run["status"] == "converged"
     return Document(
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
         answer,
@@ -114,7 +114,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             *([] if is_complete else [endings]),
             *remarks(_charge_left(table)),
         ),
-        page_sections=lambda: _sections(file.robot, found, first, answer),
+        page_sections=lambda: _sections(file.robot, found, first_run, answer),
     )
 
 
@@ -145,8 +145,8 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
             ),
             "path-section",
         )
-    back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
-    returned = f"{back:.3g} Wh returned to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
+    returned_Wh, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
+    returned = f"{returned_Wh:.3g} Wh returned to the source." if returned_Wh > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}. Driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
@@ -259,21 +259,21 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
                 ", ".join(words.FLAGS[f] for f in flags) or "none",
             )
         )  # fmt: skip
-    first = "first cycle" if many else "this segment"
-    heads = [quantity_column(c, group=first) for c in shown_columns] + [
+    group = "first cycle" if many else "this segment"
+    headings = [quantity_column(c, group=group) for c in shown_columns] + [
         quantity_column(c, group="all cycles") for c in totals
     ]
-    heads += columns(*["all cycles > share of energy [%] | .1f"] * many)
-    return catalogue.table("mission.segments", answer, *heads)
+    headings += columns(*["all cycles > share of energy [%] | .1f"] * many)
+    return catalogue.table("mission.segments", answer, *headings)
 
 
 def _demand_in_words(found: Missions, k: int) -> str:
     """Demand of the profile in a segment, in words."""
     source = found.source
-    last = k + 1 if source.linear else k
+    last_row = k + 1 if source.linear else k
 
     def span(values: np.ndarray, factor: float, unit: str) -> str:
-        begin, end = float(values[k]) / factor, float(values[last]) / factor
+        begin, end = float(values[k]) / factor, float(values[last_row]) / factor
         unit = unit if unit == "°" else f"\u00a0{unit}"
         return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
 

@@ -1,4 +1,4 @@
-"""A document as a page: one HTML file without network, its figures inlined, its tables offered as CSV."""
+"""Renderer of pages: one HTML file that needs no network, with inline figures and tables as CSV."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from sweeps.report.document import Document, Figure
 
 
 def write_report_page(folder: Path, document: Document, file: RobotFile | None = None) -> Path:
-    """Write `report.html` and `figures/` of a document. Returns the path of the page.
+    """Writes `report.html` and `figures/` of a document. Returns the path of the page.
 
     Args:
-        file: file of the robot that the page is about: its parameters are the last section.
+        file: robot file of the page, whose parameters are the last section.
     """
     album = FigureAlbum(folder)
     document = dataclasses.replace(document, sections=(*document.page_sections(), *document.sections))

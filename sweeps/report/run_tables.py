@@ -145,6 +145,11 @@ def note_on_robot(file: RobotFile, model: str = "", more: str = "") -> Note:
     return Note(" ".join(filter(None, parts)), "lead")
 
 
+def lost_by_load(robot: Robot) -> bool:
+    """True if an effect of the robot loses a share of the load in the gearbox."""
+    return any(e.balance == "gearbox" and e.driver == "load" for e in robot.effects)
+
+
 def curve_warning(robot: Robot) -> tuple[Note, ...]:
     """Warning if the robot has curves for unexplained discrepancies."""
     names = " and ".join(f"`{e.name}`" for e in robot.effects if e.name in effects.UNNAMED)

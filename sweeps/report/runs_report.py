@@ -51,8 +51,8 @@ def runs_document(
         notes: remarks on the runs.
     """
     robot, names = file.robot, run_headings(runs)
-    single, first = len(names) == 1, {key: value[0] for key, value in runs.items()}
-    limit_use = limits_used(robot, first) if single else []
+    single, first_run = len(names) == 1, {key: value[0] for key, value in runs.items()}
+    limit_use = limits_used(robot, first_run) if single else []
     endings = run_tables.endings_table(Counter(map(str, runs["status"])))
     table = capabilities.drop_inapplicable_columns(robot, runs)
     shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
@@ -65,7 +65,7 @@ def runs_document(
         sideways=True,
     )  # fmt: skip
     of_runs = Section("The run" if single else "The runs", (shown_table,), "runs-section")
-    blocks += [] if single and first["status"] in words.SETTLED else [endings]
+    blocks += [] if single and first_run["status"] in words.SETTLED else [endings]
     blocks += remarks([*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])])
 
     def sections() -> Iterable[Section]:
@@ -89,9 +89,9 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
         flagged_count = int((settled & (runs["flags"] != "")).sum())
-        beyond = f". {flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
-        rest = (beyond if flagged_count else ", all within every limit") if settled.any() else ""
-        return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
+        exceeding_words = f". {flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
+        limits_words = (exceeding_words if flagged_count else ", all within every limit") if settled.any() else ""
+        return f"{settled.sum()} of {len(settled)} runs have an operating point{limits_words}."
     if not settled[0]:
         return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
     readings = ", ".join(f"{c.label} {run_tables.reading_text(runs[c.column][0], c)} {c.unit}" for c in channels)
@@ -252,11 +252,11 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
     ]
     used_limits = run_tables.use_of_limits(limits, float(robot.motor.temperature_ambient))
     if PEAK in run and not math.isnan(peak := float(run[PEAK])):
-        most = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
+        inrush = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
         used_limits.append({
             "words": "largest current of the start, all motors", "value": f"{peak:.1f} A",
-            "limit": "not stated" if most is None else f"{most:.1f} A",
-            "percent": None if most is None else 100 * peak / most,
+            "limit": "not stated" if inrush is None else f"{inrush:.1f} A",
+            "percent": None if inrush is None else 100 * peak / inrush,
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
     return used_limits
@@ -266,8 +266,8 @@ def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
     """Largest current for all motors [A]: that of the driver, or of the battery minus other consumers. None: not
     stated.
     """
-    most, battery = float(robot.driver.current_limit), robot.battery
-    limits = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
+    driver_limit, battery = float(robot.driver.current_limit), robot.battery
+    limits = [float(robot.sides) * driver_limit] if driver_limit < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:
         limits.append(battery.current_limit - float(battery.current_other))
     return min(limits, default=None)

@@ -56,14 +56,14 @@ def sweep_answer(runs: Columns) -> str:
     settled = np.isin(runs["status"], words.SETTLED)
     is_flagged = settled & (runs["flags"] != "")
     verb = "has" if 1 in (total, settled.sum()) else "have"
-    first = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
+    first_words = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
     if not is_flagged.any():
-        return f"{first}, all within every limit." if settled.any() else f"{first}."
+        return f"{first_words}, all within every limit." if settled.any() else f"{first_words}."
     raised = Counter(flag for flags in runs["flags"][is_flagged] for flag in str(flags).split(";"))
-    most, times = raised.most_common(1)[0]
+    most_frequent, times = raised.most_common(1)[0]
     return (
-        f"{first}. {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit. Most "
-        f"often, {words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
+        f"{first_words}. {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit. Most "
+        f"often, {words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(times, 'run')})."
     )
 
 

@@ -62,11 +62,11 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
                     )
                 )
                 continue
-            first = _first(reader, topic)
-            stamped = any(field == _STAMP for field, _, _ in _message_fields(first, ""))
+            first_message = _first(reader, topic)
+            stamped = any(field == _STAMP for field, _, _ in _message_fields(first_message, ""))
             read = functools.cache(functools.partial(_topic_values, path, topic))
             clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", _column(read, ""), "ns")
-            for field, words, refused in _message_fields(first, ""):
+            for field, words, refused in _message_fields(first_message, ""):
                 if field != _STAMP:
                     place = f"{topic}.{field}"
                     signals.append(

@@ -71,7 +71,7 @@ def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
     """Signals of lists and dicts of lists, numbers and arrays.
 
     Raises:
-        BadData: nothing in it is a table.
+        BadData: the content has no table.
     """
     arrays: Json = {}
     _collect(content, "", arrays, name, 1)
@@ -112,12 +112,14 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
         if isinstance(value.get(key), int | float) and value[key] > 0
     ]
     for inner in value if steps else ():
-        below = f"{at}.{inner}." if at else f"{inner}."
-        columns = [path[len(below) :] for path in arrays if path.startswith(below)]
+        prefix = f"{at}.{inner}." if at else f"{inner}."
+        columns = [path[len(prefix) :] for path in arrays if path.startswith(prefix)]
         if RUN in columns and not any(unit_of_clock(column) is not None for column in columns):
-            runs = arrays[below + RUN]
-            first = np.maximum.accumulate(np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0))
-            arrays[f"{below}time_s"] = (np.arange(len(runs)) - first) * steps[0]
+            runs = arrays[prefix + RUN]
+            first_row_of_run = np.maximum.accumulate(
+                np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0)
+            )
+            arrays[f"{prefix}time_s"] = (np.arange(len(runs)) - first_row_of_run) * steps[0]
 
 
 def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
@@ -158,8 +160,8 @@ def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None
     """
     lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
     lengths = [{len(v) for v in episode.values()} for episode in lists]
-    flat = all(not isinstance(x, list | Mapping) for episode in lists for v in episode.values() for x in v[:1])
-    if not flat or any(
+    are_flat = all(not isinstance(x, list | Mapping) for episode in lists for v in episode.values() for x in v[:1])
+    if not are_flat or any(
         len(n) != 1 or max(n) < 2 or episode.keys() != lists[0].keys()
         for n, episode in zip(lengths, lists, strict=True)
     ):
@@ -209,6 +211,6 @@ def _join_tables(arrays: Columns) -> Columns:
     if len(shaped) < 2 or len(widths) > 1 or len(groups) > 1:
         return arrays
     (above,) = groups
-    rest = {path: v for path, v in arrays.items() if path not in shaped}
+    other_arrays = {path: v for path, v in arrays.items() if path not in shaped}
     runs = np.concatenate([np.full(len(v), path_parts(path)[-1]) for path, v in shaped.items()])
-    return rest | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}
+    return other_arrays | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}

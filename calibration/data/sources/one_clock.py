@@ -121,7 +121,7 @@ def signals_on_one_grid(
     order = {key: _sample_order(time) for key, time in times.items()}
     late = {key: int(np.count_nonzero(np.diff(times[key]) < 0)) for key, rows in order.items() if rows is not None}
     times = {key: time if order[key] is None else time[order[key]] for key, time in times.items()}
-    same = {key: next(k for k in times if np.array_equal(times[k], time)) for key, time in times.items()}
+    shared_clock = {key: next(k for k in times if np.array_equal(times[k], time)) for key, time in times.items()}
     for key, time in times.items():
         _check(name, clocks[key].name, time)
     measured = {id(s.clock) for column, s in chosen.items() if is_measured(column)}
@@ -142,9 +142,9 @@ def signals_on_one_grid(
     values: Columns = {}
     brought: dict[str, list[str]] = {}
     for column, signal in chosen.items():
-        signal_values, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
+        signal_values, key, sorted_by = signal.load(), shared_clock[id(signal.clock)], order[id(signal.clock)]
         signal_values = signal_values if sorted_by is None else signal_values[sorted_by]
-        if key == same[main]:
+        if key == shared_clock[main]:
             values[column] = signal_values[is_covered]
             continue
         on = rows[is_covered]
@@ -156,11 +156,13 @@ def signals_on_one_grid(
             brought.setdefault("interpolated", []).append(column)
     notes = []
     if brought:
-        how = {
+        resampling_words = {
             "held": "held from sample to sample",
             "interpolated": "interpolated linearly between samples, each used once",
         }
-        kind_sentences = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
+        kind_sentences = "; ".join(
+            f"{', '.join(columns)} {resampling_words[kind]}" for kind, columns in brought.items()
+        )
         notes.append(
             f"{name}: signals have different clocks. Rows are taken at the samples of {clocks[main].name} "
             f"({_rate(rows)}): {kind_sentences}"
@@ -190,13 +192,15 @@ def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -
         time, values: time and values of the samples, shape (samples,).
     """
     numbers = np.asarray(values, float)
-    sound = np.isfinite(numbers)
-    time, numbers = time[sound], numbers[sound]
+    is_finite = np.isfinite(numbers)
+    time, numbers = time[is_finite], numbers[is_finite]
     resampled = np.full(len(rows), np.nan)
     if not len(time) or not len(rows):
         return resampled
-    after = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
-    nearest = np.where(time - rows[after - 1] <= rows[np.minimum(after, len(rows) - 1)] - time, after - 1, after)
+    next_row = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
+    nearest = np.where(
+        time - rows[next_row - 1] <= rows[np.minimum(next_row, len(rows) - 1)] - time, next_row - 1, next_row
+    )
     nearest = np.minimum(nearest, len(rows) - 1)
     step = _step(rows)
     near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(step, 1e-9)])
@@ -227,8 +231,8 @@ def _rate(time: np.ndarray) -> str:
 def _check(name: str, clock: str, time: np.ndarray) -> None:
     if not len(time):
         raise BadData(f"{name}, {clock}: has no sample; expected time stamps")
-    if (back := np.flatnonzero(~(np.diff(time) >= 0))).size:
-        row = int(back[0])
+    if (rows_of_falls := np.flatnonzero(~(np.diff(time) >= 0))).size:
+        row = int(rows_of_falls[0])
         raise BadData(
             f"{name}, {clock}: goes back from {time[row]:g} to {time[row + 1]:g} s at sample {row + 2}; expected "
             "increasing time stamps; sort the recording, or give each part its own file"

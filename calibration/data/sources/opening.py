@@ -102,8 +102,8 @@ def split_source(source: str) -> tuple[Path, str]:
     """Path of a file, and path of signals in it (empty if not stated)."""
     if Path(source).exists():
         return Path(source), ""
-    file, _, within = source.partition(WITHIN)
-    return Path(file), within
+    file, _, signal_path = source.partition(WITHIN)
+    return Path(file), signal_path
 
 
 def files_of_group(source: str) -> list[Path]:

@@ -85,30 +85,30 @@ def _of_group(readings: Sequence[Reading], name: str) -> Reading:
     Raises:
         BadData: the files have different columns or units.
     """
-    first = readings[0].arrays
+    first_table = readings[0].arrays
     for other in readings[1:]:
-        if other.arrays.header != first.header or other.arrays.units != first.units:
-            differing = sorted({*first.header} ^ {*other.arrays.header})
+        if other.arrays.header != first_table.header or other.arrays.units != first_table.units:
+            differing = sorted({*first_table.header} ^ {*other.arrays.header})
             raise BadData(
-                f"{name}: {other.arrays.name} and {first.name} differ in "
+                f"{name}: {other.arrays.name} and {first_table.name} differ in "
                 f"{list_some(differing) if differing else 'the order or units of their columns'}; expected the same "
                 "columns in every file"
             )
-    values = [[r.arrays.values[k] for r in readings] for k in range(len(first.header))]
+    values = [[r.arrays.values[k] for r in readings] for k in range(len(first_table.header))]
     joined = [
         np.concatenate(parts)
         if all(isinstance(v, np.ndarray) for v in parts)
         else list(itertools.chain(*map(column_texts, parts)))
         for parts in values
     ]
-    header, units = first.header, first.units
+    header, units = first_table.header, first_table.units
     if RUN not in header:
         joined.append([Path(r.arrays.name).stem for r in readings for _ in range(len(r.arrays))])
         header, units = (*header, RUN), (*units, "") if units else ()
     digest = hashlib.sha256("".join(r.arrays.digest for r in readings).encode()).hexdigest()
     notes = tuple(dict.fromkeys(note for r in readings for note in r.arrays.notes))
     return Reading(
-        NamedArrays(name, header, tuple(joined), units, first.units_from, notes, digest), readings[0].mapped
+        NamedArrays(name, header, tuple(joined), units, first_table.units_from, notes, digest), readings[0].mapped
     )
 
 
@@ -326,7 +326,7 @@ def _on_a_grid(
     column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}
     read = {*layout.measured_columns, *layout.deviation_columns}
     over_time = {c: s for c, s in chosen.items() if s.clock is not None and column_of[c] not in TIME}
-    others = {c: s for c, s in chosen.items() if s.clock is None and column_of[c] not in TIME}
+    other_signals = {c: s for c, s in chosen.items() if s.clock is None and column_of[c] not in TIME}
     lines = {layout.imposed_column} if between == "linear" or layout.imposed_column == SPEED else set()
 
     def is_measured(column: str) -> bool:
@@ -338,7 +338,7 @@ def _on_a_grid(
     if not over_time:
         raise BadData(f"{source.name}: no signal has the name of a column; {_how_to_name(source)}")
     time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
-    return {"time_s": time, **values, **_in_rows(source, others, len(time))}, notes
+    return {"time_s": time, **values, **_in_rows(source, other_signals, len(time))}, notes
 
 
 def _how_to_name(source: Source) -> str:
@@ -355,8 +355,8 @@ def _raw_values(values: np.ndarray) -> Raw:
         return [str(value).strip() for value in values.tolist()]
     if values.dtype.kind == "M":  # dates are read as text, times count from the first one
         ticks, is_missing = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
-        first = ticks[~is_missing].min() if not is_missing.all() else 0
-        return np.where(is_missing, np.nan, (ticks - first) * 1e-9)
+        first_tick = ticks[~is_missing].min() if not is_missing.all() else 0
+        return np.where(is_missing, np.nan, (ticks - first_tick) * 1e-9)
     if values.dtype.kind == "m":
         return np.where(np.isnat(values), np.nan, values.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
     return values

@@ -160,13 +160,13 @@ def suggested_paths(name: str, paths: Sequence[str]) -> str:
 
 def unit_of_clock(name: str) -> str | None:
     """Unit in the name of a clock, empty if it states none, None if it is no name of a clock."""
-    bare = name.strip().casefold()
-    if bare in CLOCKS:
+    plain_name = name.strip().casefold()
+    if plain_name in CLOCKS:
         return ""
-    if bare in ("millis", "micros", "nanos"):
-        return {"millis": "ms", "micros": "us", "nanos": "ns"}[bare]
-    match = _UNIT_OF_CLOCK.search(bare)
-    if match and bare[: match.start()].rstrip("_ ") in CLOCKS:
+    if plain_name in ("millis", "micros", "nanos"):
+        return {"millis": "ms", "micros": "us", "nanos": "ns"}[plain_name]
+    match = _UNIT_OF_CLOCK.search(plain_name)
+    if match and plain_name[: match.start()].rstrip("_ ") in CLOCKS:
         unit = match.group(1)
         return _WORDS_OF_UNITS.get(unit, unit.replace("µ", "u"))
     return None
@@ -215,8 +215,8 @@ def signals_of_arrays(
 
 def parent_path(path: str) -> str:
     """Path without its last part."""
-    last = path_parts(path)[-1]
-    return path[: len(path) - len(last)] if path.endswith(last) else ""
+    last_part = path_parts(path)[-1]
+    return path[: len(path) - len(last_part)] if path.endswith(last_part) else ""
 
 
 def sample_count(shape: tuple[int, ...]) -> int:
@@ -287,10 +287,10 @@ class Source:
             BadData: there are none.
         """
         prefix_parts = path_parts(prefix)
-        inside = tuple(
+        signals_below = tuple(
             s for s in self.signals if path_parts(s.path)[: len(prefix_parts)] == prefix_parts or s.path == prefix
         )
-        if not inside:
+        if not signals_below:
             groups = dict.fromkeys(parent_path(s.path).rstrip("/.") or s.path for s in self.signals)
             raise BadData(f"{self.name}::{prefix}: no such signal; {suggested_paths(prefix, list(groups))}")
-        return dataclasses.replace(self, signals=inside)
+        return dataclasses.replace(self, signals=signals_below)

@@ -53,24 +53,25 @@ def signals_of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
         for k, title in enumerate(header):
             if title:
                 signals.append(_signal(body.iloc[:, k].infer_objects(), title, sheet, units[k] if units else ""))
-    alone = len(tables) == 1
+    is_only_sheet = len(tables) == 1
     return tuple(
-        dataclasses.replace(s, path=s.path.removeprefix(f"{next(iter(tables))}/")) if alone else s for s in signals
+        dataclasses.replace(s, path=s.path.removeprefix(f"{next(iter(tables))}/")) if is_only_sheet else s
+        for s in signals
     )
 
 
 def _cell_count(content: bytes) -> int:
     """Number of cells in the rectangle that a sheet's XML declares. Calamine allocates all of it."""
     places = [(_column_no(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
-    wide, tall = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
+    width, height = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
     if b"number-columns-repeated" in content or b"number-rows-repeated" in content:  # of .ods
         for row in re.findall(rb"<table:table-row.*?</table:table-row>", content, re.DOTALL):
             cells = [c for c in re.findall(rb"<table:table-cell[^>]*>", row) if b"value" in c]
             if cells:
                 rows, columns = (rb'number-%s-repeated="(\d+)"' % word for word in (b"rows", b"columns"))
-                tall += int((re.findall(rows, row) or [1])[0])
-                wide = max(wide, sum(int((re.findall(columns, cell) or [1])[0]) for cell in cells))
-    return wide * tall
+                height += int((re.findall(rows, row) or [1])[0])
+                width = max(width, sum(int((re.findall(columns, cell) or [1])[0]) for cell in cells))
+    return width * height
 
 
 def _column_no(column: bytes) -> int:

@@ -159,32 +159,32 @@ class SettledRuns(Observer):
         usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
             readings_there, sds = measured[rows], noise.sd[rows]
-            apart = np.abs(readings_there[:, None] - readings_there)
+            distance = np.abs(readings_there[:, None] - readings_there)
             mean = np.maximum(np.abs(readings_there[:, None] + readings_there) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
-            for at in np.argwhere(apart > allowed)[:1]:
-                (one, other, k), at = at.tolist(), tuple(at)
-                first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
+            for cell in np.argwhere(distance > allowed)[:1]:
+                (one, other, k), cell = cell.tolist(), tuple(cell)
+                first_row, second_row, column = int(rows[one]), int(rows[other]), runs.channels[k].column
                 in_sds = not (noise.estimated[k] or shared[k])
-                deviation = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
-                values = float(runs[column][first]), float(runs[column][second])
+                deviation = f"{distance[cell] / sd[cell]:.0f} sd" if in_sds else f"{distance[cell] / mean[cell]:.0%}"
+                values = float(runs[column][first_row]), float(runs[column][second_row])
                 without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
                 torque = [c for c in (LOAD,) if c != column and runs.has(c)]
                 cells = {**runs.extras, **runs.columns}
-                others = tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
-                near = runs.layout.nearest(others[0], runs.columns) if others else ""
+                other_columns = tuple(c for c in (*without, *torque) if cells[c][first_row] != cells[c][second_row])
+                near = runs.layout.nearest(other_columns[0], runs.columns) if other_columns else ""
                 remarks.append(
                     Remark(
                         "repeats",
                         source=runs.source,
-                        rows=(first + 1, second + 1),
+                        rows=(first_row + 1, second_row + 1),
                         column=column,
                         values=values,
                         apart=deviation,
-                        unused=others,
+                        unused=other_columns,
                         near=near,
                     )
                 )
@@ -284,10 +284,10 @@ class SettledRuns(Observer):
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
             return dataclasses.replace(robot, effects=(*robot.effects, *put))
 
-        wide = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
-        r, slopes, _, signals = problem.linearised(probed, wide, data)
+        z_and_probes = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
+        r, slopes, _, signals = problem.linearised(probed, z_and_probes, data)
         r, slopes = zero_inactive_residuals(r, slopes, adhesion_penalty_slice(data))
-        jacobian = jnp.concatenate([slopes, jnp.eye(size, wide.size)])
+        jacobian = jnp.concatenate([slopes, jnp.eye(size, z_and_probes.size)])
         residual = jnp.concatenate([r, z - data.centre])
         rows, count = data.measured.shape
         defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes), -1).transpose(2, 3, 0, 1)
@@ -297,8 +297,10 @@ class SettledRuns(Observer):
         scale = data.weight / data.sd
 
         def signature(effect: Effect) -> Array:
-            alone = dataclasses.replace(robot, effects=(effect,))
-            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(flat_signals)
+            robot_with_effect = dataclasses.replace(robot, effects=(effect,))
+            term = jax.vmap(lambda s: balances.effects_sum(robot_with_effect, s, effect.balance, effect.channel))(
+                flat_signals
+            )
             term = jnp.broadcast_to(term, flat_signals.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
                 term = term @ side_shares(effect.channel, term.shape[1])

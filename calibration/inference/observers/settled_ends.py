@@ -88,20 +88,20 @@ def settled_ends_of_runs(problem: Problem) -> SettledEnds:
     time = np.asarray(observe.time)
     stretches = [s for run in observe.stretches() for s in run]
     ends = [s for s in stretches if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or stretches[:1]
-    mean, error, shown = (np.full((len(ends), measured.shape[1]), np.nan) for _ in range(3))
+    mean, error, readings = (np.full((len(ends), measured.shape[1]), np.nan) for _ in range(3))
     for k, stretch in enumerate(ends):
         end = stretch.after(time, 1 - END) if stretch.driven else stretch.rows[:0]
         for c in range(measured.shape[1]):
             these = end[weight[end, c] > 0]
             if len(these) < FEWEST:
                 continue
-            shown[k, c] = measured[these, c].mean()
+            readings[k, c] = measured[these, c].mean()
             halves = np.array_split(measured[these, c], 2)
             change = abs(halves[1].mean() - halves[0].mean())
             noise = 2 * np.median(sd[these, c]) / np.sqrt(len(these))
-            size = abs(shown[k, c])
+            size = abs(readings[k, c])
             if change < max(CHANGE * size, CHANGE_SD * noise):
-                mean[k, c] = shown[k, c]
+                mean[k, c] = readings[k, c]
                 error[k, c] = max(noise / 2, FLOOR * size)
     conditions = observe.conditions
     if observe.varying:
@@ -115,7 +115,7 @@ def settled_ends_of_runs(problem: Problem) -> SettledEnds:
         duty=jnp.where(driven, conditions.duty, 1.0),
         open=jnp.where(driven, conditions.open, 0.0),
     )
-    return SettledEnds(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
+    return SettledEnds(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), readings)
 
 
 def starts_from_settled_ends(
@@ -150,7 +150,7 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
 
     μ_s, V_s and V_d have their nominal ratios to μ_d and to each other, in one configuration or in all.
     """
-    c, out, parameters = problem.coordinates, [], z.copy()
+    c, points, parameters = problem.coordinates, [], z.copy()
     value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
     for name in problem.base.configurations:
         names = [f"{name}.{x}" for x in (*GRIP, *SLIDING)]
@@ -160,10 +160,10 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
         rise = value[dynamic] / nominal[dynamic] * nominal[static] / value[static]
         new = {static: value[static] * rise, creep: value[creep] * rise}
         new |= {k: new[creep] * nominal[k] / nominal[creep] for k in sliding}
-        out.append(z.copy())
+        points.append(z.copy())
         for k, x in new.items():
-            out[-1][k] = parameters[k] = _coordinate_of_value(problem, k, x)
-    return np.stack([*out, parameters])
+            points[-1][k] = parameters[k] = _coordinate_of_value(problem, k, x)
+    return np.stack([*points, parameters])
 
 
 def _distinct_points(points: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
 
     Dynamic friction values keep their nominal ratio to static ones.
     """
-    out = []
+    points = []
     for z in draws:
         z = z.copy()
         for k, name in enumerate(problem.coordinates.names):
@@ -204,8 +204,8 @@ def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
                 if name.endswith(suffix):
                     share = ndtr(z[k])
                     z[k] = _coordinate_of_value(problem, k, low * (high / low) ** share)
-        out.append(_with_friction_slope(problem, z, 1.0))
-    return np.stack(out)
+        points.append(_with_friction_slope(problem, z, 1.0))
+    return np.stack(points)
 
 
 def _coordinate_of_value(problem: Problem, k: int, value: float) -> float:
@@ -272,9 +272,9 @@ def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.nd
             if name.endswith(follower) and (base_name := name.removesuffix(follower) + leader) in c.names:
                 j = c.names.index(base_name)
                 value[k] = nominal[k] * value[j] / nominal[j]
-    inside = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
+    coordinate = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
     changed = value != c.value(np.asarray(z))
-    return np.where(changed, (inside - np.asarray(c.location)) / np.asarray(c.spread), z)
+    return np.where(changed, (coordinate - np.asarray(c.location)) / np.asarray(c.spread), z)
 
 
 @compiled
@@ -290,9 +290,9 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])
-    first = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
+    first_misfits = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
     with Threads(CORES) as cores:
-        misfits = [first, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
+        misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
     by_row = np.sum(np.concatenate([np.asarray(x) for x in misfits])[: len(points)] ** 2, 2)
     by_run = np.zeros((len(points), len(observe.rows_of)))
     np.add.at(by_run.T, np.asarray(observe.run), by_row.T)

@@ -636,11 +636,15 @@ class Histories(Observer):
         """
         residual, rows, total = off(), np.asarray(self.rows_of), 0.0
         first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
-        within = (first >= 0) & (second >= 0)
+        has_both = (first >= 0) & (second >= 0)
         for k in range(residual.shape[1]):
-            is_compared = within & counts[first, k] & counts[second, k]
-            apart = np.abs(residual[second[is_compared], k] - residual[first[is_compared], k])
-            usual = apart[apart <= JUMP * np.median(apart)] if len(apart) else np.zeros(1)
+            is_compared = has_both & counts[first, k] & counts[second, k]
+            residual_difference = np.abs(residual[second[is_compared], k] - residual[first[is_compared], k])
+            usual = (
+                residual_difference[residual_difference <= JUMP * np.median(residual_difference)]
+                if len(residual_difference)
+                else np.zeros(1)
+            )
             total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
         return float(total)
 
@@ -967,14 +971,14 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
             if channel.zero_at_rest and field not in state and len(finite):
                 configuration = int(rows[run_rows[0]])
                 radius = float(robot.configurations.members[configuration].radius)
-                none, one = jnp.zeros(()), jnp.ones(())
-                rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
+                zero, one = jnp.zeros(()), jnp.ones(())
+                rolling = State(zero, one, radius / robot.gearbox.ratio, zero, distance=radius)
                 factor = 1 / float(
                     channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling))
                 )
                 value, sd = _value_at_zero(runs["time_s"][finite] - runs["time_s"][run_rows[0]], measured[finite, k])
-                least = float(np.median(noise.sd[finite, k]))
-                state[field] = factor * value, abs(factor) * max(sd, least)
+                usual_sd = float(np.median(noise.sd[finite, k]))
+                state[field] = factor * value, abs(factor) * max(sd, usual_sd)
         begins[key] = RunStart(**{field: value for field, (value, _) in state.items()})
         state_priors += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
     priors = (*robot.rig.priors, *state_priors) if robot.rig.start == "free" else robot.rig.priors
@@ -1030,11 +1034,13 @@ def _check_signs(runs: Runs) -> None:
 
 def _undriven_remarks(runs: Runs) -> list[Remark | str]:
     """Remark on runs on a slope whose motors are not driven."""
-    still = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
-    if not still.any():
+    is_undriven = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
+    if not is_undriven.any():
         return []
     return [
-        Remark("stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[still])))
+        Remark(
+            "stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[is_undriven]))
+        )
     ]
 
 
@@ -1124,20 +1130,20 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     for name in np.unique(runs.run_names):
         rows = whole_log.in_order(name)
         time = whole_log["time_s"][rows]
-        apart, wait = np.diff(time), _usual_interval(np.diff(runs["time_s"][runs.in_order(name)]))
+        row_steps, wait = np.diff(time), _usual_interval(np.diff(runs["time_s"][runs.in_order(name)]))
         both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
-        longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
+        longest = np.full(len(row_steps), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
             begins = np.where(_drive_changes(whole_log, rows, SMALL), np.arange(len(rows)), 0)
-            since = time - time[np.maximum.accumulate(begins)]
-            longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
+            time_in_run = time - time[np.maximum.accumulate(begins)]
+            longest = np.maximum(longest, np.minimum(LATER * time_in_run[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
             slow = _may_pass_rest(speeds, SLOW[rig.imposed])
-            before = int(np.ceil(early / _usual_interval(apart)))
+            before = int(np.ceil(early / _usual_interval(row_steps)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
         if elastic > 0:
@@ -1155,8 +1161,8 @@ def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-        far = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
-    ways = np.where(far, np.sign(speeds), 0.0)
+        is_moving = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
+    ways = np.where(is_moving, np.sign(speeds), 0.0)
     return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 
@@ -1459,9 +1465,11 @@ def _memory_along_run(
             return memory + span * speed / (1 - span * slope)
 
         first = solve_next_stage(memory, spans[0], state_there.places[0], state_there.sides[0])
-        ahead = jnp.where(passes, 1.0, spans[1] / jnp.where(spans[0] > 0, spans[0], 1.0))
+        step_ratio = jnp.where(passes, 1.0, spans[1] / jnp.where(spans[0] > 0, spans[0], 1.0))
         span = jnp.where(passes, spans[1], spans[0])
-        last = solve_next_stage(memory + ahead * (first - memory), span, state_there.places[1], state_there.sides[1])
+        last = solve_next_stage(
+            memory + step_ratio * (first - memory), span, state_there.places[1], state_there.sides[1]
+        )
         return last, jnp.stack([first, last])
 
     begin = first_conditions_and_state(robot, conditions)[1]

@@ -93,9 +93,11 @@ class SettledTurns(SettledRuns):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledTurns:
-        first = fidelities.NAMES[0]
-        if fidelity not in (None, first):
-            raise BadConfiguration(f"{runs.source}: settled turns are fitted with --model {first}; got {fidelity}")
+        default_model = fidelities.NAMES[0]
+        if fidelity not in (None, default_model):
+            raise BadConfiguration(
+                f"{runs.source}: settled turns are fitted with --model {default_model}; got {fidelity}"
+            )
         observer = super().of(runs, robot, fidelity)
         return cls(observer.conditions, observer.fidelity)
 

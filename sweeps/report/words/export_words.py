@@ -233,7 +233,7 @@ def escape_markdown(text: str) -> str:
 def law_text(found: Export) -> str:
     """Text of LAW.md."""
     drive, compared = found.joint, found.comparison
-    about = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
+    law_values = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     constants = "\n".join(
         f"| `{escape_markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
@@ -262,7 +262,7 @@ obtained the parameters of this drive from measurements or data sheets, and expo
 The joint is the driven wheel or output shaft.
 
 ## How to use it
-{USE[found.format].format(**about)}{command_sentence(found)}
+{USE[found.format].format(**law_values)}{command_sentence(found)}
 
 ## Equations
 {bullets(law_equations(found))}

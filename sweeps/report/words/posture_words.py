@@ -103,18 +103,24 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
         "overall_length_mm": millimetres * limits.length,
         "overall_height_mm": millimetres * limits.height,
     }
-    first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
-    level = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
-    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first, ANGLES, ANGLES))
+    first_conditions, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
+    level = Drawn(side, float(rests.height[0]), 0.0, float(first_conditions.slope))
+    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first_conditions, ANGLES, ANGLES))
     front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
     best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
-    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first))
+    lever_degrees = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first_conditions))
     return Postures(
         table,
         level,
         _on_step(step),
         StepMap(
-            ANGLES, found.height / MM, margin / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1])
+            ANGLES,
+            found.height / MM,
+            margin / MM,
+            best,
+            float(ANGLES[front]),
+            float(ANGLES[rear]),
+            (lever_degrees[0], lever_degrees[1]),
         ),
     )
 
@@ -124,7 +130,7 @@ def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dic
 
     On a step it is the best posture, over a gap the levers are flush with the belt, and for the size they are folded.
     """
-    found: dict[str, tuple[Drawn, float, float]] = {}
+    postures: dict[str, tuple[Drawn, float, float]] = {}
     for outcome in outcomes:
         name = outcome.requirement.name
         if name not in ("step_mm", "gap_mm", "length_mm"):
@@ -140,8 +146,8 @@ def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dic
             stands = static_limits.with_lever_angles(conditions, front, rear)
             rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
             drawn = Drawn(jax.device_get(side.with_pitch(rests.pitch)), float(rests.height), 0.0)
-        found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
-    return found
+        postures[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
+    return postures
 
 
 def _on_step(found: static_limits.StepLimit) -> Drawn:
@@ -174,12 +180,12 @@ def posture_table(found: Postures, names: Sequence[str]) -> Table:
 
 def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
-    one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
+    run, highest = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
-        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}. It tips "
-        f"on slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
-        f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm "
-        f"and gaps up to {one['widest_gap_mm']:.0f} mm. The highest step in any posture is {most:.0f} mm (front "
+        f"posture: pitch {run['pitch_deg']:z.1f}°, on {run['contact_mm']:.0f} mm, carried by {run['bears']}. It tips "
+        f"on slopes of {run['tips_back_deg']:.1f}° uphill, {run['tips_forward_deg']:.1f}° downhill, "
+        f"{run['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {run['highest_step_mm']:.0f} mm "
+        f"and gaps up to {run['widest_gap_mm']:.0f} mm. The highest step in any posture is {highest:.0f} mm (front "
         f"{found.over.front_deg:g}°, rear {found.over.rear_deg:g}°)"
     )
 

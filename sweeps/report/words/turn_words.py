@@ -60,14 +60,16 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     known = np.isfinite(speeds) & np.isfinite(rates)
     if not known.any():
         return "and no turn settles even at the full supply voltage"
-    ahead, round_ = np.abs(speeds[known]), np.abs(rates[known])
-    most_rate = np.interp(abs(speed), ahead[::-1], round_[::-1], right=math.nan)
-    most_speed = np.interp(abs(rate), round_, ahead, right=math.nan)
+    straight_speeds, round_ = np.abs(speeds[known]), np.abs(rates[known])
+    most_rate = np.interp(abs(speed), straight_speeds[::-1], round_[::-1], right=math.nan)
+    most_speed = np.interp(abs(rate), round_, straight_speeds, right=math.nan)
     if most_rate >= abs(rate):
         return "which would be enough. If friction falls with sliding speed, there may be no settled turn"
     told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
     told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
-    told += [f"no more than {ahead.max():.3g} m/s in straight travel"] if not math.isfinite(most_rate) else []
+    told += (
+        [f"no more than {straight_speeds.max():.3g} m/s in straight travel"] if not math.isfinite(most_rate) else []
+    )
     told += (
         [f"no more than {round_.max():.3g} rad/s when turning on the spot"] if not math.isfinite(most_speed) else []
     )
@@ -124,9 +126,9 @@ def _moves(row: Json) -> str:
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
         return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
-    back = "backward " if speed < 0 else ""
+    backward = "backward " if speed < 0 else ""
     return (
-        f"Turns {back}to the {_way(row)} on a circle of {abs(radius):.0f} mm radius, at {abs(speed):.0f} mm/s "
+        f"Turns {backward}to the {_way(row)} on a circle of {abs(radius):.0f} mm radius, at {abs(speed):.0f} mm/s "
         f"and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
     )
 
@@ -134,16 +136,16 @@ def _moves(row: Json) -> str:
 def turn_notes(robot: Robot, row: Json) -> list[str]:
     """Remarks on a turn: effective width, motors that stand or are driven, and exceeded limits."""
     notes = []
-    own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
+    true_width = float(robot.configurations[str(row["configuration"])].turning.width) / MM
     width = float(row["effective_width_mm"])
     if math.isfinite(width) and not _sloping(row) and row["status"] == "converged":
         notes.append(
-            f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: "
-            "the speed difference that the turn needs, relative to the difference without sliding"
+            f"effective track width {width:.0f} mm, {width / true_width:.2f} times the {true_width:.0f} mm between "
+            "the sides: the speed difference that the turn needs, relative to the difference without sliding"
         )
-    if robot.rig.inherits and not BETWEEN <= own * MM <= OVER:
+    if robot.rig.inherits and not BETWEEN <= true_width * MM <= OVER:
         notes.append(
-            f"{own:.0f} mm between the sides is outside the range of the packaged robot's parts, "
+            f"{true_width:.0f} mm between the sides is outside the range of the packaged robot's parts, "
             f"{BETWEEN / MM:.0f} to {OVER / MM:.0f} mm"
         )
     for side in SIDES:
@@ -152,8 +154,8 @@ def turn_notes(robot: Robot, row: Json) -> list[str]:
         if abs(turning) < STANDS:
             notes.append(f"the {side} motor is stalled at {abs(current):.2f} A")
         elif turning * current < 0:
-            back = f", {-power:.1f} W go back to the supply" if power < 0 else ""
-            notes.append(f"the {side} motor is driven by the turn and braked with {abs(current):.2f} A{back}")
+            returned = f", {-power:.1f} W go back to the supply" if power < 0 else ""
+            notes.append(f"the {side} motor is driven by the turn and braked with {abs(current):.2f} A{returned}")
     if float(row["power_supply_W"]) < 0:
         notes.append("the supply has to absorb power")
     notes += [f"{flag}: {words.FLAGS[flag]}" for flag in str(row["flags"]).split(";") if flag]
