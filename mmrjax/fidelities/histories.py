@@ -258,7 +258,7 @@ def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ru
     """
     changing, constant = _split_conditions(conditions)
     now = jax.tree.map(lambda x: x[:-1], changing)
-    if now.motor_speed is not None and now.motor_acceleration is not None:
+    if changing.motor_speed is not None and now.motor_acceleration is not None:
         now = eqx.tree_at(lambda c: c.motor_acceleration, now, _slopes(changing.motor_speed, times))
     jumped = jnp.zeros(len(times) - 1, bool)
     for x in (getattr(now, name) for name in DRIVING):

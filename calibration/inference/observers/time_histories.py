@@ -918,7 +918,7 @@ def _conditions_over_time(
     speed = _interpolate_at_instants(every, each, time, times)
     # Rows are samples of a smooth motion. Slopes of the lines from row to row were those of half a row later.
     gradient = [
-        np.gradient(every[rows], time[rows], edge_order=min(len(rows) - 1, 2)) if len(rows) > 1 else np.zeros(1)
+        np.gradient(every[rows], time[rows], edge_order=2 if len(rows) > 2 else 1) if len(rows) > 1 else np.zeros(1)
         for rows in each
     ]
     slope = np.stack([np.interp(t, time[rows], x) for rows, x, t in zip(each, gradient, times, strict=True)])
