@@ -69,3 +69,5 @@ def test_the_answer_states_a_value_that_may_be_wrong_before_the_effect_that_imit
 def test_a_parameter_that_moved_is_stated_with_its_ratio():
     said = loop_words.moved_parameter("motor.friction_viscous", 1.2e-5, 4e-6, "N·m·s", 2.3)
     assert said == "`motor.friction_viscous` is 1.2e-05 N·m·s, 3 times the stated value 4e-06 (+2.3 prior sds)"
+    of_zero = loop_words.moved_parameter("motor.friction_viscous", 4e-3, 0.0, "N·m·s", 4.1)
+    assert of_zero == "`motor.friction_viscous` is 0.004 N·m·s, stated value 0 (+4.1 prior sds)"

@@ -36,6 +36,7 @@ def test_coordinates_start_at_the_nominal_robot(every, robot_with_effects):
     sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk_parameters(robot_with_effects)])
     assert np.all(np.abs(value - nominal)[~on_bound] <= 1e-5 * sd[~on_bound])  # nearest bound: half an sd
     assert np.all((value[on_bound] > 0) & (value[on_bound] < 0.01))  # their nominal value is their bound
+    assert_allclose(every.stated, nominal, rtol=1e-12, atol=0)
 
 
 def test_coordinates_never_leave_the_bounds_and_never_die(every, robot_with_effects):

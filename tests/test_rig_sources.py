@@ -134,7 +134,7 @@ def test_losses_that_a_model_leaves_at_0_are_free_up_to_a_share_of_the_stall_tor
 def test_losses_of_a_model_without_motor_constants_keep_the_lines_of_the_template(tmp_path):
     (tmp_path / "free.xml").write_text(BARE)
     text = rig_new.new_rig_text(None, tmp_path / "free.xml", "left", None)
-    assert '# loss_viscous = "0.001 ± 100 %"' in text and "held at 0" in text
+    assert '# loss_viscous = "0.001 ± 100 %"' in text and "Not stated: 0. " in text
     assert "rover.track.loss_viscous" not in values(text, tmp_path)[1]
 
 

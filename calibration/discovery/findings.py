@@ -249,7 +249,7 @@ def parameter_shifts(
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
-    value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
+    value = [coordinates.stated, *(coordinates.value(x) for x in z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
     fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])

@@ -65,7 +65,6 @@ def parameter_estimates(
     point, sd = np.asarray(z), np.asarray(about.sd)
     value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
-    median = coordinates.value(np.zeros_like(point))
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
@@ -91,7 +90,7 @@ def parameter_estimates(
             meaning=fields[name].spec.meaning,
             prior=PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
-                float(median[k]),
+                float(coordinates.stated[k]),
                 _float_pair(wide[k]),
                 sources.get(name, fields[name].spec.source),
             ),

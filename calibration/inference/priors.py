@@ -132,14 +132,19 @@ class Coordinates(eqx.Module):
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     @property
+    def stated(self) -> np.ndarray:
+        """Stated value of each parameter [SI]. `value` at 0 differs from it within `SOFTNESS` of a bound."""
+        location = np.asarray(self.location)
+        return np.where(self.scale, np.exp(np.where(self.scale, location, 0.0)), location)
+
+    @property
     def prior_sd(self) -> np.ndarray:
         """Prior sd of each parameter [SI], as written in files.
 
         For a log-normal prior with median m it is m √(e^s² - 1), as for "m ± sd" in a file.
         """
         arrays = jax.tree.map(np.asarray, self)
-        size = np.exp(np.where(arrays.scale, arrays.location, 0.0))
-        return np.where(arrays.scale, size * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
+        return np.where(arrays.scale, self.stated * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Derivative dθ/dz [SI]."""
@@ -284,7 +289,7 @@ def loop_parameter_names(
         if c in present
         for name in (
             *friction_names(robot, c),
-            *_radius_name(robot, c),
+            *([f"{c}.radius"] if robot.shows_travel else []),
             *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
         )
     ]
@@ -316,11 +321,6 @@ def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
     """True if a load has a parameter of this name that is not zero."""
     field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0
-
-
-def _radius_name(robot: Robot, configuration: str) -> Names:
-    """Name of a configuration's radius, unless no channel shows the travel of its shaft."""
-    return (f"{configuration}.radius",) if robot.shows_travel else ()
 
 
 #: Parameters of the drive that act only on the voltage.

@@ -71,8 +71,9 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
         yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement, more=fits)
     elif changes:
         name, change = next(iter(changes.items()))
-        size = next(loop_words.effect_amplitude(e) for e in found.effects if e.name == name)
-        yield catalogue.figure("loop.law", found, table, {name: change}, words=(name, size))
+        effect = next(e for e in found.effects if e.name == name)
+        law = ", or ".join(effect.families), name, loop_words.effect_amplitude(effect)
+        yield catalogue.figure("loop.law", found, table, {name: change}, words=law)
     elif found.unnamed is not None:
         yield _curve(found)
     else:
@@ -338,10 +339,9 @@ def _sections(
     yield Section("Errors on runs used in the fit, and on held-out runs", tuple(error_blocks))
     yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
-    hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
-    yield Section("", hidden, folded="how thresholds were determined, and which effects are similar")
+    yield Section("", (catalogue.figure("loop.look_alikes", found),), folded="which effects are similar")
     yield from [looked_for] if missing else []
-    yield Section("Parameters before and after", (catalogue.figure("loop.base_shift", found), _base(found)))
+    yield Section("Parameters before and after", (_base(found),))
     first = {"row": table["row"]}
     if isinstance(found.detail, TimeStatistics):
         first |= {"run": table.get("run_id", table["row"]), "t [s]": table["time_s"]}
