@@ -120,26 +120,6 @@ def test_logs_of_about_one_length_share_what_is_compiled():
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_log_is_reproducible_and_its_effect_has_its_strength():
-    rig = logs.rig(np.random.default_rng(7), "voltage", 0.005)
-    clean, again = (logs.case(rig, "", 0.0, 4).table for _ in range(2))
-    assert all((clean[n] == again[n]).all() for n in clean)
-    one = logs.case(rig, "series_resistance", 9.0, 4)
-    assert one.label["effects"][0]["class"] == "series_resistance"
-    assert len(one.table["time_s"]) == logs.RUNS * logs.ROWS
-    y, base, (change,) = logs.slopes(rig, rig.p, (), [one.terms])
-    left = remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))
-    assert np.linalg.norm(left) == pytest.approx(9.0, rel=0.1)
-    assert np.sqrt(np.mean((one.measured - y - change) ** 2)) == pytest.approx(1.0, abs=0.05)
-    # A resistor before a winding is more of its resistance: a refit leaves what that one's tolerance says.
-    taken_up = one.terms[0].amplitude / rig.p["resistance"]
-    assert one.label["effects"][0]["sigmas"] == pytest.approx(
-        np.log1p(taken_up) / logs.RELATIVE["resistance"], rel=0.1
-    )
-
-
 def test_an_effect_of_a_servo_is_sized_by_two_simulations(monkeypatch):
     """A search for the amplitude took a simulation for each of its steps."""
     monkeypatch.setattr(logs, "ROWS", 60)
