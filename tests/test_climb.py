@@ -200,7 +200,6 @@ def ended(step):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
     for step in STEPS:
         found = ended(step)
@@ -495,7 +494,6 @@ def nose_up():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     """Slow, on a ground that holds. A robot that leans on a step with its rear levers flush gets over where the centre
     of mass comes over the edge: under the tips of grousers at the least, between two of them at the most."""

@@ -157,7 +157,6 @@ def test_the_inrush_recovers_in_time_and_a_longer_stay_below_does_not(robot, fol
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     """By four parameters at once: the implicit function theorem at the event, through heat and charge."""
     names = ("battery.resistance", "battery.voltage_full", "motor.resistance", "6T2A.mass")

@@ -345,7 +345,6 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     """With the noise that is estimated of them the rows pull static friction down to the margin. From just inside of
     it nothing shows the penalty."""

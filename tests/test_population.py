@@ -327,7 +327,6 @@ def test_options_of_a_population_that_cannot_be_are_refused(options, says):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_running_gear_is_found_through_the_track_model(tmp_path):
     """Readings of a shaking gear. The population comes near its slip, which the flush gear does not."""
     table = records.read_runs("measured")

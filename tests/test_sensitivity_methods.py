@@ -101,7 +101,6 @@ def test_size_covers_the_evaluations_that_are_asked_for():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [8, 128])
 def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
     held = np.zeros((2, 3))
@@ -114,7 +113,6 @@ def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_sobol_intervals_cover_those_of_the_steady_model_in_scipy():
     from sensitivity import coverage
 

@@ -164,7 +164,6 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_truth_of_a_second_implementation_is_found(robot, of_world):
     found = calibrate(of_world, robot, noise=NOISE)
     assert found.converged and found.adequacy.p_value > 0.01

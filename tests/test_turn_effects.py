@@ -133,7 +133,6 @@ def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_p
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_sides_that_are_not_alike_are_found(tmp_path):
     """A table of a robot whose left side rubs more, calibrated with that effect's amplitude free."""
     true = with_amplitudes(paper_robots.nominal(), {"side_friction": jnp.asarray(0.0025)})

@@ -318,7 +318,6 @@ def test_conditions_that_change_between_many_levels_are_few(observer, runs):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_loop_finds_what_was_not_declared_on_a_stair(engine):
     stairs = engine({**NOMINAL, f"effects.{UNDECLARED}.amplitude": 0.4}, ("stair", "reversal"))
     analyst = Analyst(

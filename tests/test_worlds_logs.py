@@ -50,7 +50,6 @@ def shown(tmp_path, case, terms=()):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("imposed", logs.IMPOSED)
 def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
     rig = logs.rig(np.random.default_rng([3, logs.IMPOSED.index(imposed)]), imposed)
