@@ -72,7 +72,7 @@ docs: $(READY)
 	@echo "open site/index.html"
 
 # The pictures of the docs and the tutorial about the loop, from runs of today; needs chromium. RECORDS is a folder with
-# records of others that are not packaged: drivetrain/log.csv and rig.toml of docs/howto/public-records.md.
+# records of others that are not packaged: drivetrain/log.csv and rig.toml, emps/train.csv (docs/howto/public-records.md).
 RECORDS ?=
 gallery: $(TOOLS)
 	$(BIN)/mmrjax loop measured --out runs/gallery/loop --force
@@ -84,7 +84,7 @@ gallery: $(TOOLS)
 	$(BIN)/mmrjax sensitivity --outputs total_current,slip --out runs/gallery/sensitivity --force
 	$(BIN)/mmrjax loop docs/rigs/public/neo_dyno.csv --robot docs/rigs/public/neo_dyno.toml --out runs/gallery/neo_dyno --force
 	$(BIN)/mmrjax loop docs/rigs/public/odrive.csv --robot docs/rigs/public/odrive.toml --out runs/gallery/odrive --force
-	$(if $(RECORDS),$(BIN)/mmrjax calibrate $(RECORDS)/emps/train.csv --robot docs/rigs/public/emps.toml --out runs/gallery/emps --force)
+	$(if $(RECORDS),$(BIN)/mmrjax calibrate $(RECORDS)/emps/train.csv --robot docs/rigs/public/emps_by_direction.toml --out runs/gallery/emps --force)
 	$(if $(RECORDS),$(BIN)/mmrjax calibrate $(RECORDS)/drivetrain/log.csv --robot $(RECORDS)/drivetrain/rig.toml --feedforward simple --out runs/gallery/drivetrain --force)
 	$(BIN)/python docs/site.py runs/gallery/loop
 	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity neo_dyno odrive $(if $(RECORDS),drivetrain emps),$(page)=runs/gallery/$(page))

@@ -690,6 +690,13 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     assert abs(data.joint("wheel").qpos[0]) > 0.1  # the key frame turns the output at once
 
 
+def test_a_key_frame_of_runs_in_both_directions_moves():
+    """It was at the mean of all commands, which is rest."""
+    command, load = np.array([-24.0, -12.0, 12.0, 24.0, 6.0]), np.array([-2.0, -1.0, 1.0, 2.0, 0.5])
+    chosen, torque = formats.middle_run(command, load)
+    assert abs(chosen) == 12.0 and torque == chosen / 12
+
+
 def test_command_that_is_refused_leaves_nothing(mmrjax, rig):
     code, _, error = mmrjax("export", rig, "--to", "mujoco", "--configuration", "leg", "--out", "out")
     assert code == 2 and error.startswith("mmrjax: --configuration: got leg; the robot has no such configuration")

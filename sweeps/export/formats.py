@@ -115,6 +115,12 @@ def notes_for_file_head(runs: ComparisonRuns) -> list[str]:
     ]
 
 
+def middle_run(command: np.ndarray, load: np.ndarray) -> tuple[float, float]:
+    """Command and load of the run with the median magnitude of the command. The mean of a symmetric grid is rest."""
+    row = int(np.argsort(np.abs(command))[len(command) // 2])
+    return float(command[row]), float(load[row])
+
+
 def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive = begun.joint
     normal = float(np.mean(np.asarray(runs.signals.normal)))
@@ -129,7 +135,7 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
     notes = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
-    middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
+    middle = middle_run(runs.command, runs.load)
     follows_angle = drive.robot.rig.imposed == "goal_angle"
 
     def texts_of(drive: DriveJoint) -> dict[str, str]:

@@ -93,7 +93,7 @@ def draw_profile_likelihoods(found: CalibrationResult) -> Figure:
 def draw_correlations(found: CalibrationResult) -> Figure:
     """Posterior correlation of every pair of parameters, and the singular values."""
     names = [short_name(n) for n in found.identifiability.names]
-    fig, grid = new_figure(1, 2, 1.6 + 0.36 * len(names), width_ratios=[1.7, 1.0])
+    fig, grid = new_figure(1, 2, 1.6 + 0.36 * max(len(names), 5), width_ratios=[1.7, 1.0])
     left, right = grid[0]
     c = found.identifiability.correlation
     image = left.imshow(c, cmap=matplotlib.colormaps["RdBu_r"], vmin=-1, vmax=1)
@@ -111,7 +111,7 @@ def draw_correlations(found: CalibrationResult) -> Figure:
     right.axhline(1.0, color=ORANGE, lw=1)
     right.text(len(s), 1.1, "below: known from the prior", fontsize=8.5, ha="right", va="bottom")
     right.set_xticks(np.arange(1, len(s) + 1, 2))
-    right.set(xlabel="direction", ylabel="singular value (prior sd / data sd)")
+    right.set(xlabel="direction", ylabel="prior sd / data sd")
     right.set_title("combinations of parameters")
     return fig
 

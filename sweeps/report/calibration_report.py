@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
+from calibration.described import as_paragraph
 from calibration.inference import blocks
 from calibration.inference.feedforward import Feedforward
 from calibration.inference.identifiability import HELD
@@ -19,6 +20,9 @@ from mmrjax.errors import count_noun
 from sweeps.pages import words
 from sweeps.report import catalogue, feedforward_report, fit_tables, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
+
+#: Prefixes of simulated readings of a log, and their names.
+LINES = {"after_": "calibrated", "before_": "before"}
 
 
 def calibration_document(
@@ -32,7 +36,9 @@ def calibration_document(
         "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
         chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
     )  # fmt: skip
-    search = Note(f"{found.starts.statement()}.", "" if found.converged else "warn", "search", terminal=True)
+    search = Note(
+        as_paragraph([found.starts.statement()]), "" if found.converged else "warn", "search", terminal=True
+    )
     rms = [fit_tables.rms_table(found.rms, found.channels)] if sized else []
     answer = fit_words.calibration_answer(found)
     before_after = catalogue.figure("calibration.before_after", found, finding=answer, words=(OF_SIZE,))
@@ -43,6 +49,7 @@ def calibration_document(
         answer,
         (
             Note(f"{found.adequacy.statement}.", "lead", "adequate", terminal=True),
+            *([catalogue.figure("fit.overlay", table, found.channels, LINES, finding=answer)] if found.axis else []),
             _parameters(found),
             _errors(found),
             *rms,
@@ -103,24 +110,21 @@ def _shifts(found: CalibrationResult) -> Iterable[Block]:
 
 
 def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
-    """Sections: histories over time, simulated against measured readings, residuals over each condition."""
-    table = found.rows()
-    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
-    answer, panels = fit_words.calibration_answer(found), found.channels
+    """Sections: frequency response of a log, simulated against measured readings, residuals over each condition."""
+    table, panels = found.rows(), found.channels
+    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in panels}
     if found.axis:
-        lines = {"after_": "calibrated", "before_": "before"}
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
-        overlay = catalogue.figure("fit.overlay", table, panels, lines, finding=answer)
-        yield Section("Histories", (overlay, *fit_tables.frequency_response(runs, panels, lines)))
+        for figure in fit_tables.frequency_response(runs, panels, LINES):
+            yield Section("Frequency response", (figure,))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
         catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
-    yield from (
-        Section(h, (f,)) for h, f in zip(("Parity", "Residuals against every condition"), figures, strict=True)
-    )
+    headings = "Parity", "Residuals against every condition"
+    yield from (Section(heading, (figure,)) for heading, figure in zip(headings, figures, strict=True))
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:

@@ -71,8 +71,9 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
         yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement, more=fits)
     elif changes:
         name, change = next(iter(changes.items()))
-        size = next(loop_words.effect_amplitude(e) for e in found.effects if e.name == name)
-        yield catalogue.figure("loop.law", found, table, {name: change}, words=(name, size))
+        effect = next(e for e in found.effects if e.name == name)
+        law = ", or ".join(effect.families), name, loop_words.effect_amplitude(effect)
+        yield catalogue.figure("loop.law", found, table, {name: change}, words=law)
     elif found.unnamed is not None:
         yield _curve(found)
     else:
