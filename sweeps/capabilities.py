@@ -30,11 +30,6 @@ OF_TRAVEL = (
 RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
 
 
-def _parameters_of_bare_rig(robot: Robot) -> dict[str, float]:
-    """Parameters of a rig whose file describes only its loads."""
-    return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
-
-
 def states_parameter(robot: Robot, prefix: str) -> bool:
     """True if the robot's file or its base gives a parameter whose name begins with this text."""
     return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk_parameters(robot))
@@ -91,7 +86,8 @@ def drop_inapplicable_columns(robot: Robot, table: Columns) -> Columns:
 def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
     """Parameters that a rig file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
-    nothing, stated_parameters = _parameters_of_bare_rig(robot), []
+    bare = blank_robot(robot.configurations, rig=robot.rig)
+    nothing, stated_parameters = {p.name: float(p.value) for p in params.walk_parameters(bare)}, []
     for p in params.walk_parameters(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations

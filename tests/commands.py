@@ -3,12 +3,16 @@
 import csv
 import json
 import sys
+from pathlib import Path
 
 import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
 from sweeps import cli
+
+#: The checkout.
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def command(arguments):
@@ -18,6 +22,16 @@ def command(arguments):
         patch.setattr(sys, "argv", ["mmrjax", *str(words).split(), *map(str, rest)])
         cli.main()
     return end.value.code
+
+
+def command_in(folder, capsys, monkeypatch, *words):
+    """Run a command in a folder. Returns its exit code, stdout and stderr."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["mmrjax", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    printed = capsys.readouterr()
+    return int(end.value.code or 0), printed.out, printed.err
 
 
 def rows(path):
@@ -61,6 +75,11 @@ def read_table(folder, text, robot, name="log.csv"):
 def read_json(path):
     """The content of a file of JSON."""
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def schema_of(command):
+    """Schema of a command's result.json."""
+    return read_json(ROOT / "docs" / "schemas" / f"{command}.schema.json")
 
 
 def motor_on_bench(torque_constant, resistance):

@@ -14,7 +14,7 @@ from test_time_overlay import overlay
 from sweeps import pages
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.document import Document, Figure, Section
-from tests.commands import text_file
+from tests.commands import ROOT, text_file
 
 pytestmark = [
     pytest.mark.slow,
@@ -143,7 +143,7 @@ def test_the_page_of_histories_can_be_read_everywhere(browser, tmp_path):
 
 def test_a_page_from_disk_has_a_worker(browser, tmp_path):
     """As the search of the docs' site needs one, and browsers refuse it."""
-    shutil.copy(Path(__file__).parents[1] / "docs" / "assets" / "iframe-worker.js", tmp_path)
+    shutil.copy(ROOT / "docs" / "assets" / "iframe-worker.js", tmp_path)
     (tmp_path / "double.js").write_text('addEventListener("message", e => postMessage(2 * e.data))')
     browser.open(text_file(tmp_path / "page.html", '<body><script src="iframe-worker.js"></script></body>'), 1280)
     answer = """new Promise(done => {

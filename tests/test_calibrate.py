@@ -5,7 +5,6 @@ import json
 import math
 import re
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +32,10 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
 from sweeps.report import calibration_report
 from sweeps.report.terminal_renderer import print_document
-from tests.commands import read_json
+from tests.commands import read_json, schema_of
 from tests.commands import rows as rows_of
 
-ROOT = Path(__file__).resolve().parents[1]
-SCHEMA = read_json(ROOT / "docs" / "schemas" / "calibrate.schema.json")
+SCHEMA = schema_of("calibrate")
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +47,6 @@ def measured():
 def found(request, measured):
     """Of the packaged table: as quick as it goes, and as the command does it."""
     return calibrated() if request.param == "few starts" else calibrate(measured, paper_robots.nominal())
-
-
-#: For tests of what only a calibration as of the command holds: 64 starts, profiles, and what is left out.
-whole = pytest.mark.parametrize("found", ["all of it"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -69,27 +63,6 @@ def quick(runs, robot=None, **keywords):
     return calibrate(
         runs, robot or paper_robots.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords}
     )
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@whole
-def test_packaged_data_calibrate_and_the_report_says_what_it_must(found, document):
-    assert found.converged and document["optimizer"]["agreement"] == "all 64 starts end at the same optimum"
-    assert found.starts.infeasible > 0  # nominal adhesion among them
-    assert tuple(document["parameters"]) == found.identifiability.names and len(document["parameters"]) == 11
-    for entry in document["parameters"].values():
-        low, high = entry["interval"]
-        assert low <= entry["value"] <= high and entry["sd"] > 0 and entry["unit"]
-        assert {"prior", "held_by_prior", "shift_in_prior_sd"} <= set(entry)
-    for when in ("before", "after"):
-        for what in ("fitted", "held_out"):
-            for channel in channels.USUAL:
-                assert {"rms_percent", "max_percent", "rms_sigma"} <= set(document["errors"][when][what][channel])
-    assert set(document["held_out_by"]) == {"slope", "voltage", "payload", "configuration", "voltage_configuration"}
-    text = " ".join(document["notes"])
-    assert "estimated from the misfit" in text and "the readings depend only on their product" in text
-    assert not document["chi2"]["tests_adequacy"]
 
 
 def test_packaged_data_figures_are_what_they_were(found, document):

@@ -9,9 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data import runs as records
-from calibration.inference import noise as noise_room
-from calibration.inference import observers, priors
-from calibration.inference import optimizers as fit
+from calibration.inference import priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.priors import GUIDED
@@ -20,7 +18,6 @@ from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.model import channels, paper_robots, params
-from mmrjax.model.signals import CONVERGED
 
 GUIDE_FRICTION, GUIDE_SHARE = f"6T2A.{priors.GUIDE_FRICTION}", f"6T2A.{priors.GUIDE_SHARE}"
 STATIC = "6T2A.ground.friction.static"
@@ -79,27 +76,6 @@ def found(base, made, told):
     return calibrate(made, base, model="track", free=free, noise=STATED, starts=2, tell=told.append)
 
 
-@pytest.fixture(scope="module")
-def posed(base, made):
-    """The problem that `found` solves."""
-    guided, known = priors.with_guide_share(base, "6T2A")
-    coordinates = priors.parameter_coordinates(guided, [GUIDE_FRICTION, STATIC], known)
-    sd = noise_room.noise_from_table(made, observers.observer_kind(made).sizes(made), STATED).sd
-    return observers.pose_problem(made, guided, coordinates, sd, "track")
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_jacobian_through_the_rollout_is_the_central_difference(posed):
-    at, step = jnp.asarray([0.5, -0.5]), 1e-4
-    _, jacobian, seen = fit.linearise(posed, at, posed.data)
-    assert (np.asarray(seen.status) == CONVERGED).all()
-    moved = [[fit.linearise(posed, at + s * e, posed.data)[0] for s in (step, -step)] for e in np.eye(2)]
-    central = np.stack([(up - down) / (2 * step) for up, down in moved], 1)
-    assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
-    assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_track_calibration_recovers_the_guide_friction(found, made, told):
@@ -129,20 +105,3 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2")
     assert "the track model's step of 0.0001 s is above the largest stable one" in said
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
-    """docs/lab/figures.md, Calibration through the track model. Some ten minutes on two cores."""
-    runs = records.read_runs("measured")
-    found = calibrate(runs, paper_robots.nominal(), model="track", starts=1)
-    assert found.converged and (found.status == "converged").all()
-    steady = calibrate(runs, paper_robots.nominal(), blocks=()).parameters
-    low, high = steady[GUIDE_SHARE].interval
-    for name, entry in found.parameters.items():
-        assert abs(entry.with_steady.apart_in_sd) < 1.96, name
-        if name == GUIDE_FRICTION:
-            assert 0.2 * low < entry.value * GUIDED < 0.2 * high
-        else:
-            assert steady[name].interval[0] < entry.value < steady[name].interval[1], name

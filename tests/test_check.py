@@ -21,10 +21,10 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
-from tests.commands import command, read_json
+from tests.commands import command, read_json, schema_of
 from tests.pages import Tables
 
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json")
+SCHEMA = schema_of("check")
 
 
 def read(text):

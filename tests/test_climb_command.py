@@ -2,7 +2,6 @@
 
 import csv
 import re
-from pathlib import Path
 
 import jax.numpy as jnp
 import jsonschema
@@ -15,9 +14,9 @@ from mmrjax.climbing.climb_simulation import LOSSES
 from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
 from sweeps.report.climb_report import Seen, footing_coordinates
-from tests.commands import ends, read_json, text_file
+from tests.commands import ends, read_json, schema_of, text_file
 
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json")
+SCHEMA = schema_of("climb")
 
 REFUSED = {
     "levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--levers-front", "30"],

@@ -85,32 +85,6 @@ def test_clean_table_lacks_nothing(clean):
     assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_result_is_that_of_the_stages(clean, churning, looks):
-    for at in (clean, churning):
-        found = looks.analyst.result(at.traced, at.runs)
-        assert found.verdict == at.traced.verdict and found.chi2 == (2 * at.base.cost, 2 * at.traced.best.cost)
-        assert tuple(tuple(e.members) for e in found.effects) == at.traced.members
-        assert found.before.p_value == at.left.test.p_value and found.before.adequate == (not at.left.test.rejected)
-        assert found.after.adequate and found.readings == 3 * len(at.runs) and found.unnamed is None
-        assert {e.name for e in found.robot.effects} == set(at.traced.best.effects)
-        assert (found.next_experiment is None) == (found.verdict != "class")
-        assert (
-            found.settings == looks.analyst.settings
-            and found.outliers == found.unusable == ()
-            and found.included.all()
-        )
-        assert found.verdict != "none" or found.alternatives == found.implausible == ()
-
-
-@pytest.mark.slow
-def test_brush_drop_is_found():
-    found = SETTLED.trace(table(tables.narrow(["brush_drop"], 10.0, seed=1)))
-    (members,) = classes(found)
-    assert "brush_drop" in members and found.verdict == ("named" if len(members) == 1 else "class")
-
-
 @pytest.fixture(scope="module")
 def outside():
     """A law that no effect of the library is like, through the stages of the loop."""
@@ -160,17 +134,6 @@ def test_reading_that_stands_alone_is_an_outlier(clean, looks):
     assert found.outliers == (18,) and found.verdict == "none" and found.unusable == ()  # rows count from 1
     assert not found.included[17] and found.included.sum() == len(clean.runs) - 1
     assert found.rms["before"]["speed"] < 2 * np.max(clean.runs["speed_sd_mm_s"]), found.rms
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_outliers_of_a_short_table_are_set_aside(clean, looks):
-    """A tenth of sixteen rows is one, and what one reading shows, a curve over the order shows too."""
-    runs = clean.runs.where(np.linspace(0, len(clean.runs) - 1, 16).astype(int))
-    runs = changed(runs, "speed_mm_s", 3, 9 * runs["speed_sd_mm_s"][3])
-    runs = changed(runs, "motor_speed_rpm", 9, -12 * runs["motor_speed_sd_rpm"][9])
-    found = looks.analyst.trace(runs)
-    assert found.verdict == "none" and set(found.screened.outliers) == {3, 9}
 
 
 @pytest.mark.slow

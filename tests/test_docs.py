@@ -4,15 +4,13 @@ import importlib.util
 import inspect
 import re
 import tomllib
-from pathlib import Path
 
 import jsonschema
 import pytest
 
 import mmrjax as mm
-from tests.commands import read_json
+from tests.commands import ROOT, read_json
 
-ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 
 

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 import weakref
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +20,9 @@ from mmrjax.model import paper_robots
 from sweeps import cli
 from sweeps.pages import words
 from sweeps.points import run
+from tests.commands import ROOT
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = ROOT / "docs"
 
 
 @pytest.mark.quick(1)

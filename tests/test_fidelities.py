@@ -4,7 +4,6 @@ import dataclasses
 import subprocess
 import sys
 import types
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +17,8 @@ from mmrjax.fidelities.steady import operating_point, steady_batch
 from mmrjax.model import channels, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import STATUSES, Result
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 RUNS = Conditions(configuration=[0, 1], voltage=24.0, slope_deg=[5.0, 0.0])
 SHORT = 0.03  # [s]
 

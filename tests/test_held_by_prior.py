@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,6 +20,7 @@ from calibration.inference.identifiability import HELD, held_by_prior
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
 from sweeps.report.terminal_renderer import print_document
+from tests.commands import ROOT
 
 
 def linear(jacobian):
@@ -138,13 +138,12 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
 
 
 def test_no_other_word_is_left_for_it():
-    root = Path(__file__).parents[1]
     old = re.compile(
         r"prior says more than the data of:|prior only|held by the prior\b|['\"]held by (its|their) prior|stands in for something"
     )
     for path in [
-        *root.glob("calibration/**/*.py"),
-        *root.glob("sweeps/**/*.py"),
-        *root.glob("sweeps/pages/templates/*"),
+        *ROOT.glob("calibration/**/*.py"),
+        *ROOT.glob("sweeps/**/*.py"),
+        *ROOT.glob("sweeps/pages/templates/*"),
     ]:
         assert not old.search(path.read_text("utf-8")), path

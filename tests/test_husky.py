@@ -1,7 +1,6 @@
 """The Husky's table of settled turns: read, checked and calibrated as any other rig's."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,9 @@ from calibration.data import surfaces
 from calibration.inference import blocks, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import SettledTurns
+from tests.commands import ROOT
 
-HUSKY = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "husky"
+HUSKY = ROOT / "docs" / "rigs" / "husky"
 
 
 @pytest.fixture(scope="module")

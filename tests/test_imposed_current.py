@@ -1,5 +1,7 @@
 """Motors whose current is imposed: steady travel, histories, tables and fits against plain physics, without a winding."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -73,6 +75,13 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
             f"up to {2 * factor:g} A, although by the file's numbers the load turns slowly at 0.667 A. Is it in"
             in said
         )
+
+
+@pytest.mark.parametrize("reading", ["motor_voltage_V", "motor_speed_rpm"])
+def test_a_large_current_without_a_measured_speed_may_be_that_of_a_held_shaft(tmp_path, robot, reading):
+    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=(reading.rpartition("_")[0],)))
+    table = read_table(tmp_path, f"motor_current_A,{reading}\n200,1\n400,2\n700,3.5\n", robot)
+    assert ("add a column held" in rig_facts.doubtful_current(table, robot)) == (reading == "motor_voltage_V")
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from sweeps import cli
 from sweeps.commands import loop as room
-from tests.commands import read_json
+from tests.commands import read_json, schema_of
 
 PRIORS = [a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")]
 
@@ -171,7 +171,7 @@ def test_residuals_of_rows_are_simulated_less_measured_readings(done):
 
 def test_result_has_the_schema_of_the_issue(done):
     r = done.result
-    schema = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json")
+    schema = schema_of("loop")
     jsonschema.validate(r, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**r, "verdict": "perhaps"}, schema)
@@ -222,7 +222,7 @@ def test_report_tells_the_story_in_order(done):
     order = [
         'id="answer"', 'id="law"', 'id="summary"', 'id="advice"', 'id="found"', 'id="contents"', 'id="before_after"',
         'id="defects"', '<figure id="errors-figure"', 'id="effects"', 'id="notes"', 'id="ladder"',
-        'id="look_alikes"', 'id="unseen"', 'id="base_shift"', '<table id="words"', 'id="files"',
+        'id="look_alikes"', 'id="unseen"', '<table id="base"', '<table id="words"', 'id="files"',
     ]  # fmt: skip
     at = [text.find(mark) for mark in order]
     assert -1 not in at and at == sorted(at)

@@ -4,7 +4,6 @@ import dataclasses
 import difflib
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import ANY
 
@@ -42,9 +41,9 @@ from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.fit_tables import Change
 from sweeps.report.terminal_renderer import print_document
-from tests.commands import read_json
+from tests.commands import schema_of
 
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json")
+SCHEMA = schema_of("loop")
 
 
 def happening():

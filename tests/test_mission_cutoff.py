@@ -18,8 +18,7 @@ from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
-from sweeps import cli
-from tests.commands import ends, read_rig, rows
+from tests.commands import command_in, ends, read_rig, rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -210,15 +209,6 @@ def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
 # --- what is said ---------------------------------------------------------------------------------------------------
 
 
-def command(capsys, monkeypatch, folder, *words):
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr("sys.argv", ["mmrjax", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    said = capsys.readouterr()
-    return int(ended.value.code or 0), said.out, said.err
-
-
 def written(folder, cutoff, text=""):
     (folder / "low.toml").write_text(f"[battery]\nvoltage_cutoff = {cutoff}\n{text}")
     (folder / "hour.csv").write_text("time_s,duty,slope_deg,payload_kg\n0,1,10,5\n3600,1,10,5\n")
@@ -234,7 +224,7 @@ def folder(tmp_path_factory):
 def run_folder(folder, capsys, monkeypatch):
     if not (folder / "a").exists():
         _, out, err = ends(
-            command(capsys, monkeypatch, folder, *written(folder, 3.3), "--no-report", "--out", "a"), code=0
+            command_in(folder, capsys, monkeypatch, *written(folder, 3.3), "--no-report", "--out", "a"), code=0
         )
         (folder / "out.txt").write_text(out)
         (folder / "err.txt").write_text(err)
@@ -263,7 +253,7 @@ def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, cap
     asked = ("simulate", "--configuration", "4W2T", "--set", "driver.current_limit=1.5", "--no-report")
     by_run = ("--model", "drive", "--voltage", "-24", "--duration", "3", "--out", "run")
     for words in (by_run, ("--profile", "three.csv", "--out", "mission")):
-        command(capsys, monkeypatch, folder, *asked, *words)
+        command_in(folder, capsys, monkeypatch, *asked, *words)
     compared = set()
     for name in ("runs.csv", "history.csv"):
         one, other = (rows(folder / out / name)[-1] for out in ("run", "mission"))
@@ -309,7 +299,7 @@ def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
 
 def test_a_mission_that_begins_below_its_cut_off_is_refused(tmp_path, capsys, monkeypatch):
     words = written(tmp_path, 3.5)
-    code, out, err = command(capsys, monkeypatch, tmp_path, *words, "--discharge", "2000", "--out", "b")
+    code, out, err = command_in(tmp_path, capsys, monkeypatch, *words, "--discharge", "2000", "--out", "b")
     assert (code, out) == (2, "") and not (tmp_path / "b").exists()
     assert (
         "--discharge: got 2000 mAh; a cell is then at 3.377 V, below its cut-off of 3.5 V, before the mission" in err

@@ -15,8 +15,8 @@ import pytest
 from packaging.specifiers import SpecifierSet
 
 import mmrjax as mm
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import math
 import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +13,8 @@ from mmrjax.effects.electrical_effects import ThermalDrift
 from mmrjax.model.gearbox import Gearbox
 from mmrjax.model.motor import Motor
 from mmrjax.model.power import Battery
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
     "motors.csv": parts.packaged_motors,
     "gearboxes.csv": parts.packaged_gearboxes,

@@ -9,15 +9,10 @@ import pytest
 from calibration.data import contradictions
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from sweeps.inputs import one_run
 from sweeps.report.words import posture_words
 from tests.commands import ends, text_file
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return paper_robots.nominal()
 
 
 @pytest.fixture(scope="module")

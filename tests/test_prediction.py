@@ -8,15 +8,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
-from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.discovery import findings, mechanism, prediction
-from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
 from calibration.inference.blocks import distinct_held_out_blocks, predictable_blocks, unpredictable_kinds
-from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import channels, paper_robots
-from sweeps.inputs import read_runs
 
 RNG = np.random.default_rng(2)
 NONE_FREE = SimpleNamespace(names=(), tied=())
@@ -160,37 +155,6 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
         HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
     ) == Gain(0.0, np.inf)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_path):
-    """The written robot predicts, on the rows that both reach, no worse than this, by kind of block [%]. Swept with the
-    mass of its own file it reads as it was fitted."""
-    robot = paper_robots.nominal()
-    runs = read_runs("measured", robot, measured=True)
-    found = discover(runs, robot)
-    assert found.verdict == "class" and found.written and found.gain.mean > found.gain.se
-    standing = {e.name: found.support.rests_on(e.name) for e in found.effects}
-    assert standing == {"series_resistance": None, "brush_drop": None, "gear_load_loss": None, "vibration_slip": 10}
-    assert "supply_sag" in found.effects[0].members and found.effects[0].families == (
-        "voltage drop that changes with current",
-    )
-    wanted = {"slope": (3.55, 1.2, 1.75), "voltage_configuration": (3.8, 1.05, 4.3), "voltage": (3.8, 4.1, 3.15)}
-    assert set(found.readings_of_rows.held_out) == set(wanted)
-    measured = found.readings_of_rows.measured
-    for kind, (before, after) in found.readings_of_rows.held_out.items():
-        both = np.isfinite(before) & np.isfinite(after)
-        error = np.where(both, 100 * (after - measured) / after, np.nan)
-        rms = np.sqrt(np.nanmean(error**2, 0))
-        assert (rms < np.array(wanted[kind]) + 0.05).all(), (kind, rms)
-    found.save(tmp_path)
-    again = robot_file.read_robot(tmp_path / "robot.toml")
-    assert float(again.configurations["4W2T"].mass) == 13.1
-    unweighed = {k: v for k, v in runs.columns.items() if k != "total_mass_kg"}
-    shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading
-    swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual_channels()], -1)
-    assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +26,7 @@ from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.signals import Result
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests.commands import ROOT
 
 
 def python(code, **environment):
@@ -226,14 +224,6 @@ def test_drive_keeps_histories(robot):
     assert mm.simulate(robot, mm.Conditions(voltage=24.0), model="drive", duration=1.0, history=False).history is None
 
 
-@pytest.mark.slow
-def test_track_keeps_histories_with_reactions(robot):
-    runs = mm.Conditions(voltage=[24.0, 15.0])
-    many = mm.simulate(robot, runs, model="track", duration=0.03)
-    assert many.history.time.shape == (2, 30) and many.history.reactions.guided.shape[:2] == (2, 30)
-    assert many.guide_share.shape == (2,) and "guide_share" in many.to_dict() and "guide share" in many.table()
-
-
 def in_fours(monkeypatch):
     """Runs in one call of `steady` four at a time. Returns the shapes of the calls that are made."""
     sizes = []
@@ -277,14 +267,6 @@ def test_large_batches_run_in_chunks(robot, monkeypatch):
 
 def current(resistance, robot, runs, **options):
     return mm.simulate(mm.replace(robot, {"motor.resistance": resistance}), runs, **options).total_current
-
-
-@pytest.mark.slow
-def test_forward_mode_goes_through_a_run_over_time(robot):
-    run, x, h = mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=5.0), jnp.asarray(0.611), 1e-5
-    short = dict(model="drive", duration=0.01, history=False)
-    driven = (current(x + h, robot, run, **short) - current(x - h, robot, run, **short)) / (2 * h)
-    assert_allclose(jax.jacfwd(lambda r: current(r, robot, run, **short))(x), driven, rtol=1e-3)
 
 
 def test_vmap_and_jit_go_through(robot):

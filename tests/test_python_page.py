@@ -2,7 +2,6 @@
 
 import re
 import runpy
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data import effect_file
-from tests.commands import read_json
+from tests.commands import ROOT, read_json
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = ROOT / "docs"
 #: Pages whose blocks continue each other; blocks that read what a command wrote are left out.
 TUTORIALS = ("start/python", "howto/sweep", "howto/mission", "howto/turn", "howto/formats", "explanation/track-model")
 

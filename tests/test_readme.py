@@ -2,16 +2,14 @@
 
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
 from calibration.data import profiles, requirements_file
 from sweeps import cli
-from tests.commands import read_rig, text_file
+from tests.commands import ROOT, read_rig, text_file
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jsonschema
 import numpy as np
@@ -22,9 +21,9 @@ from calibration.inference.residual_clusters import LEVEL, find_residual_cluster
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
-from tests.commands import read_json, text_file
+from tests.commands import ROOT, read_json, text_file
 
-SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"
+SCHEMAS = ROOT / "docs" / "schemas"
 ROWS = 90
 CURRENT, MOTOR, SPEED = range(3)
 

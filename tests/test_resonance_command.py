@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 
 import jsonschema
@@ -17,10 +16,10 @@ from sweeps import config
 from sweeps.commands import resonance as room
 from sweeps.pages.resonance_figures import draw_resonance_map
 from sweeps.points import run
-from tests.commands import command, read_json, rows
+from tests.commands import command, read_json, rows, schema_of
 from tests.pages import Tables, drawn, outside
 
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "resonance.schema.json")
+SCHEMA = schema_of("resonance")
 SMALL = ("resonance", "--voltages", "24:40:2", "--payloads", "8,0", "--duration", "1")
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 import re
-from pathlib import Path
 
 import equinox as eqx
 import numpy as np
@@ -23,7 +22,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
 from sweeps.report.terminal_renderer import print_document
-from tests.commands import ends, read_rig
+from tests.commands import ROOT, ends, read_rig
 
 KINDS = tuple(rig_new.KINDS)
 
@@ -626,7 +625,7 @@ def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
         read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
 
 
-ROBOT_FILES = Path(__file__).parents[1] / "docs" / "reference" / "robot-files.md"
+ROBOT_FILES = ROOT / "docs" / "reference" / "robot-files.md"
 PAGE = ROBOT_FILES.read_text(encoding="utf-8")
 EXAMPLES = PAGE.split("```toml\n")[1:]
 

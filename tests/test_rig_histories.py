@@ -313,8 +313,8 @@ def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path
     assert made.angle(made.whole(robot)).shape == (len(runs),)
 
 
-def test_every_row_of_an_imposed_speed_has_the_acceleration_of_its_line(tmp_path):
-    """That of the line which begins at the row. The last row of each run ends one, and a run of one row has none."""
+def test_every_row_of_an_imposed_speed_has_the_acceleration_of_the_motion_there(tmp_path):
+    """That of the parabola through three rows. A run of one row has none."""
     robot, _ = imposed_speed(tmp_path, 1)
     ramps = {"a": [100.0, 120.0, 160.0, 160.0, 150.0], "b": [0.0, -30.0, -60.0], "c": [7.0]}
     columns = {
@@ -323,7 +323,7 @@ def test_every_row_of_an_imposed_speed_has_the_acceleration_of_its_line(tmp_path
         "motor_speed_rpm": np.concatenate(list(ramps.values())) / quantities.RPM,
     }
     rows = Histories.of(written(tmp_path, robot, columns, [0.01]), robot).of_rows
-    expected = [200.0, 400.0, 0.0, -100.0, -100.0, -300.0, -300.0, -300.0, 0.0]
+    expected = [100.0, 300.0, 200.0, -50.0, -150.0, -300.0, -300.0, -300.0, 0.0]
     assert_allclose(rows.motor_acceleration, expected, rtol=1e-9, atol=1e-9)
 
 

@@ -2,7 +2,6 @@
 
 import re
 import tomllib
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -27,12 +26,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
 from sweeps.report.document import Figure
-from tests.commands import ends, read_json
+from tests.commands import ends, read_json, schema_of
 from tests.commands import rows as table
 from tests.pages import Tables
 
-ROOT = Path(__file__).parents[1]
-SCHEMA = read_json(ROOT / "docs" / "schemas" / "sensitivity.schema.json")
+SCHEMA = schema_of("sensitivity")
 NAMES = ("motor.torque_constant", "6T2A.track.guide_share", "4W2T.track.loss_coulomb", "motor.inductance")
 SMALL = (
     "sensitivity --parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",
@@ -190,7 +188,7 @@ def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
     monkeypatch.setattr(sensitivity_report, "_sentence", lambda *_: "a sentence")
     monkeypatch.setattr(sensitivity_report, "_inputs", lambda *_: "a table")
     one = {"studied": np.array([True]), "value": np.zeros(1), "row": SimpleNamespace(label=""), "second": None}
-    outputs = {k: SimpleNamespace(overall_share=v, convergence=None, **one) for k, v in shares.items()}
+    outputs = {k: SimpleNamespace(overall_share=v, **one) for k, v in shares.items()}
     found = SimpleNamespace(outputs=outputs, next_runs=None, comparison={}, names=("a", "b"))
     blocks = [block for section in sensitivity_report._sections(found) for block in section.blocks]
     assert [b.name for b in blocks if isinstance(b, Figure)] == ["tornado_speed", "indices_speed"]

@@ -5,7 +5,6 @@ import csv
 import json
 import re
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from calibration.inference import noise as noises
 from calibration.inference.foresight import InformationForecast
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
-from tests.commands import csv_text, ends, read_rig, text_file
+from tests.commands import ROOT, csv_text, ends, read_rig, text_file
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -596,9 +595,7 @@ def turning(tmp_path):
         "yaw_rate_rad_s": (right - left) / 0.8 + 0.01 * noise[2],
     }
     write_table({n: [f"{x:.6g}" for x in column] for n, column in table.items()}, tmp_path / "log.csv")
-    return pairs, robot_file.read_robot(
-        Path(__file__).resolve().parents[1] / "docs" / "rigs" / "husky" / "husky.toml"
-    )
+    return pairs, robot_file.read_robot(ROOT / "docs" / "rigs" / "husky" / "husky.toml")
 
 
 def test_levels_of_a_turn_are_those_of_both_sides_and_a_yaw_rate_has_its_own_sign(tmp_path):

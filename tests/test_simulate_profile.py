@@ -1,6 +1,7 @@
 """`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
 
 import csv
+import functools
 import re
 
 import numpy as np
@@ -14,9 +15,8 @@ from mmrjax.missions.mission_batch import OUTPUTS
 from mmrjax.missions.profile import profile
 from mmrjax.model import energy
 from mmrjax.model.signals import STATUSES
-from sweeps import cli
 from sweeps.commands.missions import select_course_rows
-from tests.commands import ends, read_json
+from tests.commands import command_in, ends, read_json
 
 #: Up a slope, to a stop, and back; twice.
 MISSION = """\
@@ -41,14 +41,7 @@ def mmrjax(tmp_path_factory):
     """Run the command line in a folder of its own."""
     folder = tmp_path_factory.mktemp("missions")
 
-    def run(capsys, monkeypatch, *words):
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr("sys.argv", ["mmrjax", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
-
+    run = functools.partial(command_in, folder)
     run.folder = folder
     (folder / "mission.csv").write_text(MISSION)
     return run

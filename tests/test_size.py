@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +17,9 @@ from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, op
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
 from sweeps.report.size_report import design_verdict
-from tests.commands import command, read_json
+from tests.commands import command, read_json, schema_of
 
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json")
+SCHEMA = schema_of("size")
 TEXT = """
 speed_m_s = 0.9
 payload_kg = 8

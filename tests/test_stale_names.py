@@ -3,9 +3,9 @@
 import ast
 import importlib
 import types
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.commands import ROOT
+
 #: Benchmarks that are imported, by tests or one another; the others read their command line as they start.
 IMPORTED = ("campaign", "loop", "loop_findings", "loop_scores", "measure", "rig_logs", "rigs")
 OWN = ("mmrjax", "calibration", "sweeps", "worlds", *IMPORTED)

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
-from synthetic import SETTLED, STATED, Analyst, table
-from worlds import histories, laws, settled, tables
+from synthetic import SETTLED, table
+from worlds import laws, settled, tables
 
 from calibration.discovery import discover, standing
-from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, start_of_fit
+from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.discovery.discrepancy import locate_discrepancy
 from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
-from calibration.discovery.search import SearchResult, diagnose_candidate
+from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, fit_smooth_curve, fit_smooth_surface
 from calibration.discovery.standing import (
@@ -32,11 +32,10 @@ from calibration.discovery.standing import (
     equation_of_place,
     evidence_of_names,
     evidence_over_curves,
-    judge_names,
 )
 from calibration.inference import bases
 from calibration.inference.linearization import PROBED
-from calibration.inference.observers import Histories, SettledRuns
+from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from mmrjax.effects import BY_NAME
 from mmrjax.model import channels
@@ -536,27 +535,6 @@ def growing(monkeypatch, sigmas, seed):
     return table(tables.narrow(["sliding_speed_grows"], sigmas, seed))
 
 
-def stood(analyst, runs, effects):
-    """Whether these effects, fitted together, would stand, whatever a search would have found."""
-    screened = analyst.screened(runs)
-    space, base, bases = screened.base.space, screened.base.candidate, screened.bases
-    left = discover.diagnose_base_by_bootstrap(screened, analyst.settings)
-    active = fill_slots(effects, analyst.settings)
-    first = start_of_fit(space, base, active, analyst.settings, left.scores)
-    (best,) = fit_candidates(space, [(active, first)], analyst.settings)
-    after = diagnose_candidate(space, best, bases, left.test.null, analyst.settings)
-    return judge_names(space, base, SearchResult((best,), best, after), left, bases, analyst.settings), best, after
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
-    got, best, _ = stood(SETTLED, growing(monkeypatch, 20.0, 1), ("rolling_radius", "load_slip"))
-    assert not got.stands and got.why
-    true, same, after = stood(SETTLED, table(tables.narrow(["rolling_radius", "load_slip"], 15.0, 1)), best.effects)
-    assert true.stands and true.why == "beside" and same.key == best.key and not after.test.rejected_with_margin
-
-
 @pytest.mark.slow
 def test_sliding_speed_that_grows_gets_no_name(monkeypatch):
     for sigmas, seed in ((12.0, 1), (30.0, 2)):
@@ -565,31 +543,6 @@ def test_sliding_speed_that_grows_gets_no_name(monkeypatch):
         # A mechanism lists equations too that these data cannot separate from slip, after it.
         assert found.where.balance == "slip" and found.where.family == "slip that changes with speed"
         assert found.families[0] == found.where.family
-
-
-#: With all slips of the library, and room for three effects at once.
-SLIPS = Analyst(
-    dataclasses.replace(settings_for(SettledRuns, 192), slots=3),
-    dict(SETTLED.library) | {n: BY_NAME[n] for n in ("belt_creep", "speed_slip", "nonlinear_slip")},
-)
-STANDS_FOR_ONE = ("belt_creep", "load_slip", "rolling_radius")
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_three_slips_do_not_stand_for_a_sliding_speed_that_grows(monkeypatch):
-    for sigmas, seed in ((12.0, 1), (20.0, 1), (30.0, 2)):
-        runs = growing(monkeypatch, sigmas, seed)
-        got, _, _ = stood(SLIPS, runs, STANDS_FOR_ONE)
-        assert not got.stands, (sigmas, seed)
-        found = SLIPS.trace(runs)
-        assert found.verdict in WITHOUT_NAME and found.members == () and not found.standing.stands, (sigmas, seed)
-        assert found.where.family == "slip that changes with speed", (sigmas, seed)
-        # The law is a function of the demand times the speed: both are its drivers.
-        assert found.families and set(found.families) <= {
-            "slip that changes with speed",
-            "slip that changes with demand",
-        }, (sigmas, seed)
 
 
 @pytest.mark.slow
@@ -605,24 +558,6 @@ def test_true_pairs_of_one_balance_keep_their_names(pair):
 
 
 # --- histories ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_supply_that_sags_over_time_gets_no_name(monkeypatch):
-    """By one volt in 0.8 s, in six starts. It was called a brush drop and an eccentric pulley."""
-    sag = laws.Law("", "supply", lambda s, q: np.full_like(s.w, s.time / 0.8), 1.0 / histories.LARGEST)
-    monkeypatch.setitem(histories.EVERY, "sag_over_time", sag)
-    made = histories.narrow(["sag_over_time"], 1e6, 1, duration=0.8)
-    assert made.label["effects"][0]["amplitude"] == pytest.approx(1.0)
-    names = ("brush_drop", "pulley_eccentricity", "series_resistance", "supply_sag", "churning", "rotating_inertia")
-    dynamic = {f"{c}.ground.friction.dynamic": (0.48, 0.08) for c in ("6T2A", "4W2T")}
-    analyst = Analyst(
-        dataclasses.replace(settings_for(Histories, 300), slots=2), {n: BY_NAME[n] for n in names}, STATED | dynamic
-    )
-    found = analyst.trace(table(made))
-    assert found.verdict in WITHOUT_NAME and not found.standing.stands and found.members == ()
-    assert {found.where.balance, *found.where.alike} & {"electrical", "supply"} and found.where.variable == "time"
 
 
 def test_small_offset_of_an_instrument_without_a_stated_noise_is_not_established():

@@ -1,7 +1,6 @@
 """Runs from standstill as they are written: by the clock of the rig, with the slip over the stages of the start."""
 
 import csv
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +18,10 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import Signals
 from sweeps.commands import simulate
-from tests.commands import read_json
+from tests.commands import read_json, schema_of
 
 VOLTAGE, V_S = 33.0, 0.02
-SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "simulate.schema.json")
+SCHEMA = schema_of("simulate")
 
 
 def table(path):

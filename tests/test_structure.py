@@ -7,14 +7,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import pytest
 
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("mmrjax", "calibration", "sweeps")  # each may import those before it
 FORBIDDEN_ROOMS = {"utils", "util", "helpers", "helper", "common", "misc"}
 HEAVY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "matplotlib", "scipy"}

@@ -32,7 +32,7 @@ from sweeps.points import axes, scale, zarr_store
 from sweeps.points.job import prepare_job, store_layout
 from sweeps.points.tasks import task_of_configuration
 from sweeps.store import LOCK, MANIFEST, RunFolder
-from tests.commands import ends, read_json
+from tests.commands import ROOT, ends, read_json
 
 CONFIG = """report = false
 chunk = 40
@@ -616,13 +616,6 @@ def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_
 
 @pytest.mark.parametrize("cut", range(4))
 def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatch, tmp_path, cut):
-    def finish(store):
-        with store.last() as last:
-            assert last
-            names = ["identity.json", "journal", "manifest.json", zarr_store.STORE]
-            store.write_json("manifest.json", {"schema": MANIFEST, "contents": names})
-            store.move_into_place()
-
     def simulated(speed, **options):
         store = opened(**options)
         store.begin()
@@ -630,7 +623,7 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
         return store
 
     old = simulated(1.0)
-    finish(old)
+    finished(old)
     old.close()
     forced, steps = simulated(2.0, seed=1, force=True), iter(range(100))
 
@@ -647,12 +640,12 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
         patch.setattr(shutil, "rmtree", killed(shutil.rmtree))
         patch.setattr(Path, "unlink", killed(Path.unlink))
         with pytest.raises(KeyboardInterrupt):
-            finish(forced)
+            finished(forced)
     forced.close()
     again = opened(seed=1, force=True)
     assert len(again.done()) == 3  # nothing is simulated again
     if not again.finished:
-        finish(again)
+        finished(again)
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
     assert not {"lock", "writing"} & {p.name for p in (tmp_path / "s").iterdir()}
     assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == [2.0] * 3
@@ -908,7 +901,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
 
 @pytest.mark.slow
 def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
-    page = (Path(__file__).resolve().parents[1] / "docs" / "reference" / "plans.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "plans.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     _, out, _ = ends(mmrjax("sweep plan.toml --dry-run --chunk 1000"), code=0)
     assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out

@@ -10,7 +10,7 @@ from calibration.data.posterior_file import NORMAL, Posterior
 from calibration.data.runs import Runs
 from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from sweeps import config
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.sampled_design import DrawnSamples
@@ -18,11 +18,6 @@ from sweeps.store import RunFolder
 
 NAMES = ("motor.resistance", "motor.friction_coulomb")
 DRAWS = 12
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return paper_robots.nominal()
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_turn_calibration import DUTIES, NOISE, SHOWN, written
-from test_turning import flat, of_world
-from worlds import turning as world
+from test_turning import flat
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -64,24 +63,6 @@ def test_effect_moves_the_turn_and_mirrors(name):
     other = -size if name in OF_SIDES else size
     mirrored = np.asarray(rates(amplitudes(**{name: other}), MIRRORED, (y * sign)[swap]))
     assert_allclose(mirrored, (moved * sign)[swap], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_friction_of_a_side_is_that_of_a_second_implementation():
-    robot, more = paper_robots.nominal(), 0.002
-    dry = float(robot.motor.friction_coulomb)
-    constants = [{"motor.friction_coulomb": dry + more}, {"motor.friction_coulomb": dry - more}]
-    other = of_world(robot, "6T2A", left=constants[0], right=constants[1])
-    y = np.asarray(flat(MOTION))
-    theirs = world.rates(
-        other, world.Inputs(0.9, -0.2, kind="duty", supply=33.0), 0.0, (y * np.asarray(circling._UNITS))[PLACES]
-    )
-    mine = np.asarray(rates(amplitudes(side_friction=more), RUN, jnp.asarray(y))) * np.asarray(circling._UNITS)
-    assert_allclose(mine[PLACES][:10], theirs[:10], rtol=1e-8, atol=1e-8)
-
-
-#: Of the second implementation's state in ours.
-PLACES = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]
 
 
 def test_terms_are_their_equations():

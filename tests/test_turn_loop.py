@@ -80,23 +80,6 @@ def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
     assert {"6T2A.turning.width", "6T2A.turning.lateral"} < set(space.coordinates.base.names)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", SCORED)
-def test_signature_is_what_the_effect_does(posed, linear, shown, name):
-    _, space = posed
-    k = space.library.names.index(name)
-    effect = space.library.scored[k].effect
-    size = float(effect.amplitude)
-    mine = np.asarray(linear.signatures)[:, np.flatnonzero(space.library.of == k)]
-    values = space.library.scored[k].values
-    at = len(values) // 2
-    if len(values):
-        effect = params.replace(effect, {space.library.scored[k].shape: values[at]})
-    wanted = size * shown(effect, 1e-3 * size)
-    assert np.abs(wanted).max() > 0.1
-    assert_allclose(mine[:, at], wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
-
-
 @pytest.mark.parametrize("name", CURVES)
 def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     """A curve that the loop fits is the one whose columns it scored."""

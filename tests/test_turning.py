@@ -35,11 +35,6 @@ def of_world(robot, configuration, payload=0.0, **changes):
 
 
 @pytest.fixture(scope="module")
-def robot():
-    return paper_robots.nominal()
-
-
-@pytest.fixture(scope="module")
 def turns(robot):
     """Settled turns at 33 V: as `DUTIES` say, mirrored, backward, and straight, of either configuration."""
     left = [a for a, _ in DUTIES] + [b for _, b in DUTIES] + [-a for a, _ in DUTIES] + [0.7]
@@ -197,30 +192,6 @@ def test_run_over_time_is_that_of_a_second_implementation(robot):
         assert_allclose(getattr(signals, name)[:, 0], expected[:, k], rtol=1e-6, atol=1e-6, err_msg=name)
     assert_allclose(signals.current, expected[:, 6:8], rtol=1e-5, atol=1e-6)
     assert_allclose(signals.speed_motor, expected[:, 8:10], rtol=1e-6, atol=1e-4)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_derivatives_over_time_are_differences(robot):
-    """Heading and place of a turn across a slope, by the ratio of frictions, adhesion and the left duty."""
-    names, times = ("6T2A.turning.lateral", "6T2A.ground.friction.static"), jnp.asarray([0.0, 0.5, 1.0, 2.0])
-    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
-
-    @jax.jit
-    def course(theta):
-        own = params.replace(robot, dict(zip(names, theta[:2], strict=True)))
-        run = mm.Conditions(0, voltage=24.0, duty_left=theta[2], duty_right=0.4, slope_deg=10.0, heading_deg=60.0)
-        signals = drive.drive(own, run.resolved(own), times, 1e-10).signals
-        shown = (signals.heading, signals.place_x, signals.place_y)
-        return jnp.stack([jnp.reshape(x, (len(times), -1))[:, 0] for x in shown])
-
-    theta = jnp.asarray([*(known[n] for n in names), 0.9])  # a duty beyond 1 is cut
-    exact = np.asarray(jax.jacfwd(course)(theta))
-    for k in range(3):
-        step = 1e-5 * float(theta[k])
-        two = (np.asarray(course(theta.at[k].add(s * step))) for s in (1, -1))
-        difference = np.subtract(*two) / (2 * step)
-        assert_allclose(exact[..., k], difference, rtol=1e-4, atol=1e-4 * np.abs(difference).max())
 
 
 def test_turning_numbers_are_those_of_the_paper(robot):

@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,7 @@ from calibration.data.input_errors import BadData
 from mmrjax.fidelities import outputs
 from mmrjax.model import channels, quantities
 from sweeps.commands import explain
-from tests.commands import read_rig, read_table, text_file
+from tests.commands import ROOT, read_rig, read_table, text_file
 
 #: One of each unit, in SI.
 BY_HAND = {
@@ -139,7 +138,7 @@ for command in commands:
 
 
 def test_a_channel_of_one_row_is_in_tables_sweeps_help_pages_and_json(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-c", ROW_MORE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ from mmrjax.fidelities.steady import steady
 from mmrjax.fidelities.variation import CONDITIONS, Variation, evaluate_points
 from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.conditions import Conditions
+from tests.commands import ROOT
 
 NAMES = ("motor.resistance", "6T2A.ground.friction.static", "slope_deg", "voltage")
 VALUES = np.array([[0.7, 0.5, 0.0, 24.0], [0.9, 0.6, 5.0, 33.0], [0.611, 0.2, 20.0, 15.0]])
@@ -124,7 +124,6 @@ def test_unknown_output_is_refused_with_the_choices(variation, model):
 
 
 def test_status_is_named_in_one_place():
-    root = Path(__file__).resolve().parents[1]
-    files = [f for folder in ("mmrjax", "sweeps") for f in (root / folder).rglob("*.py")]
+    files = [f for folder in ("mmrjax", "sweeps") for f in (ROOT / folder).rglob("*.py")]
     stated = [f.name for f in files if re.search(r'^(STATUS|_?CODES)\b.*= .*"status"', f.read_text(), re.MULTILINE)]
     assert stated == ["signals.py"]

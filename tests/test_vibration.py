@@ -1,7 +1,6 @@
 """Friction of contacts that shake: the averaged law, and the slip of track-model runs that follows from their ripple."""
 
 import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED, Signals
+from tests.commands import ROOT
 
 LAW = Friction(static=0.6, dynamic=0.5, speed_static=0.01, speed_dynamic=0.1)
 
@@ -35,7 +35,7 @@ def fig7(speed):
 )
 def test_the_equation_that_is_written_is_the_one_that_runs(place):
     """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""
-    text = (Path(__file__).parents[1] / place).read_text("utf-8")
+    text = (ROOT / place).read_text("utf-8")
     (said,) = set(re.findall(r"ΔV = a (√.*?0\.05²\))", text))
     for written, python in (("∣", "|"), ("|u|", "abs(u)"), ("√", "sqrt"), ("²", "**2"), ("^p u", "**p * u")):
         said = said.replace(written, python)

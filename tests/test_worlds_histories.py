@@ -141,15 +141,6 @@ def test_steps_are_fine_enough_for_the_stickiest_contact():
     assert apart(finer, y) < 2e-4
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_runs_of_another_robot_end_where_settled_travel_is():
-    for variety in range(3):
-        w = brief(world("robots", variety, seed=2), 1.6)
-        _, y = simulated(w, w.constants, w.conditions)
-        assert_allclose(y[:, :, -1], settled.readings(w.conditions, w.constants)[0], rtol=1e-6)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("variety", range(3))
 def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):

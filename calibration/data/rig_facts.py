@@ -251,10 +251,12 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
         return ""
     heading = runs.headings.get(column, column)
+    motionless = largest > needed and not any(c.zero_at_rest and runs.has(c.column) for c in runs.channels)
+    held = "Was the shaft held? Then add a column held with 1 in these rows. " * motionless
     return (
         f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
-        f"slowly at {three_digits(needed)} A. Is it in another unit (mA, mN·m)? Then state [columns] {column} = "
-        f'{{column = "{heading}", factor = ...}}'
+        f"slowly at {three_digits(needed)} A. {held}Is it in another unit (mA, mN·m)? Then state [columns] "
+        f'{column} = {{column = "{heading}", factor = ...}}'
     )
 
 

@@ -902,20 +902,15 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
             ratio = turns[one] / turns[other]
             unit = next((word for word, x in UNITS.items() if abs(math.log(ratio / x)) < NEAR), None)
             if unit is not None:
-                column = (
-                    angles[one] if one in angles and not _direct(runs, one) else channels.find_channel(one).column
-                )
+                column = channels.find_channel(one).column
+                if one in angles and not runs.has(column):
+                    column = angles[one]
                 raise BadData(
                     f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {ratio:.4g} times the value "
                     f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
                     f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
                     f"{{column = ..., factor = {1 / ratio:.3g}}} in the rig's file"
                 )
-
-
-def _direct(runs: Runs, channel: str) -> bool:
-    """True if a channel is read directly instead of from the rate of an angle."""
-    return runs.has(channels.find_channel(channel).column)
 
 
 def _nothing_settled_message(found: Settled, loop: str) -> str:

@@ -167,14 +167,15 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         largest_current = None if log.current is None else float(np.nanmax(np.abs(log.current)))
         limited = Remark("feedforward_limit", level=level, current=largest_current)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-    fitted_windows = _select_windows(windows, windows["demand"] < level) if level else windows
-    values, covariance, _ = _fit_constants(fitted_windows, mechanism)
+    if level:
+        windows = {key: x[windows["demand"] < level] for key, x in windows.items()}
+    values, covariance, _ = _fit_constants(windows, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
     spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
     if mechanism == "simple":
-        remarks += _direction_remarks(fitted_windows)
+        remarks += _direction_remarks(windows)
     remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
@@ -196,12 +197,12 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         remarks.append(Remark("feedforward_gains_delayed", delay=tolerances_used.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
     figures = {
-        "run": fitted_windows["run"],
-        "voltage_V": fitted_windows["u"] / fitted_windows["T"],
-        "velocity": fitted_windows["x"] / fitted_windows["T"],
-        "acceleration": fitted_windows["dv"] / fitted_windows["T"],
-        "direction": fitted_windows["s"] / fitted_windows["T"],
-        "quasistatic": fitted_windows["quasistatic"],
+        "run": windows["run"],
+        "voltage_V": windows["u"] / windows["T"],
+        "velocity": windows["x"] / windows["T"],
+        "acceleration": windows["dv"] / windows["T"],
+        "direction": windows["s"] / windows["T"],
+        "quasistatic": windows["quasistatic"],
     }
     return Feedforward(
         mechanism, log.unit, constants, spread, gains, tolerances_used, delay, lag, missing, figures, tuple(remarks)
@@ -340,10 +341,6 @@ def _is_ramp(driven: np.ndarray) -> bool:
     """True if the driving voltages of a test change, False for a voltage step."""
     size = np.abs(driven)
     return bool(len(size) and size.std() > 0.1 * size.mean())
-
-
-def _select_windows(windows: Columns, kept: np.ndarray) -> Columns:
-    return {key: x[kept] for key, x in windows.items()}
 
 
 def _regression_matrix(w: Columns, mechanism: str) -> np.ndarray:

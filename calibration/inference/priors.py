@@ -289,7 +289,7 @@ def loop_parameter_names(
         if c in present
         for name in (
             *friction_names(robot, c),
-            *_radius_name(robot, c),
+            *([f"{c}.radius"] if robot.shows_travel else []),
             *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
         )
     ]
@@ -321,11 +321,6 @@ def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
     """True if a load has a parameter of this name that is not zero."""
     field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0
-
-
-def _radius_name(robot: Robot, configuration: str) -> Names:
-    """Name of a configuration's radius, unless no channel shows the travel of its shaft."""
-    return (f"{configuration}.radius",) if robot.shows_travel else ()
 
 
 #: Parameters of the drive that act only on the voltage.

@@ -418,7 +418,7 @@ class _LogArrays:
             begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
                 padded = x[np.r_[rows[0], rows, rows[-1]]]
-                lines = name == "motor_speed" or (linear and name != "motor_acceleration")
+                lines = linear or name in ("motor_speed", "motor_acceleration")
                 mean = 0.5 * (padded[1:] + padded[:-1]) if lines else padded[:-1]
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
                 values[name].append(padded)
@@ -513,11 +513,16 @@ def _jump_times(observe: Any, run: int) -> np.ndarray:
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"
-    for name, share in (*((n, JUMP) for n in imposed), ("motor_acceleration", KINK)):
+    for name in imposed:
         x = getattr(conditions, name)
         if x is not None and np.ndim(x) > 1:
             x = np.asarray(x)
-            jumps |= np.abs(np.diff(x[run])) > share * max(float(np.abs(x).max()), 1e-300)
+            jumps |= np.abs(np.diff(x[run])) > JUMP * max(float(np.abs(x).max()), 1e-300)
+    if conditions.motor_acceleration is not None and np.ndim(conditions.motor_acceleration) > 1:
+        length = np.diff(times)
+        slope = np.diff(np.asarray(conditions.motor_speed)[run]) / np.where(length > 0, length, np.inf)
+        largest = max(float(np.abs(conditions.motor_acceleration).max()), 1e-300)
+        jumps[:-1] |= (np.abs(np.diff(slope)) > KINK * largest) & (length[1:] > 0)
     return times[1:][jumps]
 
 

@@ -129,7 +129,7 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
     if part is None:
         nothing = np.zeros(points)
         return OutputStudy(
-            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, (), nothing, finite
+            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, nothing, finite
         )
     return OutputStudy(
         row,
@@ -142,7 +142,6 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
         part.overall,
         part.at_points,
         part.second,
-        part.convergence,
         part.lost,
         part.studied,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import morris, sobol
-from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate
+from calibration.sensitivity.replicates import IntervalEstimate
 from calibration.sensitivity.study import Study
 
 #: Largest share of base points without a value at an operating point that is studied.
@@ -24,7 +24,6 @@ class PartialResult:
     share: np.ndarray | None
     sd: np.ndarray | None
     second: IntervalEstimate | None
-    convergence: tuple[tuple[int, IntervalEstimate], ...]
     lost: np.ndarray
     studied: np.ndarray
 
@@ -60,13 +59,11 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
     names = [o.name for o in study.model.outputs]
     terms: dict[str, dict[int, sobol.VarianceTerms]] = {name: {} for name in names}
     lost_counts = {name: np.zeros(points) for name in names}
-    spent = {}
     for input_set, group in group_points(study, moving).items():
         size = sobol.base_point_count(evaluations / points, len(input_set), True)
         design = sobol.sobol_design(len(input_set), size, seed)
         scores = _sampled_scores(study, design.points, np.array(input_set))
         for k, outputs in study.sample(study.values_at(scores), group):
-            spent[k] = len(design.points)
             for name in names:
                 output_terms = sobol.sobol_terms(design, outputs[name])
                 rows = design.size * design.replicates
@@ -85,18 +82,15 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
             total_terms = output_terms if total_terms is None else total_terms + output_terms
         studied = np.array([k in terms[name] for k in range(points)])
         if total_terms is None:
-            answer[name] = PartialResult({}, {}, None, None, None, (), lost_counts[name], studied)
+            answer[name] = PartialResult({}, {}, None, None, None, lost_counts[name], studied)
             continue
         overall = sobol.indices_of_terms(total_terms)
-        stages = [(r, sobol.indices_of_terms(total_terms, r).total) for r in sobol.STAGES]
-        count = sum(spent[k] for k in terms[name])
         answer[name] = PartialResult(
             {"first": overall.first, "total": overall.total},
             {"first": first, "total": total},
             np.where(np.isfinite(total.value), np.clip(total.value, 0.0, 1.0), np.nan),
             sd,
             overall.second,
-            tuple((count * r // REPLICATES, e) for r, e in stages),
             lost_counts[name],
             studied,
         )
@@ -140,7 +134,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
                 whole[k, places] = part  # fmt: skip
         studied = np.array([k in found[name] for k in range(points)])
         if not studied.any():
-            answer[name] = PartialResult({}, {}, None, None, None, (), lost_counts[name], studied)
+            answer[name] = PartialResult({}, {}, None, None, None, lost_counts[name], studied)
             continue
         square = size.value**2
         share = square / np.where(square.sum(1, keepdims=True) > 0, square.sum(1, keepdims=True), 1.0)
@@ -155,5 +149,5 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
             "mean_effect": IntervalEstimate(mean, mean, mean),
             "sd_effect": IntervalEstimate(spread, spread, spread),
         }
-        answer[name] = PartialResult(overall, at_points, share, None, None, (), lost_counts[name], studied)
+        answer[name] = PartialResult(overall, at_points, share, None, None, lost_counts[name], studied)
     return answer

@@ -129,7 +129,6 @@ class OutputStudy:
         overall: indices of each input over all points: name → estimates of shape (inputs,).
         at_points: indices at each point: name → estimates of shape (points, inputs).
         second: second-order indices over all points, shape (inputs, inputs). None if not computed.
-        convergence: main index after increasing numbers of model evaluations.
         lost: share of base points without a value, at each point, shape (points,).
         studied: True for points that could be studied.
     """
@@ -145,7 +144,6 @@ class OutputStudy:
     overall: dict[str, IntervalEstimate]
     at_points: dict[str, IntervalEstimate]
     second: IntervalEstimate | None
-    convergence: tuple[tuple[int, IntervalEstimate], ...]
     lost: np.ndarray
     studied: np.ndarray
 
@@ -305,14 +303,6 @@ class SensitivityResult:
                     name: interactions(study, names)
                     for name, study in self.outputs.items()
                     if study.second is not None
-                },
-                "convergence": {
-                    name: [
-                        {"evaluations": count, "indices": _estimates_by_input(names, {"index": estimate})}
-                        for count, estimate in study.convergence
-                    ]
-                    for name, study in self.outputs.items()
-                    if study.convergence
                 },
                 **entries_of(self, "negligible", "statuses", "statuses_sampled=sampled"),
                 "next_runs": None if self.next_runs is None else _next_runs_json(self.next_runs, names),

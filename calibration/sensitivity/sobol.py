@@ -21,8 +21,6 @@ from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate, rat
 
 #: Fewest points of a replicate.
 FEWEST = 4
-#: Numbers of replicates for which convergence is shown.
-STAGES = (4, 8, 16, REPLICATES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,17 +176,11 @@ class SobolIndices:
     variance: float
 
 
-def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> SobolIndices:
-    """Sobol indices from the parts of the variance. `replicates`: only this many of the first replicates."""
-    replicate_slice = slice(replicates)
-    variance, first = terms.variance[replicate_slice], terms.first[replicate_slice]
-    second = None
+def indices_of_terms(terms: VarianceTerms) -> SobolIndices:
+    """Sobol indices from the parts of the variance."""
+    variance, first, second = terms.variance, terms.first, None
     if terms.second is not None:
-        interaction = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
-        second = ratio_estimate(interaction, variance)
+        second = ratio_estimate(terms.second - first[:, :, None] - first[:, None, :], variance)
     return SobolIndices(
-        ratio_estimate(first, variance),
-        ratio_estimate(terms.total[replicate_slice], variance),
-        second,
-        float(variance.mean()),
+        ratio_estimate(first, variance), ratio_estimate(terms.total, variance), second, float(variance.mean())
     )

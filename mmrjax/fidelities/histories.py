@@ -244,10 +244,22 @@ class RunStep(eqx.Module):
         return jax.vmap(rate)(states, stacked)
 
 
+def _slopes(speed: Array, times: Float[Array, " times"]) -> Array:
+    """Slopes of the lines between the imposed speeds of instants, 0 in steps of no length."""
+    length = jnp.diff(times)
+    return jnp.where(length > 0, jnp.diff(speed) / jnp.where(length > 0, length, 1.0), 0.0)
+
+
 def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[RunStep, Conditions]:
-    """All steps of a run, and the conditions that do not change."""
+    """All steps of a run, and the conditions that do not change.
+
+    In a step an imposed speed follows the line between the instants. At an instant it has the acceleration that the
+    conditions state.
+    """
     changing, constant = _split_conditions(conditions)
     now = jax.tree.map(lambda x: x[:-1], changing)
+    if changing.motor_speed is not None and now.motor_acceleration is not None:
+        now = eqx.tree_at(lambda c: c.motor_acceleration, now, _slopes(changing.motor_speed, times))
     jumped = jnp.zeros(len(times) - 1, bool)
     for x in (getattr(now, name) for name in DRIVING):
         if x is not None:
@@ -739,16 +751,17 @@ def course_between_instants(
     """
     ys, sides = _unknowns_of_run(robot, conditions, times, known)
     steps, constant = run_steps(conditions, times)
-    then = jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
-    course_inputs = ys[:-1], ys[1:], steps, then, sides
+    instants = _split_conditions(conditions)[0]
+    begun, then = (jax.tree.map(lambda x, cut=cut: x[cut], instants) for cut in (slice(-1), slice(1, None)))
+    course_inputs = ys[:-1], ys[1:], steps, begun, then, sides
     if at is not None:
         course_inputs = jax.tree.map(lambda x: x[at], course_inputs)
 
-    def one(y: Array, after: Array, step: RunStep, then: Conditions, sides: Array) -> StepCourse:
+    def one(y: Array, after: Array, step: RunStep, begun: Conditions, then: Conditions, sides: Array) -> StepCourse:
         conditions = step.held(constant)
         y = sampled_unknowns(robot, conditions, y)
         if step.before is None:  # the imposed quantity is itself linear
-            first = signals_of_instant(robot, conditions, y, sides[0])
+            first = signals_of_instant(robot, eqx.combine(begun, constant), y, sides[0])
             return StepCourse(
                 first, first, signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
             )

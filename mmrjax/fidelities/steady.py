@@ -286,18 +286,13 @@ def _state_at_unknowns(
     return signals, status, sound, residual
 
 
-def _vmap_axes(tree: Any) -> Any:
-    """Axes for `jax.vmap`: 0 for arrays with a leading axis of points, else None."""
-    return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
-
-
 #: Most points that a CPU computes at once; the intermediate values of a block then fit in its cache.
 BLOCK = 32_768
 
 
 def _map_over_points(function: Callable[..., Any], *arguments: Any) -> Any:
     """`function` of scalars, mapped over the leading axis of all arrays that have one. On a CPU block by block."""
-    batched = jax.vmap(function, in_axes=_vmap_axes(arguments))
+    batched = jax.vmap(function, in_axes=jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, arguments))
     leaves, tree = jax.tree.flatten(arguments)
     points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
     # Blocks of equal size share a program; a number of points without a suitable divisor is computed at once.

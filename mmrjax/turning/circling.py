@@ -247,10 +247,6 @@ def _load_units(robot: Robot, conditions: Conditions) -> Pair:
     return jnp.stack([robot.chassis(conditions.configuration).mass * GRAVITY, robot.running_gear.wheelbase])
 
 
-def _load_transfer(robot: Robot, conditions: Conditions, y: Settling) -> Pair:
-    return y[SETTLING:] * _load_units(robot, conditions)
-
-
 def _is_searched(conditions: Conditions) -> np.ndarray:
     """True for the unknowns of a search, False for imposed speeds and their currents, shape (9,)."""
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
@@ -368,7 +364,7 @@ def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tu
         conditions.of_sides(), motion.current
     )
     motion = dataclasses.replace(motion, current=current)
-    travel = _turning(rest.without_diode(robot), conditions, motion, _load_transfer(robot, conditions, y))
+    travel = _turning(rest.without_diode(robot), conditions, motion, y[SETTLING:] * _load_units(robot, conditions))
     signals = travel.signals
     signals = dataclasses.replace(
         signals, voltage=signals.voltage - is_limited, voltage_left=signals.voltage_left - is_limited

@@ -107,12 +107,11 @@ def noise_of_angle(readings: np.ndarray) -> float:
 
 
 def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> tuple[np.ndarray, int]:
-    """Motion at `times` on a smoothing spline, shape (4, times), and the number of the spline's knots.
+    """Motion at `times` on a smoothing spline, shape (3, times), and the number of the spline's knots.
 
-    The motion is the angle [rad], the speed, the acceleration, and the slope of the line to the next speed. The
-    spline has the fewest knots with which its residuals equal the noise. If most readings repeat others, this noise
-    is at least that of the display's step. Knots are dense at jumps of the torque, so that the acceleration jumps
-    within a few samples.
+    The motion is the angle [rad], the speed and the acceleration. The spline has the fewest knots with which its
+    residuals equal the noise. If most readings repeat others, this noise is at least that of the display's step.
+    Knots are dense at jumps of the torque, so that the acceleration jumps within a few samples.
     """
     noise, steps = noise_of_angle(angle), np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
@@ -120,9 +119,7 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # more knots would be needed, for readings without noise
         curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
-    speed = curve.derivative(1)(times)
-    lines = np.diff(speed) / np.diff(times)
-    return np.stack([curve(times), speed, curve.derivative(2)(times), [*lines, lines[-1]]]), len(curve.get_knots())
+    return np.stack([curve(times), *(curve.derivative(n)(times) for n in (1, 2))]), len(curve.get_knots())
 
 
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
@@ -141,13 +138,13 @@ def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays
 def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray, int]:
     """`smoothed_motion` of all joints at each row of a log, by splines of degree 5 and of degree 3.
 
-    Both have the shape (4, rows, joints). The largest number of knots of a joint at degree 5 follows.
+    Both have the shape (3, rows, joints). The largest number of knots of a joint at degree 5 follows.
 
     Raises:
         BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. Also as
             in `check_units`.
     """
-    motion, cubic = np.empty((2, 4, len(log), len(chain.names)))
+    motion, cubic = np.empty((2, 3, len(log), len(chain.names)))
     knots = np.zeros(len(chain.names), int)
     for k, name in enumerate(chain.names):
         joint = columns_of_joint(log, name, chain.names)
@@ -182,12 +179,11 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
 def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) -> dict[str, Runs]:
     """Runs of each joint, with the torque of the rest of the model as the torque of its load.
 
-    It is the torque of the model minus the torque of inertia and weight in the joint's file. The simulation computes
-    accelerations from linear speeds between rows, half a row early, so the torque contains the difference. The motor
-    speed is that of the smoothed motion. Errors of both are largest where the torque jumps: within two knots of a
-    jump they are about the difference from a cubic spline. Within one knot of a jump of the current, the error of the
-    torque is up to that jump. This error is included in the current's sd, unless the log states the sd. If it exceeds
-    the current's noise, one row per knot is used. Readings are omitted if the direction of the speed is uncertain,
+    It is the torque of the model minus the torque of inertia and weight in the joint's file. The motor speed is that
+    of the smoothed motion. Errors of both are largest where the torque jumps: within two knots of a jump they are
+    about the difference from a cubic spline. Within one knot of a jump of the current, the error of the torque is up
+    to that jump. This error is included in the current's sd, unless the log states the sd. If it exceeds the
+    current's noise, one row per knot is used. Readings are omitted if the direction of the speed is uncertain,
     because friction in the wrong direction would count as an error.
 
     Args:
@@ -197,7 +193,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         BadData: as in `smoothed_log` and `runs.runs_of_arrays`.
     """
     motion, cubic, knots = smoothed_log(log, chain)
-    torques, cubic_torques = chain.torques(motion[:3]), chain.torques(cubic[:3])
+    torques, cubic_torques = chain.torques(motion), chain.torques(cubic)
     rows_per_knot = round(len(log) / knots)  # rows from knot to knot
     doubts = [
         maximum_filter1d(np.abs(x), 4 * rows_per_knot + 1, axis=0)
@@ -207,13 +203,11 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
     for name, robot in robots.items():
         k, (load,) = chain.names.index(name), robot.configurations.members
         joint = columns_of_joint(log, name, chain.names)
-        angle, speed, acceleration, lines = motion[:, :, k]
+        angle, speed, acceleration = motion[:, :, k]
         ratio = float(robot.gearbox.ratio)
         per_ampere = ratio * float(robot.gearbox.efficiency_load * robot.motor.torque_constant)
-        rotor = ratio**2 * float(robot.gearbox.efficiency_load * robot.motor.inertia)
-        inertial = float(load.inertia) * lines + rotor * (lines - acceleration)
         columns = {
-            LOAD: torques[:, k] - inertial - np.asarray(load.torque_load(angle)),
+            LOAD: torques[:, k] - float(load.inertia) * acceleration - np.asarray(load.torque_load(angle)),
             SPEED: speed * ratio / RPM,
             **{DOUBTS[0]: doubts[0][:, k] / per_ampere, DOUBTS[1]: CERTAIN * doubts[1][:, k] * ratio / RPM},
         }

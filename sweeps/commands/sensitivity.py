@@ -138,8 +138,7 @@ def _operating_points(
         imposed.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
-                f"--vary {name}: the robot's file imposes the "
-                f"{imposed_quantity_words(layout.imposed)}; vary it instead"
+                f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
         raise BadConfiguration(
@@ -164,11 +163,6 @@ def _operating_points(
     return grid_conditions(
         grid.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
     )
-
-
-def imposed_quantity_words(name: str) -> str:
-    """Words for the imposed quantity."""
-    return name.replace("_", " ")
 
 
 def _uncertain_inputs(

@@ -411,14 +411,10 @@ def constants_text(constants: Sequence[LawConstant], name: str = "PARAMS") -> st
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
     lines = [f"{name} = {{"]
     for c in constants:
-        lines += [f"    # {text}" for text in textwrap.wrap(printable(_constant_comment(c)), 106)]
+        comment = f"{c.meaning} [{c.unit}]{f'; {c.interval}' * bool(c.interval)}; {c.source}"
+        lines += [f"    # {text}" for text in textwrap.wrap(printable(comment), 106)]
         lines.append(f"    {quoted(c.name)}: {c.value!r},")
     return "\n".join([*lines, "}"])
-
-
-def _constant_comment(c: LawConstant) -> str:
-    interval = f"; {c.interval}" if c.interval else ""
-    return f"{c.meaning} [{c.unit}]{interval}; {c.source}"
 
 
 def _module_header(joint: DriveJoint, what: str, notes: Sequence[str]) -> str:

@@ -46,10 +46,6 @@ def draw_clusters(found: Sequence[ResidualCluster]) -> Figure:
     return fig
 
 
-#: Most panels of a pair plot, and radii that hold 68 % and 95 % of a normal distribution of two [sds].
-PAIRED, RADII = 6, (1.515, 2.448)
-
-
 def draw_parameter_intervals(found: CalibrationResult) -> Figure:
     """Estimate of each parameter in prior sds, with its 95 % interval and the prior's."""
     fig, grid = new_figure(1, 1, 1.1 + 0.32 * len(found.parameters))
@@ -117,34 +113,6 @@ def draw_correlations(found: CalibrationResult) -> Figure:
     right.set_xticks(np.arange(1, len(s) + 1, 2))
     right.set(xlabel="direction", ylabel="prior sd / data sd")
     right.set_title("combinations of parameters")
-    return fig
-
-
-def draw_correlated_pairs(found: CalibrationResult) -> Figure:
-    """Posterior of the most correlated pairs of parameters: contours that hold 68 % and 95 %."""
-    posterior = found.posterior
-    sd = np.sqrt(np.diag(posterior.covariance))
-    correlation = np.abs(posterior.covariance / np.outer(sd, sd))
-    pairs = [(i, j) for i in range(len(posterior)) for j in range(i)]
-    shown_pairs = sorted(pairs, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
-    fig, grid = new_figure(-(-len(shown_pairs) // 3), min(3, len(shown_pairs)), 2.9 * -(-len(shown_pairs) // 3))
-    turn = np.linspace(0, 2 * np.pi, 120)
-    circle = np.stack([np.cos(turn), np.sin(turn)], 1)
-    for axes in grid.ravel()[len(shown_pairs) :]:
-        axes.set_axis_off()
-    for axes, (i, j) in zip(grid.ravel(), shown_pairs, strict=False):
-        pair = [j, i]
-        root = np.linalg.cholesky(posterior.covariance[np.ix_(pair, pair)] + 1e-18 * np.eye(2))
-        for radius, shade in zip(RADII, (1.0, 0.45), strict=True):
-            z = np.tile(posterior.mean, (len(turn), 1))
-            z[:, pair] += radius * circle @ root.T
-            axes.plot(*np.asarray(posterior.at(z))[:, pair].T, color=BLUE, alpha=shade, lw=1.4)
-        axes.plot(*np.asarray(posterior.at(posterior.mean))[pair], "o", ms=4, color=INK)
-        axes.ticklabel_format(style="sci", scilimits=(-2, 4), useMathText=True)
-        axes.locator_params(nbins=4)
-        x, y = (f"{short_name(posterior.coordinates[k])} [{posterior.units[k]}]" for k in pair)
-        axes.set_xlabel(x, loc="left")
-        axes.set(ylabel=y, title=f"correlation {posterior.covariance[j, i] / (sd[j] * sd[i]):.2f}")
     return fig
 
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from calibration.data import Columns
 from calibration.data.courses import applied_drive
 from calibration.data.table import Runs
-from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import place_in_words
@@ -28,14 +28,12 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
-    add_corner_note,
     colour_bar,
     configuration_looks,
     is_narrow,
     new_figure,
     outer_legend,
 )
-from sweeps.pages.words import short_name
 from sweeps.report.fit_tables import Change
 from sweeps.report.run_tables import UNITS, imposed_column
 
@@ -279,28 +277,6 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     return fig
 
 
-#: Kinds of evidence that are drawn, and their statistics.
-KINDS = {
-    "single": "strongest effect [σ]",
-    "curve": "strongest curve [normal deviate]",
-    "chi2": "χ² of the residuals",
-}
-
-
-def draw_bootstrap_statistics(before: Evidence) -> Figure:
-    """The strongest statistics among bootstrap tables in which nothing is missing, and those of the data."""
-    fig, grid = new_figure(1, len(KINDS), 2.5)
-    for axes, (name, text) in zip(grid[0], KINDS.items(), strict=True):
-        kind = before.kinds[name]
-        axes.hist(kind.null, bins=30, color="#c9c9c9")
-        axes.axvline(kind.threshold, color=ORANGE, lw=1.6)
-        axes.axvline(kind.found, color=BLUE, lw=2)
-        axes.set_xlabel(text)
-        axes.set_yticks([])
-    add_corner_note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
-    return fig
-
-
 def draw_errors(found: DiscoveryResult) -> Figure:
     """rms error before and after, fitted, and held out by each kind of block."""
     lines = {"fitted": found.errors}
@@ -519,25 +495,6 @@ def draw_similar_effects(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(names)), names)
     axes.grid(visible=False)
     colour_bar(fig, image, axes, label="|cos| of the signatures", shrink=0.8)
-    return fig
-
-
-def draw_parameter_shifts(found: DiscoveryResult) -> Figure:
-    """Each base parameter in prior sds, before and after the effects were added."""
-    shift = found.base_shift
-    fig, grid = new_figure(1, 1, 1.0 + 0.27 * len(shift))
-    axes = grid[0, 0]
-    axes.axvspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
-    axes.axvline(0, color=FAINT, lw=0.9)
-    for row, p in enumerate(shift.values()):
-        axes.plot([p.shift_before, p.shift_after], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
-        axes.plot(p.shift_before, row, "o", ms=6, mfc="white", color=ORANGE)
-        axes.plot(p.shift_after, row, "o", ms=5, color=BLUE)
-    axes.set_yticks(range(len(shift)), [short_name(n) for n in shift])
-    axes.invert_yaxis()
-    axes.grid(axis="y", visible=False)
-    axes.set(xlabel="shift from the prior [prior sds]")
-    axes.set_title("orange: before, blue: after. A large shift probably absorbs a missing effect")
     return fig
 
 

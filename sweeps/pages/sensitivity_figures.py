@@ -1,4 +1,4 @@
-"""Figures of a sensitivity study: overview, tornadoes, heat maps over conditions, convergence, next runs."""
+"""Figures of a sensitivity study: who decides what, tornadoes, heat maps over conditions."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.sensitivity.replicates import IntervalEstimate
-from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
-from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, add_corner_note, legend_columns, new_figure
+from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, legend_columns, new_figure
 from sweeps.pages.words import short_name
 
 #: Most inputs in a figure, and most operating points in a tornado.
@@ -180,56 +179,3 @@ def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityRes
 
 def _range_text(values: np.ndarray) -> str:
     return f"{values.min():g}-{values.max():g}"
-
-
-def draw_convergence(found: SensitivityResult) -> Figure:
-    """Main index of the leading inputs of each output against the number of model evaluations."""
-    studies = [s for s in found.outputs.values() if s.convergence][:6]
-    rows = -(-len(studies) // 3)
-    fig, axes = new_figure(rows, min(3, len(studies)), 2.1 * rows + 0.4)
-    for ax, study in zip(axes.ravel(), studies, strict=False):
-        counts = np.array([count for count, _ in study.convergence])
-        for k, colour in zip(leading_inputs(study.overall_share, 3), (BLUE, VERMILION, GREEN), strict=False):
-            series = [e[k] for _, e in study.convergence]
-            low, high = np.array([e.low for e in series]), np.array([e.high for e in series])
-            ax.fill_between(counts, low, high, color=colour, alpha=0.18, linewidth=0)
-            ax.plot(
-                counts,
-                [float(e.value) for e in series],
-                "o-",
-                color=colour,
-                markersize=3,
-                label=short_name(found.names[k]),
-            )
-        ax.set_xscale("log")
-        ax.set_xticks(counts, [f"{count / 1000:.0f}k" for count in counts])
-        ax.minorticks_off()
-        ax.set_ylim(bottom=0)
-        ax.set_title(study.row.label)
-        ax.legend(fontsize=7.5, loc="best")
-    for ax in axes.ravel()[len(studies) :]:
-        ax.set_visible(False)
-    axes[-1, 0].set_xlabel("model evaluations")
-    axes[-1, 0].set_ylabel("total index [-]")
-    return fig
-
-
-def draw_next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
-    """Remaining share of each input's sd after each proposed run."""
-    remaining_sd = runs.sd[-1]
-    moving = [k for k in np.argsort(remaining_sd, kind="stable") if remaining_sd[k] < 0.99][:10]
-    fig, axes = new_figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
-    ax = axes[0, 0]
-    for place, k in enumerate(moving):
-        ax.barh(-place, 1.0, color="#e9ecef", height=0.66)
-        ax.barh(-place, remaining_sd[k], color=BLUE, height=0.66)
-        ax.text(remaining_sd[k] + 0.01, -place, f"{100 * remaining_sd[k]:.0f} %", va="center", fontsize=8.5)
-    ax.set_yticks([-p for p in range(len(moving))], [short_name(found.names[k]) for k in moving])
-    ax.set_xlim(0, 1.02)
-    ax.set_xlabel(
-        f"standard deviation after {count_noun(len(runs.points), 'such run')}, as a share of that before [-]"
-    )
-    ax.grid(axis="y", visible=False)
-    if not moving:
-        add_corner_note(ax, "these runs give no information on these inputs")
-    return fig

@@ -38,7 +38,8 @@ def draw_gearbox_efficiency(robots: dict[str, Robot], rows: data.PaperRows | Non
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
     colour = MODEL.get(name, PURPLE)
-    top = 1.25 * max(2.0, 0.0 if rows is None else _largest_gear_torque(robot, rows))
+    torques = [2.0] if rows is None else [2.0, *_gear_torque(robot, rows)]
+    top = 1.25 * float(np.nanmax(torques))
     for (volts, speed), line in zip(_GEAR_SPEEDS.items(), ("-", "--"), strict=True):
         idle = float(robot.gearbox.torque_idle(speed * data.RPM, 1.0))
         inputs = idle + np.geomspace(1e-5, top / float(robot.gearbox.ratio * robot.gearbox.efficiency_load), 300)
@@ -102,11 +103,6 @@ def _gear_torque(robot: Robot, rows: data.PaperRows) -> np.ndarray:
 
 def _kind(rows: data.PaperRows) -> np.ndarray:
     return rows.conditions["configuration"]
-
-
-def _largest_gear_torque(robot: Robot, rows: data.PaperRows) -> float:
-    torque = _gear_torque(robot, rows)
-    return float(np.nanmax(torque)) if np.isfinite(torque).any() else 2.0
 
 
 def _mark_rows(axes: Axes, robot: Robot, rows: data.PaperRows) -> None:

@@ -131,8 +131,6 @@ def _certainty(found: CalibrationResult) -> Iterable[Block]:
     if found.profiled:
         yield catalogue.figure("calibration.profiles", found)
     yield catalogue.figure("calibration.correlations", found)
-    if len(found.posterior) > 1:
-        yield catalogue.figure("calibration.pairs", found)
     weak = [
         (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
         for value, parts in found.identifiability.weak_directions()

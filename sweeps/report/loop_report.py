@@ -339,10 +339,9 @@ def _sections(
     yield Section("Errors on runs used in the fit, and on held-out runs", tuple(error_blocks))
     yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
-    hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
-    yield Section("", hidden, folded="how thresholds were determined, and which effects are similar")
+    yield Section("", (catalogue.figure("loop.look_alikes", found),), folded="which effects are similar")
     yield from [looked_for] if missing else []
-    yield Section("Parameters before and after", (catalogue.figure("loop.base_shift", found), _base(found)))
+    yield Section("Parameters before and after", (_base(found),))
     first = {"row": table["row"]}
     if isinstance(found.detail, TimeStatistics):
         first |= {"run": table.get("run_id", table["row"]), "t [s]": table["time_s"]}

@@ -1,4 +1,4 @@
-"""Report of a sensitivity study: the answer, then each output, interactions, convergence and next runs."""
+"""Report of a sensitivity study: the answer, then each output, interactions and next runs."""
 
 from __future__ import annotations
 
@@ -60,9 +60,6 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
     if found.next_runs is not None:
         yield Section("What to measure next", tuple(_next_runs(found, found.next_runs)), "measure")
     yield Section("Inputs", (_inputs(found), catalogue.note("sensitivity.largest")), "inputs")
-    if any(study.convergence for study in found.outputs.values()):
-        figure = catalogue.figure("sensitivity.convergence", found)
-        yield Section("Convergence", (figure,), "convergence-of-indices")
 
 
 def _any_influence(study: OutputStudy) -> bool:
@@ -135,7 +132,6 @@ def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
         for k in range(len(points))
     ]
     yield catalogue.table("sensitivity.next-runs", rows, imposed, *ground)
-    yield catalogue.figure("sensitivity.next_runs", n, found)
     runs_left = []
     for name, sds in n.output_sd.items():
         row = found.outputs[name].row

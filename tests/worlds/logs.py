@@ -1,6 +1,7 @@
 """Logs over time of random rigs with undeclared effects: one drive and a load on a shaft, from plain NumPy physics.
 
-The voltage, the current or the speed of the motor is imposed. Four runs of 200 rows. Shares nothing with mmrjax. Many
+The voltage, the current or the speed of the motor is imposed. A speed is smooth: a cubic spline of its rows. Four runs
+of 200 rows. Shares nothing with mmrjax. Many
 perturbed rigs go through the classical Runge-Kutta method at once, with steps of the winding's time constant.
 """
 
@@ -13,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from worlds import laws
 from worlds.histories import ROUNDS, runge_kutta, soft_sign, teeth
 from worlds.laws import Term, shaped
@@ -158,8 +160,8 @@ def rig(
     every = drawn if every is None else every
     inputs = np.stack([_inputs(rng, imposed, every, supply, rated, fast) for _ in range(RUNS)])
     late = float(rng.choice([0.0, rng.uniform(0.0, 2.0)]))
-    # The current of an imposed speed jumps from row to row with its slope: late by whole rows it is not read in between.
     step = (SERVO_WINDING if imposed == GOAL else WINDING) / 2  # readings are those of a step
+    # The current of an imposed speed jumps where its friction turns: late by whole rows it is not read in between.
     delay = every * round(late) if imposed == "motor_speed" else step * round(late * every / step)
     made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, delay, {})
     made = dataclasses.replace(made, alone=alone and imposed != "motor_speed")
@@ -258,18 +260,20 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     way = np.zeros(count * RUNS)  # in which dry friction acts as of motion; 0 where it holds the shaft
     y = np.zeros((4, count * RUNS))
     lines = r.imposed == "motor_speed"
+    curve = CubicSpline(np.arange(ROWS), inputs, axis=1)  # an imposed speed, at half steps, and its slope
+    smooth = [curve(np.arange(2 * per * (ROWS - 1) + 1) / (2 * per), n).T / r.every**n for n in (0, 1) if lines]
     h, late = r.every / per, round(r.delay / (r.every / per))
     wanted = {max(row * per - late, 0) for row in range(ROWS)}
     kept: dict[int, list[np.ndarray]] = {}
     for row in range(ROWS):
         now = inputs[:, row]
-        after = min(row + 1, ROWS - 1)  # the last row accelerates as the step that ends there
-        slope = (inputs[:, after] - inputs[:, after - 1]) / r.every if lines else 0.0
         for n in range(per):
             t = (row + n / per) * r.every
 
             def at(x: float, y: np.ndarray, what: Any = rates) -> Any:
-                return what(t + x * h, y, now + slope * (n + x) * h, slope, braked[:, row])  # noqa: B023
+                half = min(2 * (row * per + n) + round(2 * x), len(smooth[0]) - 1) if lines else 0  # noqa: B023
+                given, slope = (smooth[0][half], smooth[1][half]) if lines else (now, 0.0)  # noqa: B023
+                return what(t + x * h, y, given, slope, braked[:, row])  # noqa: B023
 
             if row * per + n in wanted:
                 s = at(0.0, y, signals) if lines else SimpleNamespace(I=y[0], w=y[1])

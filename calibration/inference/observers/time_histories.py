@@ -914,12 +914,14 @@ def _conditions_over_time(
             conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
     if of_rows.motor_speed is None:
         return conditions
-    speed = _interpolate_at_instants(np.asarray(of_rows.motor_speed), each, time, times)
-    step = np.diff(times, axis=1)
-    slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
-    # An instant has the acceleration of the step that it begins; the last begins none, and has that of the last step.
-    last = np.maximum.accumulate(np.where(step > 0, np.arange(step.shape[1]), 0), 1)
-    slope = np.take_along_axis(slope, np.concatenate([last, last[:, -1:]], 1), 1)
+    every = np.asarray(of_rows.motor_speed)
+    speed = _interpolate_at_instants(every, each, time, times)
+    # Rows are samples of a smooth motion. Slopes of the lines from row to row were those of half a row later.
+    gradient = [
+        np.gradient(every[rows], time[rows], edge_order=2 if len(rows) > 2 else 1) if len(rows) > 1 else np.zeros(1)
+        for rows in each
+    ]
+    slope = np.stack([np.interp(t, time[rows], x) for rows, x, t in zip(each, gradient, times, strict=True)])
     # Not by `dataclasses.replace`, because its constructor would broadcast constant conditions over the instants.
     return eqx.tree_at(
         lambda c: (c.motor_speed, c.motor_acceleration),
