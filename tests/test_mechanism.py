@@ -59,7 +59,7 @@ def found(monkeypatch):
     library = {n: SimpleNamespace(family=lambda f=f: f) for n, f in FAMILIES.items()}
     space = SimpleNamespace(
         weight=np.ones((ROWS, 1)), library=library, included=np.ones(ROWS, bool),
-        bare=SimpleNamespace(channels=(), observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
+        bare=SimpleNamespace(channels=(), observe=SimpleNamespace(long=False, reads=True, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})

@@ -5,9 +5,10 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import discover, findings, screening
+from calibration.discovery import active_set, candidates, discover, findings, screening
 from calibration.discovery.settings import settings_for
-from calibration.inference.observers import Histories
+from calibration.inference import weak_form
+from calibration.inference.observers import Histories, windows
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from tests.commands import motor_on_bench
@@ -62,12 +63,23 @@ def answered(tmp_path_factory):
     file.write_text(RIG, encoding="utf-8")
     robot, library = robot_file.read_robot(file), {n: BY_NAME[n] for n in NAMES}
 
-    def of(**faults):
+    def input_of(**faults):
+        runs = Runs("log.csv", log(**faults)).of(robot)
+        noise = (
+            f"motor_speed={SD[0] / RPM}rpm,{next(c.name for c in runs.channels if c.name != 'motor_speed')}={SD[1]}A"
+        )
+        return discover.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
+
+    def space_of(**faults):
         runs = Runs("log.csv", log(**faults)).of(robot)
         sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
-        space = discover.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
+        return discover.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
+
+    def of(**faults):
+        space = space_of(**faults)
         return findings.rank_effects_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
 
+    of.space_of, of.input_of = space_of, input_of
     return of
 
 
@@ -91,3 +103,50 @@ def test_a_delay_of_ten_rows_is_a_parameter_and_nothing_is_missing(answered):
     found = answered(late=10)
     value, _ = found.parameters["rig.delay"]
     assert not found.missing and value == pytest.approx(0.1, abs=EVERY)
+
+
+def test_windows_fit_effects_as_least_squares_do(answered):
+    """A log is a table of equations: residuals, slopes and signatures of its regression, and shapes between them."""
+    space = answered.space_of(forward=0.3)
+    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
+    posed, rows = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    observe, names = posed.observe, space.library.names
+    table = active_set.candidate_space(
+        posed, space.library.effects, {n: BY_NAME[n] for n in NAMES}, 4, SETTINGS.width
+    )
+    slots = ("directional_friction", "supply_sag", "", "")
+    (found,) = candidates.fit_candidates(table, [(slots, np.zeros(table.free + 8))], SETTINGS)
+    linear, size = observe.linear, table.free
+    counts = np.asarray(posed.data.weight).ravel() > 0
+    e, j, g = (
+        np.asarray(x)[: linear.readings][counts] for x in (linear.residual, linear.jacobian, linear.signatures)
+    )
+    chosen = [list(space.library.of).index(names.index(n)) for n in slots[:2]]  # without a shape
+    columns = np.concatenate([j, SETTINGS.width * g[:, chosen]], 1)
+    prior = np.concatenate([np.asarray(fit.origin) - fit.centre, np.zeros(2)])
+    move = -np.linalg.lstsq(np.concatenate([columns, np.eye(size + 2)]), np.concatenate([e, prior]), rcond=None)[0]
+    expected = np.concatenate([fit.origin + move[:size], move[size:]])
+    assert np.max(np.abs(found.z[: size + 2] - expected) / found.sd[: size + 2]) < 0.05  # the end of a search
+    assert move[size] > 5 * found.sd[size] and len(rows) == len(posed.data.weight)
+
+
+def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered):
+    space = answered.space_of(forward=0.3)
+    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
+    posed, _ = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    linear = posed.observe.linear
+    way = np.asarray(linear.signals.direction)
+    column = np.asarray(linear.columns(linear.probed.index("track"), way[:, None] ** 2))[:, 0]
+    offset = np.asarray(linear.signatures)[
+        :, list(space.library.of).index(space.library.names.index("torque_offset"))
+    ]
+    assert abs(column @ offset) > 0.999 * np.linalg.norm(column) * np.linalg.norm(offset) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault, family", [({"forward": 0.3}, "loss torque that changes with direction"), ({}, "")])
+def test_the_windows_of_a_log_decide_and_one_simulation_confirms(answered, monkeypatch, fault, family):
+    monkeypatch.setattr(discover, "LONG", 0)
+    traced = answered.input_of(**fault).trace_windows()
+    assert (traced is None) == (not fault)
+    assert not fault or (family in traced.families and traced.run.gained > 0.5 * traced.run.promised > 0)

@@ -143,7 +143,7 @@ def test_noise_that_windows_and_equations_share_is_correlated(space, before):
     rows, _, (w, *_) = shown_states.points_and_windows(problem, plan)
     w, z, sd = w.part(np.arange(12)), before.base.z[: space.free], np.asarray(rows.sd)
     terms = weak_form._terms_with_derivatives(problem, plan, rows, z, ())
-    factor = weak_form._covariance_factor(plan, w, sd, jax.device_get(terms), np.zeros(2))
+    factor = weak_form.covariance_factor(plan, w, sd, jax.device_get(terms), np.zeros(2))
     value = dict(zip(problem.coordinates.names, np.asarray(problem.coordinates.value(z)), strict=True))
     r, k, inertia = (float(value[f"motor.{name}"]) for name in TRUE)
     noise = sd * np.random.default_rng(0).standard_normal((20_000, *sd.shape))

@@ -275,6 +275,7 @@ SAMPLES = [
         axis="slope_deg",
         beside=(17.5, 22.5),
     ),
+    Remark("contradicted", promised=0.7, gained=0.2),
     Remark("unwritten", curve=True, gain=0.13, se=0.42),
     Remark("unwritten", curve=False, gain=-0.2, se=0.05),
     Remark("too_few_replicates", settled=100),

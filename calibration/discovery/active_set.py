@@ -259,7 +259,7 @@ def candidate_space(
     have = {e.name for e in bare.base.effects}
     more = tuple(library[e.name]() for e in effects if e.name not in have)
     robot = params.without_weak_types(dataclasses.replace(bare.base, effects=(*bare.base.effects, *more)))
-    data = dataclasses.replace(bare.data, centre=jnp.zeros(len(coordinates)))
+    data = dataclasses.replace(bare.data, centre=jnp.pad(bare.data.centre, (0, 2 * slots)))
     grids = tuple(with_shape_grid(e) for e in effects)
     effect = np.repeat(np.arange(len(grids)), [len(s.at) for s in grids])
     return CandidateSpace(

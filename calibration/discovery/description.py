@@ -30,6 +30,8 @@ def missed_channels(
     Args:
         refit: linearization of the fit without effects.
     """
+    if not space.bare.observe.reads:
+        return ()
     has_stated_sd = np.array([source not in UNSTATED for source in noise.source])
     share, sigma = _error_shares(space, runs, noise, refit)
     large = (share > UNDESCRIBED) & ~(has_stated_sd & (sigma <= EXPLAINED))

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,7 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
+from calibration.discovery.log_simulation import LogSimulation, simulate_models
 from calibration.discovery.loop_notes import (
     AlternativeValue,
     Mechanism,
@@ -49,7 +51,7 @@ from calibration.discovery.loop_notes import (
     VerdictSummary,
 )
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
-from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
+from calibration.discovery.mechanism import cached_hold_out_score, excess_misfit, find_mechanism
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
@@ -85,8 +87,10 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
+from calibration.inference.observers.windows import problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
+from calibration.inference.weak_form import fit_weak_form
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -113,6 +117,10 @@ WORSE = 1.1
 LIKELY = 4.0
 #: Distance from the prior above which a note reports a base parameter [prior sd].
 FAR = 3.0
+#: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
+LONG = 4000
+#: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
+CHANCE = 3.0
 #: Callback for progress notes.
 Tell = Callable[[Remark | str], None]
 
@@ -241,6 +249,7 @@ class LoopInput:
     keep: StoreStage = kept.compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
+    equations: CandidateSpace | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -255,6 +264,8 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
+        if (by_windows := self.trace_windows()) is not None:
+            return by_windows
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
@@ -265,6 +276,15 @@ class LoopInput:
                 word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
+
+    def trace_windows(self) -> LoopStages | None:
+        """Stages of the windows of a log with a long run. None without a finding, which a simulation may still
+        make.
+        """
+        if self.equations is not None or (self.known is not None and self.known.run is None):
+            return None
+        equations = equations_of_log(self, LONG)
+        return None if equations is None else _confirm_by_simulation(self, equations, equations.trace())
 
     @functools.cached_property
     def shows_unmodelled_backlash(self) -> bool:
@@ -277,7 +297,9 @@ class LoopInput:
         For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
         is appended to `ranked`, unless effects would only stand in for a backlash.
         """
-        space = build_candidate_space(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
+        space = self.equations or build_candidate_space(
+            self.runs, self.robot, noise.sd, self.settings, self.stated, self.library
+        )
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         near = None
         if before is not None:
@@ -397,6 +419,7 @@ class LoopStages:
     mechanism: Mechanism | None = None
     missed: tuple[MissedChannel, ...] = ()
     unused: Names = ()
+    run: LogSimulation | None = None
 
     @property
     def members(self) -> tuple[Names, ...]:
@@ -475,7 +498,8 @@ def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[
     screened = given.screen(noise, None if known_stages is None else known_stages.screened.base, ranked)
     base, free = screened.base, screened.base.space.free
     residuals = _residual_tests(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
-    factors = {} if screened.cluster is not None else common_factors(residuals)
+    skip = screened.cluster is not None or not base.space.bare.observe.reads
+    factors = {} if skip else common_factors(residuals)
     sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
         given.progress(progress_remark("sds"))
@@ -705,6 +729,75 @@ def choose_effects(
     )
 
 
+def _space_of(given: LoopInput) -> CandidateSpace:
+    return build_candidate_space(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+
+
+def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states.
+
+    Args:
+        fewest: fewest steps of the longest run.
+    """
+    space = _space_of(given)
+    observe: Any = space.bare.observe
+    if not observe.long or observe.times.shape[1] < fewest:
+        return None
+    fit = fit_weak_form(space.bare, space.library.scored)
+    if fit is None or not fit.plan.mechanical:
+        return None
+
+    def columns(rows: np.ndarray) -> dict[str, np.ndarray]:
+        table = {name: x[rows] for name, x in given.runs.columns.items() if x.dtype.kind == "f"}
+        return {**table, "configuration": np.asarray(observe.of_rows.configuration)[rows]}
+
+    settings = given.settings
+    posed, rows = problem_of_windows(space.bare, fit, space.library.scored, columns, settings.width)
+    table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    noise = dataclasses.replace(given.noise, sd=given.noise.sd[rows])
+    shares = settings_for(type(posed.observe), settings.replicates).shares
+    return dataclasses.replace(
+        given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table, known=None,
+        settings=dataclasses.replace(settings, shares=shares),
+    )  # fmt: skip
+
+
+def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
+    """Stages of a log's windows after the simulation of the base model and of the chosen one.
+
+    None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
+    gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
+    level.
+    """
+    screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+    if given.known is not None:  # only the noise differs
+        refuted = given.known.run is not None and given.known.run.contradicts
+        return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
+    if searched is None or beside is None or given.shows_unmodelled_backlash:
+        return None
+    given.progress(progress_remark("confirm"))
+    base, best = screened.base.candidate, traced.best
+    if best is base:
+        named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
+        best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+    run = simulate_models(_space_of(given), base, best, given.settings)
+    confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
+    if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
+        return None
+    traced = dataclasses.replace(traced, run=run)
+    if not run.contradicts or traced.verdict == "place":
+        return traced
+    if traced.verdict == "mechanism":
+        return dataclasses.replace(traced, verdict="place")
+    mechanism = find_mechanism(
+        screened.base.space, windows.runs, base, left, searched.ladder, screened.bases, beside, traced.predicted,
+        windows.settings,
+    )  # fmt: skip
+    level = "place" if mechanism is None or mechanism.fails else "mechanism"
+    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+
+
 # --- stages without a module of their own ---------------------------------------------------------------
 
 
@@ -912,9 +1005,14 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         traced.verdict in WITHOUT_NAME,
     )
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
+    decided, shown = (space, best), diagnosis
+    if (run := traced.run) is not None:
+        best = run.base if best is base else run.best
+        space, base, noise, traced = run.space, run.base, given.noise, dataclasses.replace(traced, predicted={})
+        shown, ends = run.diagnosis(base, diagnosis), run.diagnosis(best, ends)
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
-    beside = traced.beside if nameless else None
+    beside = traced.beside if nameless and run is None else None
     if beside is not None:
         progress(progress_remark("shape"))
     before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
@@ -941,7 +1039,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, of_fit = (best, traced.ends) if written else (base, diagnosis)
+        fit, of_fit = (best, traced.ends if run is None else ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
@@ -953,15 +1051,18 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
 
     ladder = () if traced.searched is None else traced.searched.ladder
     ladder = ladder if traced.alike is None else traced.alike.ladder
-    near, too_large = findings.listed_alternatives(space, best, cost, ladder, settings)
+    cost_there = cost if run is None else decided[1].cost
+    near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
-        found = findings.found_effects(space, base, best, traced.alike, diagnosis.test, settings)
-        if not nameless:
+        named = best if run is None else dataclasses.replace(best, cost=decided[1].cost)
+        base_there = screened.base.candidate
+        found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
+        if not nameless and run is None:
             ask = observe.menu and not observe.long
             concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
-    scores = findings.effect_scores(space, diagnosis.scores, settings)
+    scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
     library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
@@ -976,15 +1077,15 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         runs=runs,
         numbers=numbers,
         included=included,
-        outliers=tuple(int(numbers[k]) for k in screened.outliers),
+        outliers=() if run is not None else tuple(int(numbers[k]) for k in screened.outliers),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
         unnamed=None
         if beside is None or traced.where is None
         else findings.unnamed_discrepancy(beside, traced.where, diagnosis.test.p_value, len(runs)),
         remains=None if nameless or traced.alike is None else traced.where,
-        next_experiment=_next_experiment(space, traced, settings),
-        cannot_see=findings.invisible_effects(space, diagnosis.scores, settings),
+        next_experiment=_next_experiment(decided[0], traced, settings),
+        cannot_see=findings.invisible_effects(decided[0], diagnosis.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
             sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
@@ -1001,8 +1102,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=scores,
-        cosine=signature_cosines(space, diagnosis.scores)[np.ix_(library_places, library_places)],
-        detail=observe.detail(screened.bases, included, diagnosis, ends),
+        cosine=signature_cosines(decided[0], diagnosis.scores)[np.ix_(library_places, library_places)],
+        detail=observe.detail(screened.bases, included, shown, ends),
         readings_of_rows=row_readings,
         errors_as_stated=error(row_readings.as_stated),
         errors=errors_on_common_rows(row_readings.before, row_readings.after, error),
@@ -1018,6 +1119,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     )
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    if run is not None and run.contradicts:
+        of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(
         result, remarks=(*of_noise, *worse_than_stated(row_readings, noise, included), *loop_remarks(result))
     )

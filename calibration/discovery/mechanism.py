@@ -63,7 +63,8 @@ def find_mechanism(
     """
     ladder = simulate_leading_families(space, base, ladder, settings)
     best, location_families = _best_by_family(space, ladder), _families_of_location(beside.where)
-    if space.bare.observe.long:  # fits of curves take long
+    curved = space.bare.observe.reads and not space.bare.observe.long
+    if not curved:  # fits of curves take long, and windows have none
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
@@ -75,11 +76,7 @@ def find_mechanism(
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
     # Families that the curve cannot separate from its own may predict better by an effect.
     other_families = [f for f in location_families if f not in alike and explained[alike[0]] == by_curve]
-    by_name = [
-        f
-        for f in (*alike, *other_families)
-        if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)
-    ]
+    by_name = [f for f in (*alike, *other_families) if f in best and (not curved or by_effects[f] >= HALF * most)]
     blocks = [
         mask
         for blocks_by_name in blocks_room.predictable_blocks(runs, space.bare).values()
@@ -89,7 +86,7 @@ def find_mechanism(
     excess = excess_misfit(space, base)
     curve = (
         ()
-        if space.bare.observe.long or location_families[0] in by_name or location_families[0] not in alike
+        if not curved or location_families[0] in by_name or location_families[0] not in alike
         else location_families[:1]
     )
     for leader in (*by_name[:1], *curve, *by_name[1:]):

@@ -39,8 +39,6 @@ BESIDE = 1.0
 #: Gain that a set must promise for another program, and that simulation may lack for no other set to be tried, as a
 #: share of the largest gain of any set.
 ANOTHER = 0.05
-#: Most steps of all runs for which a base fit in the program with effects costs less than a program of its own.
-BRIEF = 10_000
 #: Number of effects in the first program of a log's fits, and of those among them that are similar to the first.
 ROOM, NEAR = 8, 5
 
@@ -201,7 +199,7 @@ class WeakFormScreening:
     Attributes:
         base: fit without effects, by regression. None if the load may slide on its ground: the equations do not show
             sliding, so a search must not start there.
-        room: effects for the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
+        room: effects for the program of all fits, if the equations show that one is missing.
         alone: fits with one effect each, by regression, the best first. Empty if nothing is missing.
         scores: score of every instance.
         windows: number of equations.
@@ -247,9 +245,8 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormSc
     base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), optimum, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
-    brief = problem.observe.times.size <= BRIEF  # type: ignore[attr-defined]  # of histories
     alone = _fit_single_effects(space, base, equations, scores, settings) if missing else ()
-    room = _likely_effects(space, alone, scores, settings) if missing and brief else ()
+    room = _likely_effects(space, alone, scores, settings) if missing else ()
     return WeakFormScreening(None if slides else base, room, alone, scores, equations.windows, null)
 
 

@@ -226,7 +226,8 @@ def _compare_with_single_curve(
         if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
     location = beside.where
-    if equation_of_place(location.place) in {_equation_of_effect(space, e) for e in best.effects}:
+    place = equation_of_place(location.place)
+    if space.bare.observe.reads and place in {_equation_of_effect(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
@@ -294,6 +295,7 @@ def judge_each_name(
         better: candidates that are the better explanation but not of a plausible size.
     """
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
+    over_time = space.bare.observe.long or not space.bare.observe.reads
     most = searched.diagnosis or after
     lacks = _deficient_equations(space, most, bases)
     fewer = dict(zip(largest.effects, refit_without_each(space, largest, settings, searched.ladder), strict=True))
@@ -315,7 +317,7 @@ def judge_each_name(
                 space, best, effect, _augment_with_curves(space, after.linear, bases, chosen_curves, effect)
             )
             signatures = after.linear.signatures
-        run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
+        run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=over_time)
         full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
@@ -334,7 +336,7 @@ def judge_each_name(
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
-                "run" if space.bare.observe.long else "row",
+                "run" if over_time else "row",
                 *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
                 offset=_relative_zero_error(space, best, effect, settings),
             )
@@ -384,7 +386,7 @@ def _largest_variation(
         share: family-wise error of the critical value.
     """
     most = 0.0, "", math.inf
-    if space.bare.observe.long:
+    if space.bare.observe.long or not space.bare.observe.reads:
         return *most[:2], math.inf, math.inf
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     slot = space.free + best.active.index(effect)

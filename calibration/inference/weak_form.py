@@ -34,7 +34,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from calibration.data import Columns
-from calibration.inference.linearization import ScoredEffect, balance_probe, effect_terms, map_over_shapes
+from calibration.inference.linearization import PROBED, ScoredEffect, balance_probe, effect_terms, map_over_shapes
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
 from calibration.inference.shown_states import (
@@ -83,15 +83,18 @@ class EquationTerms(eqx.Module):
 
     Attributes:
         f, y: terms at the measured readings.
-        by_z, by_reading, by_effects: derivatives of f and y with respect to coordinates, readings and effects'
-            amplitudes.
+        by_z, by_balance, by_reading, by_effects: derivatives of f and y with respect to coordinates, errors of the
+            balances in `PROBED`, readings and effects' amplitudes.
+        signals: signals at each row.
     """
 
     f: Array
     y: Array
     by_z: tuple[Array, Array]
+    by_balance: tuple[Array, Array]
     by_reading: tuple[Array, Array]
     by_effects: tuple[Array, Array]
+    signals: Signals
 
 
 def _solve_current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
@@ -286,7 +289,7 @@ def _terms_with_derivatives(
     """Terms at each point for coordinates z, with derivatives with respect to base parameters, readings and
     effects.
     """
-    entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
+    entering = tuple(dict.fromkeys((*PROBED, *(e.effect.balance for e in effects if e.effect.balance != "sensor"))))
     probes = tuple(balance_probe(b) for b in entering)
     size, names = z.size, channels.channel_names(problem.channels)
 
@@ -331,8 +334,10 @@ def _terms_with_derivatives(
         values[0],
         values[1],
         both(lambda s, _: s[:, :, :size]),
+        both(lambda s, _: s[:, :, size : size + len(PROBED)]),
         both(lambda s, _: s[:, :, size + len(probes) :]),
         both(of_effects),
+        jax.tree.map(lambda x: jnp.broadcast_to(x, rows.time.shape), signals),
     )
 
 
@@ -504,6 +509,10 @@ class WeakFormFit:
         jacobian: derivatives with respect to the coordinates.
         signatures: derivatives of the windows with respect to the amplitude of each instance [prior sd].
         windows: number of equations, one or more for each window.
+        plan, cut: channels that give the states, and the windows.
+        centre, origin: prior mean, and coordinates of the terms.
+        rows: points with states without noise.
+        smooth, read: terms there, and at the readings.
     """
 
     z: np.ndarray
@@ -511,6 +520,13 @@ class WeakFormFit:
     jacobian: np.ndarray
     signatures: np.ndarray
     windows: int
+    plan: StatePlan
+    cut: list[RunWindows]
+    centre: np.ndarray
+    origin: np.ndarray
+    rows: LogPoints
+    smooth: EquationTerms
+    read: EquationTerms
 
 
 def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakFormFit | None:
@@ -550,7 +566,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
         terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)
-        plain = [_covariance_factor(plan, w, sd, terms_there, none) for w in cut]
+        plain = [covariance_factor(plan, w, sd, terms_there, none) for w in cut]
         whitened_windows = [
             (
                 window_errors(plan, w, read)[:, 0],
@@ -563,9 +579,10 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
         )
         unknown = disturbance_intensities(*by_equation)
-        factors = [_covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
+        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
         offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
 
+        states[:] = [centre, z, smooth, terms_there, read]
         last: list[tuple[np.ndarray, np.ndarray]] = []
 
         def at(z: np.ndarray) -> np.ndarray:
@@ -579,6 +596,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
 
         return at
 
+    states: list[Any] = []
     centre = late.start(problem)
     z, size = centre, len(centre)
     try:
@@ -596,8 +614,9 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         return None
     count = len(terms_after_step) - size
     return WeakFormFit(
-        z, terms_after_step[:, 0], terms_after_step[:, 1 : size + 1], terms_after_step[:count, size + 1 :], count
-    )
+        z, terms_after_step[:, 0], terms_after_step[:, 1 : size + 1], terms_after_step[:count, size + 1 :], count,
+        plan, cut, *states,
+    )  # fmt: skip
 
 
 def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.ndarray:
@@ -611,18 +630,18 @@ def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.nd
 
 def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Integrals of terms over a run's windows, shape (equations, windows, ...)."""
-    slopes = enumerate(_derivative_weights(plan, w, f.shape[1]))
+    slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
     integral = functools.partial(np.einsum, "wk,wk...->w...")
     return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
 
 
-def _derivative_weights(plan: StatePlan, w: RunWindows, equations: int) -> list[np.ndarray]:
+def derivative_weights(plan: StatePlan, w: RunWindows, equations: int) -> list[np.ndarray]:
     """Factor of y in the windows of each equation: the derivative of the window, from integration by parts. For the
     equation of an angle reading, minus its second derivative."""
     return [-w.bend if plan.angle and k == plan.electrical else w.slope for k in range(equations)]
 
 
-def _covariance_factor(
+def covariance_factor(
     plan: StatePlan, w: RunWindows, sd: np.ndarray, terms: EquationTerms, unknown: np.ndarray
 ) -> np.ndarray:
     """Cholesky factor of the covariance of some windows. `unknown`: torque and voltage that the model does not
@@ -631,7 +650,7 @@ def _covariance_factor(
     equations, (points, channels) = terms.f.shape[1], sd.shape
     reading_factors, also = terms.by_reading
     noise = []
-    for k, slope in enumerate(_derivative_weights(plan, w, equations)):
+    for k, slope in enumerate(derivative_weights(plan, w, equations)):
         changed = w.weight[..., None] * reading_factors[w.rows, k] + slope[..., None] * also[w.rows, k]
         own_equations = np.zeros((*w.rows.shape, equations))
         own_equations[..., k] = unknown[k] * w.weight / np.sqrt(w.steps)

@@ -913,5 +913,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "too_few_replicates": "{settled} bootstrap tables are too few for some kinds of evidence. Use 500 or more "
     "(--replicates)",
     "rests_on": sentence_on_single_run,
+    "contradicted": "the equations promised to explain {promised:.0%} of the misfit, a simulation explains "
+    "{gained:.0%}, so the claim is one level lower",
     "unwritten": unwritten_reason,
 }

@@ -15,6 +15,7 @@ STEPS = {
     "mechanism": "mechanisms that explain most of the misfit",
     "alike": "effects that explain as much as {}",
     "held out": "predictions of held-out runs",
+    "confirm": "simulation of the chosen model",
     "factors": "at the same time, the verdict with {} times the {} noise",
     "shape": "the shape of the missing term",
     "errors": "errors on held-out data",
@@ -49,7 +50,17 @@ STEPS = {
 #: Stage of the loop that a step belongs to, from 1 on, and how many there are.
 STAGES = {
     **{"base": 1, "sds": 1, "bootstrap": 2, "effects": 3, "more effects": 3, "alone": 3},
-    **{"held out": 4, "mechanism": 4, "alike": 4, "factors": 5, "shape": 5, "errors": 5, "next": 6, "others": 7},
+    **{
+        "held out": 4,
+        "confirm": 4,
+        "mechanism": 4,
+        "alike": 4,
+        "factors": 5,
+        "shape": 5,
+        "errors": 5,
+        "next": 6,
+        "others": 7,
+    },
 }
 OF = max(STAGES.values())
 #: Share of a loop's time that is over when a stage begins: of logs with nothing kept, a guess for others.

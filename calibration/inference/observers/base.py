@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -25,6 +26,7 @@ from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
+from mmrjax.numerics.linear_equations import solve
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +107,7 @@ class Observer(eqx.Module):
         library: effects that only such data can reveal, in addition to the library.
         menu: True if the menu of experiments has runs of this kind.
         searches: number of starts of a calibration. None: the default of the fidelity.
+        reads: True if the rows are readings of channels, False if they are errors of equations.
         profiled: False if parameters are never profiled for this kind, whatever the fidelity states.
     """
 
@@ -122,6 +125,7 @@ class Observer(eqx.Module):
     menu: ClassVar[bool] = True
     searches: ClassVar[int | None] = None
     profiled: ClassVar[bool] = True
+    reads: ClassVar[bool] = True
 
     # --- of a table, before anything is simulated
 
@@ -395,6 +399,14 @@ class Observer(eqx.Module):
             included: True for included rows of the table.
             before, after: diagnoses without and with the proposal.
         """
+
+
+def linear_replicate(data: Data, linear: Linearization, key: Array) -> Linearization:
+    """Linearization of a table of noise alone, refitted by one linear step. `key`: random key as numbers."""
+    jacobian = linear.jacobian
+    counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
+    noise = counts * jax.random.normal(jax.random.wrap_key_data(key), counts.shape)
+    return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
 
 def _with_effects(problem: Problem, active: Numbers | None) -> Problem:

@@ -266,9 +266,7 @@ class SettledRuns(Observer):
     def cautions(self, robot: Robot) -> list[str]:
         return fidelities.get_fidelity(self.fidelity).cautions(robot, self.conditions)
 
-    def linearise(
-        self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
-    ) -> SettledLinearization:
+    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Linearization as in the protocol.
 
         A signature is the sensitivity of the readings to a defect of the effect's balance, times the effect's term.

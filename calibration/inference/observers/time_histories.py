@@ -50,7 +50,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
+from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy, linear_replicate
 from calibration.inference.optimizers import (
     CORES,
     SAME,
@@ -690,10 +690,7 @@ class Histories(Observer):
     def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
     ) -> Linearization:
-        jacobian = linear.jacobian
-        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
-        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
-        return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
+        return linear_replicate(data, linear, drawn)
 
     def starts(
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None

@@ -1,0 +1,95 @@
+"""The one simulation of a log whose verdict comes from its windows: its base model and its chosen model."""
+
+from __future__ import annotations
+
+import dataclasses
+from statistics import NormalDist
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate, candidate_of_fit
+from calibration.discovery.settings import Settings
+from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.observers.time_histories import HistoriesLinearization
+from mmrjax.model import channels
+
+#: Most Gauss-Newton steps of a simulated model from its regression.
+STEPS = 5
+#: Share of what the windows promised that a simulation has to gain for the claim to stay.
+HALF = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class LogSimulation:
+    """Simulated fits of a log without and with the effects of its verdict.
+
+    Attributes:
+        space: candidate space of the log.
+        base, best: the fits. Equal without effects.
+        promised, gained: share of the misfit that the effects explain in the windows, and in the simulation.
+    """
+
+    space: CandidateSpace
+    base: Candidate
+    best: Candidate
+    promised: float
+    gained: float
+
+    @property
+    def contradicts(self) -> bool:
+        """True if the simulation gains too little of what the windows promised."""
+        return not self.gained >= HALF * self.promised
+
+    def diagnosis(self, fit: Candidate, windows: Diagnosis) -> Diagnosis:
+        """Diagnosis with the residuals of a simulated fit, and scores of the windows.
+
+        The memory of noise is a normal deviate.
+        """
+        problem, z, active = self.space.fit_of(fit.active, fit.z)
+        observe: Any = problem.observe
+        residual, jacobian, _ = observe.at(problem, z, active)
+        rows, count = problem.data.weight.shape
+        no_signals: Any = None
+        linear = HistoriesLinearization(
+            jnp.asarray(residual), jnp.asarray(jacobian), jnp.zeros((rows * count, 0)), jnp.zeros(0),
+            problem.data.weight / problem.data.sd, no_signals, observe.rows_of, observe.knots, observe.time,
+            jnp.zeros(rows), channels=channels.channel_names(problem.channels),
+            magnitudes=problem.base.rig.magnitudes,
+        )  # fmt: skip
+        test, count = windows.test, len(windows.test.null.single)
+        chance = jnp.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+        null = dataclasses.replace(test.null, white=chance)
+        strongest = dataclasses.replace(test.found, white=linear.memory())
+        shares = {**test.settings.shares, "white": min(test.settings.shares.values())}
+        settings = dataclasses.replace(test.settings, shares=shares)
+        return Diagnosis(
+            linear, windows.scores, dataclasses.replace(test, found=strongest, null=null, settings=settings)
+        )
+
+
+def simulate_models(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> LogSimulation:
+    """Simulates the base fit and the best fit of a log's windows, each refined by a few steps."""
+    space = space.with_room(best.effects)
+
+    def refined(c: Candidate, starts: list[np.ndarray]) -> Candidate:
+        """The best of the fits from these starts."""
+        problem, _, active = space.fit_of(c.active, c.z)
+        size, fits = len(problem.coordinates), list[Candidate]()
+        for z in starts:
+            sets = None if active is None else [active]
+            optima, _ = fit_from_each_start(problem, [z[:size]], [space.weight], sets, STEPS)
+            optimum = jax.tree.map(lambda x: x[0], optima)
+            more = len(c.z) - size
+            z, sd = np.pad(optimum.z, (0, more)), np.pad(optimum.sd, (0, more), constant_values=1.0)
+            fits.append(candidate_of_fit(space, c.active, dataclasses.replace(optimum, z=z, sd=sd), settings))
+        return min(fits, key=lambda x: x.cost)
+
+    last = refined(best, [best.z])
+    without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
+    first = last if best is base else refined(base, [base.z, without])
+    return LogSimulation(space, first, last, 1 - best.cost / base.cost, 1 - last.cost / first.cost)

@@ -1,0 +1,379 @@
+"""Windows of a log: each row is the balances of a log, integrated against one window in time.
+
+A reading is 0, and its prediction is the whitened error of an equation (`weak_form`). So a log is a table, and no run
+is simulated. At states that the readings give, the equations are linear in the sizes of effects and nearly linear in
+the base parameters. So all fits are those of the linearised equations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from calibration.data import Columns, Names
+from calibration.inference import bases as bases_room
+from calibration.inference.bases import Bases
+from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite_or_zero
+from calibration.inference.observers.base import SearchPolicy, linear_replicate
+from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
+from calibration.inference.problem import Data, Observation, Problem, data_from_readings
+from calibration.inference.shown_states import RunWindows
+from calibration.inference.weak_form import (
+    WeakFormFit,
+    covariance_factor,
+    derivative_weights,
+    disturbance_intensities,
+)
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.effects.curve import WAYS
+from mmrjax.model import channels
+from mmrjax.model.params import Scalar
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED
+
+#: Number of windows whose noise is known together.
+TOGETHER = 128
+#: Number of effects that are fitted before the rest counts as a disturbance.
+FITTED = 4
+#: Variables of curves that follow from the states if no channel shows them.
+UNSHOWN = ("speed_motor", "current")
+
+
+class Integrals(eqx.Module):
+    """Whitened integrals of terms over windows.
+
+    Attributes:
+        index: points of each window, shape (windows, length).
+        weight: factor of f at each point.
+        slope: factor of y there for each equation, shape (equations, windows, length).
+        white: inverse Cholesky factor of each `TOGETHER` windows, in the order (equation, window).
+        places: channel of each equation.
+        count: number of channels.
+    """
+
+    index: Int[Array, "windows length"]
+    weight: Float[Array, "windows length"]
+    slope: Float[Array, "equations windows length"]
+    white: Float[Array, "parts size size"]
+    places: tuple[int, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    def __call__(self, f: Array, y: Array) -> Float[Array, "windows channels columns"]:
+        """Integrals of terms, shape (points, equations, columns), by the channel of each equation."""
+        integral = functools.partial(jnp.einsum, "wl,wlc->wc")
+        plain = jnp.stack(
+            [
+                integral(self.weight, f[self.index, k]) + integral(slope, y[self.index, k])
+                for k, slope in enumerate(self.slope)
+            ]
+        )
+        parts, columns = len(self.white), f.shape[-1]
+        flat = plain.reshape(len(self.slope), parts, -1, columns).swapaxes(0, 1).reshape(parts, -1, columns)
+        flat = jnp.einsum("pij,pjc->pic", self.white, flat)
+        by_window = jnp.moveaxis(flat.reshape(parts, len(self.slope), -1, columns), 1, 2)
+        out = jnp.zeros((len(self.index), self.count, columns))
+        return out.at[:, np.asarray(self.places)].set(by_window.reshape(len(self.index), -1, columns))
+
+    def inside(self, windows: np.ndarray, points: int) -> np.ndarray:
+        """True for points within some of the windows."""
+        index, weight = (np.asarray(x)[windows] for x in (self.index, self.weight))
+        return np.isin(np.arange(points), index[weight > 0])
+
+    def mean(self, x: np.ndarray) -> np.ndarray:
+        """Mean of a quantity of the points in each window."""
+        weight = np.asarray(self.weight)
+        return np.sum(weight * x[np.asarray(self.index)], 1) / np.maximum(np.sum(weight, 1), 1e-300)
+
+
+class WindowsLinearization(Linearization):
+    """Linearization of windows. An error of a balance or a channel has a value at each point of the log.
+
+    Attributes:
+        integrals: integrals over the windows.
+        slopes: derivatives of f and y with respect to an error of each balance, then of each reading.
+        time, angle: time and angle of the driving shaft at each point.
+        run: run of each window, -1 for padding.
+    """
+
+    integrals: Integrals
+    slopes: Float[Array, "two points equations places"]
+    time: Float[Array, " points"]
+    angle: Float[Array, " points"]
+    run: Int[Array, " windows"]
+
+    @property
+    def points(self) -> int:
+        return self.time.shape[0]
+
+    def at_points(self, rows: np.ndarray) -> np.ndarray:
+        return self.integrals.inside(np.asarray(rows, bool), self.points)
+
+    def of_rows(self, points: np.ndarray) -> np.ndarray:
+        return self.integrals.mean(np.asarray(points, float)) > 0.5
+
+    def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+        f, y = (s[:, :, balance, None] * shapes[:, None, :] for s in self.slopes)
+        return (self.integrals(f, y) * self.scale[:, :, None]).reshape(-1, shapes.shape[1])
+
+    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+        return -self.columns(len(PROBED) + channel, shapes)
+
+    def variable(self, name: str) -> np.ndarray:
+        if name in bases_room.ORDERS:
+            return bases_room.ORDERS[name][0] * np.asarray(self.angle)
+        return np.asarray(self.time if name == "time" else getattr(self.signals, name), float)
+
+    def runs(self) -> list[np.ndarray]:
+        run = np.asarray(self.run)
+        return [np.flatnonzero(run == k) for k in np.unique(run[run >= 0])]
+
+
+class Windows(SettledRuns):
+    """Observer of the windows of a log.
+
+    Attributes:
+        linear: linearization of the equations at `origin`, with one weight for all readings.
+        origin: base coordinates of the regression.
+        start: base coordinates at which its searches begin.
+        width: prior sd of an amplitude, relative to that of its field.
+        effect, grid: effect of each instance, and its neighbours on the grid of its shape: before, at, after.
+        table: columns of the log at its points.
+    """
+
+    word: ClassVar[str] = "window"
+    fewest: ClassVar[int] = 24
+    blocks: ClassVar[Names] = ("slope", "voltage", "run", "part")
+    policy: ClassVar[SearchPolicy] = SearchPolicy(batch=16, steps=30, searches=1, one_by_one=False)
+    rows_tell: ClassVar[bool] = False
+    reads: ClassVar[bool] = False
+
+    linear: WindowsLinearization
+    origin: Float[Array, " parameters"]
+    start: Float[Array, " parameters"]
+    width: float = eqx.field(static=True)
+    effect: Int[Array, " instances"]
+    grid: Float[Array, "three instances"]
+    table: dict[str, Array]
+
+    def errors(self, coordinates: Any, z: Array) -> Array:
+        """Errors of the equations at coordinates z, shape (readings,)."""
+        linear, size = self.linear, self.origin.shape[0]
+        readings = linear.readings
+        errors = linear.residual[:readings] + linear.jacobian[:readings] @ (z[:size] - self.origin)
+        if not hasattr(coordinates, "active"):
+            return errors
+        _, amplitude, shape = coordinates.parts(z)
+        before, here, after = self.grid
+        rise = (shape[:, None] - before) / (here - before)
+        fall = (after - shape[:, None]) / (after - here)
+        share = jnp.clip(jnp.minimum(*(jnp.where(jnp.isfinite(x), x, 1.0) for x in (rise, fall))), 0.0, 1.0)
+        own = self.effect == jnp.asarray(coordinates.active)[:, None]
+        return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * own * share, 0)
+
+    def linearise(
+        self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
+    ) -> WindowsLinearization:
+        r, jacobian, _ = _evaluate(self, problem.coordinates, data, z)
+        scale = data.weight / data.sd
+        signatures = self.linear.signatures * scale.ravel()[:, None]
+        return dataclasses.replace(self.linear, residual=r, jacobian=jacobian, signatures=signatures, scale=scale)
+
+    def operating_points(self, robot: Robot) -> None:
+        return None
+
+    @property
+    def long(self) -> bool:
+        return False
+
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        return np.zeros(np.shape(status), bool)
+
+    def starts(
+        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+    ) -> np.ndarray:
+        return np.asarray(self.start)[None]
+
+    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
+        return keys
+
+    def fit_replicate(
+        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
+    ) -> Linearization:
+        return linear_replicate(data, linear, drawn)
+
+    def search(
+        self,
+        problem: Problem,
+        starts: Numbers,
+        weights: Numbers,
+        active: Numbers | None = None,
+        *,
+        rivals: bool = False,
+        most: int | None = None,
+        scanned: Problem | None = None,
+    ) -> tuple[Optimum, Observation]:
+        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+            parts = []
+            for at, member in zip(z, members, strict=True):
+                coordinates, data = problem.coordinates, problem.data
+                if active is not None:
+                    coordinates = coordinates.with_effects(jnp.asarray(active[member]))
+                data = dataclasses.replace(data, weight=jnp.asarray(weights[member]))
+                parts.append(jax.device_get(_evaluated(self, coordinates, data, jnp.asarray(at))))
+            return jax.tree.map(lambda *x: np.stack(x), *parts)
+
+        steps = self.policy.steps if most is None else most
+        return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
+
+    def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
+        coordinates = problem.coordinates
+        if active is not None:
+            coordinates = coordinates.with_effects(jnp.asarray(active))
+        return _evaluated(self, coordinates, problem.data, jnp.asarray(z))
+
+    def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> Any:
+        raise NotImplementedError  # that of the log
+
+    def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
+        linear = self.linear
+        ways = {name: np.sign(linear.variable(name)) for name in WAYS}
+        table = {bases_room.VARIABLES[v]: linear.variable(v) for v in UNSHOWN}
+        table |= {name: np.asarray(x) for name, x in self.table.items()}
+        arguments = table, linear.at_points(included).astype(float), robot, None, ways
+        return (*bases_room.curve_families(*arguments), *bases_room.window_families(*arguments))
+
+
+def _evaluate(observe: Windows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
+    """Residuals of windows, penalties and priors, their Jacobian, and the observation."""
+
+    def both(z: Array) -> tuple[Array, Array]:
+        errors = observe.errors(coordinates, z)
+        return errors, errors
+
+    slopes, errors = jax.jacfwd(both, has_aux=True)(z)
+    scale, penalties = (data.weight / data.sd).ravel(), jnp.zeros(len(data.weight))
+    r = jnp.concatenate([scale * errors, penalties, z - data.centre])
+    jacobian = [scale[:, None] * slopes, jnp.zeros((len(penalties), len(z))), jnp.eye(len(z))]
+    status = jnp.full(len(penalties), CONVERGED)
+    seen = Observation(errors.reshape(data.weight.shape), penalties, status, jnp.zeros_like(status))
+    return r, jnp.concatenate(jacobian), seen
+
+
+_evaluated = functools.partial(compiled, options=SELDOM)(_evaluate)
+
+
+def problem_of_windows(
+    problem: Problem, fit: WeakFormFit, effects: tuple[ScoredEffect, ...], columns: Callable[[np.ndarray], Columns],
+    width: float,
+) -> tuple[Problem, np.ndarray]:  # fmt: skip
+    """Problem of the windows of a log, and the row of the log in the middle of each window.
+
+    Args:
+        problem: problem of the log.
+        fit: its regression, with the signatures of `effects`.
+        columns: function that returns the table in some rows of the log.
+        width: prior sd of amplitudes, relative to those of their fields.
+    """
+    plan, terms, count = fit.plan, fit.smooth, len(problem.channels)
+    places = (*([plan.current] * plan.electrical), *([plan.motion] * plan.mechanical), *plan.others)
+    windows, run = _stacked(fit.cut)
+    slope = np.stack(derivative_weights(plan, windows, len(places)))
+    parts = [windows.part(k) for k in np.split(np.arange(len(run)), len(run) // TOGETHER)]
+    sd, size = np.asarray(fit.rows.sd), len(fit.z)
+    absent = np.ones(count, bool)
+    absent[list(places)] = False
+    none = np.where((run < 0)[:, None] | absent, np.nan, 0.0)
+    data = dataclasses.replace(data_from_readings(none, np.ones_like(none), size), centre=jnp.asarray(fit.centre))
+    reading_slopes = tuple(np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True))
+
+    def linearised(unknown: np.ndarray) -> WindowsLinearization:
+        factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
+        white = np.stack([np.linalg.inv(x) for x in factors])
+        arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
+        integrals = Integrals(arrays[0], arrays[1], arrays[2], arrays[3], places, count)
+
+        def whole(f: Any, y: Any) -> np.ndarray:
+            return np.asarray(integrals(jnp.asarray(f), jnp.asarray(y))).reshape(-1, f.shape[-1])
+
+        errors = whole(fit.read.f[..., None], fit.read.y[..., None])[:, 0]
+        prior = np.concatenate([np.zeros(len(run)), fit.origin - fit.centre])
+        jacobian = np.concatenate([whole(*terms.by_z), np.zeros((len(run), size)), np.eye(size)])
+        return WindowsLinearization(
+            jnp.asarray(np.concatenate([errors, prior])), jnp.asarray(jacobian),
+            finite_or_zero(jnp.asarray(whole(*terms.by_effects))), jnp.zeros((len(PROBED), 0)), data.weight,
+            jax.tree.map(jnp.asarray, terms.signals), integrals, finite_or_zero(jnp.stack(reading_slopes)),
+            fit.rows.time, fit.rows.angle, jnp.asarray(run),
+            channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
+        )  # fmt: skip
+
+    linear = linearised(np.zeros(len(places)))
+    unknown = _unexplained(linear, parts, sd, fit, np.asarray(data.weight))
+    linear = linearised(unknown) if unknown.any() else linear
+    middle = np.take_along_axis(windows.rows, np.argmax(windows.weight, 1)[:, None], 1)[:, 0]
+    table = {name: jnp.asarray(x) for name, x in columns(np.asarray(fit.rows.first)).items()}
+    table |= {c.column: fit.rows.shown[:, k] for k, c in enumerate(problem.channels)}
+    grid = [np.asarray(e.at) for e in effects]
+    before, after = (
+        [np.r_[x, np.inf * s][1:] if s > 0 else np.r_[np.inf * s, x][:-1] for x in grid] for s in (-1, 1)
+    )
+    observe = Windows(
+        jax.tree.map(lambda x: jnp.asarray(x)[middle], fit.rows.conditions), "drive", linear, jnp.asarray(fit.origin),
+        jnp.asarray(fit.z), width, jnp.asarray(np.repeat(np.arange(len(grid)), [len(x) for x in grid])),
+        jnp.asarray(np.stack([np.concatenate(x) for x in (before, grid, after)])), table,
+    )  # fmt: skip
+    return Problem(problem.base, problem.coordinates, observe, data), np.asarray(fit.rows.first)[middle]
+
+
+def _unexplained(
+    linear: WindowsLinearization, parts: list[RunWindows], sd: np.ndarray, fit: WeakFormFit, weight: np.ndarray
+) -> np.ndarray:
+    """Intensity of the disturbance of each equation that neither the readings nor a few effects explain."""
+    readings, places = linear.readings, linear.integrals.places
+    columns, e = (np.asarray(x) for x in (linear.jacobian, linear.residual))
+    signatures = np.zeros((len(e), linear.signatures.shape[1]))
+    signatures[:readings] = linear.signatures
+    for _ in range(FITTED + 1):
+        q = np.linalg.qr(columns)[0]
+        left, rest = e - q @ (q.T @ e), signatures - q @ (q.T @ signatures)
+        norm = np.linalg.norm(rest, axis=0)
+        norm = np.where(norm > 1e-3 * np.linalg.norm(signatures, axis=0), norm, np.inf)
+        best = int(np.argmax(np.abs(rest.T @ left) / norm))
+        columns = np.concatenate([columns, signatures[:, [best]]], 1)
+    factors = [covariance_factor(fit.plan, w, sd, fit.smooth, np.zeros(len(places))) for w in parts]
+    by_window = left[:readings].reshape(linear.rows, -1)[:, list(places)]
+    plain = [
+        (x @ by_window[k].T.ravel()).reshape(len(places), -1).T
+        for k, x in zip(np.split(np.arange(linear.rows), len(parts)), factors, strict=True)
+    ]
+    noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in factors]
+    unit = [np.tile(np.sum(w.weight**2 / w.steps, 1)[:, None], len(places)) for w in parts]
+    counts = weight[:, places[0]] > 0
+    free = counts.sum() / max(counts.sum() - (fit.z.size + FITTED) / len(places), 1.0)
+    of_windows = (np.concatenate(x)[counts] for x in (plain, noise, unit))
+    defect, variance, per_intensity = of_windows
+    return disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
+
+
+def _stacked(cut: list[RunWindows]) -> tuple[RunWindows, np.ndarray]:
+    """Windows of all runs, padded to one length and a multiple of `TOGETHER`, and the run of each."""
+    longest, total = max(w.rows.shape[1] for w in cut), sum(len(w.rows) for w in cut)
+    more = -total % TOGETHER
+
+    def joined(name: str) -> np.ndarray:
+        x = [getattr(w, name) for w in cut]
+        x = [np.pad(a, ((0, 0), (0, longest - a.shape[1])), mode="edge") for a in x]
+        if name not in ("rows", "steps"):
+            x = [a * (np.arange(longest) < getattr(w, name).shape[1]) for a, w in zip(x, cut, strict=True)]
+        return np.concatenate([*x, np.full((more, longest), float(name == "steps")).astype(x[0].dtype)])
+
+    run = np.concatenate([*(np.full(len(w.rows), w.run) for w in cut), np.full(more, -1)])
+    return RunWindows(-1, *(joined(n) for n in ("rows", "weight", "slope", "bend", "steps"))), run
