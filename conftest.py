@@ -108,9 +108,14 @@ def pytest_collection_finish():
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark as slow the parameter sets that `quick` leaves to `make test-all`. Files that share results come first."""
+    """Mark as slow the nightly tests and the parameter sets that `quick` leaves to `make test-all`.
+
+    Files that share results come first.
+    """
     met = Counter()
     for item in items:
+        if item.get_closest_marker("nightly"):
+            item.add_marker("slow")
         mark = item.get_closest_marker("quick")
         if mark is not None:
             test = item.nodeid.partition("[")[0]

@@ -2,6 +2,7 @@
 
     python benchmarks/actuator.py                              # 4096 environments, 1000 steps
     python benchmarks/actuator.py --law drive/actuator.py      # of an export, where only JAX is installed
+    python benchmarks/actuator.py --shelf runs/neo             # page of a run of `mmrjax loop` for docs/actuators
 
 Times are the best of several, compilation apart, in single precision. Prints a line of JSON.
 """
@@ -10,15 +11,42 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import runpy
 import time
+import tomllib
 import types
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+#: Page of the actuator that a run of the loop identified. XL330's is by `gears.py`.
+SHELF = """# {name}
+
+Identified by `mmrjax loop` from a public record. `python benchmarks/actuator.py --shelf RUN` wrote this page from its
+result. {source}
+
+* Unseen error, blocks held out: {errors}.
+* Verdict: {verdict}
+* Conditions seen: {conditions}.
+* 95 % intervals, as far as the laws of robot.toml hold: {intervals}.
+* Would decide: {open}
+
+## robot.toml
+
+```toml
+{robot}```
+
+## drive.xml
+
+```xml
+{drive}```
+
+{law}"""
 #: One joint whose motor is MJX's own, and the same for an actuator from outside.
 MODEL = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="drive" axis="0 1 0" armature="0.006"/>
 <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>{actuator}</mujoco>"""
@@ -107,6 +135,40 @@ def against_motor(module: Any, environments: int, steps: int) -> dict[str, float
     return {"mjx_motor_s": theirs, "mjx_with_actuator_s": mine, "over_motor": mine / theirs}
 
 
+def shelf_page(run: Path) -> str:
+    """Page of a run of the loop: its robot under its last load, which exports, and what the result states."""
+    import gears
+
+    found = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    text = (run / "robot.toml").read_text(encoding="utf-8")
+    settings = tomllib.loads((run / "config.resolved.toml").read_text(encoding="utf-8"))
+    source = Path(settings["robot"])  # with its table beside it
+    rows = np.genfromtxt(source.with_suffix(".csv"), delimiter=",", names=True)
+    ranges = {n: rows[n] for n in rows.dtype.names or () if np.isfinite(rows[n]).all()}
+    last = tomllib.loads(text)["configurations"][-1]
+    head, *tables = re.sub(r"  # .*", "", text).split("\n[")
+    kept = [f"[{x.strip()}" for x in tables if x.startswith(("motor", "gearbox", "driver", "effects", f"{last}]"))]
+    top = [x for x in head.splitlines() if x.strip() and not x.startswith(("#", "configurations"))]
+    robot = "\n".join([*top, *kept]) + "\n"
+    if "voltage_limit" not in robot:  # the range of operating points of the law
+        robot = robot.replace("[motor]\n", f"[motor]\nvoltage_limit = {np.abs(ranges['supply_voltage_V']).max()}\n")
+    drive, law = gears.actuator(robot)
+    after = found["errors"]["after"]["held_out"]
+    return SHELF.format(
+        name=run.name.replace("_", " ").capitalize(), robot=robot, drive=drive, law=law,
+        source=source.read_text(encoding="utf-8").split("\nbase")[0].replace("# ", "").replace("\n", " "),
+        errors=", ".join(f"{n.replace('_', ' ')} {x['rms_percent']:.2g} % (rms)" for n, x in after.items()),
+        verdict=found["verdict_statement"], open=found["next_experiment"]["description"],
+        intervals=", ".join(
+            f"{n} {x['after'] - 1.96 * x['sd_after']:.4g} to {x['after'] + 1.96 * x['sd_after']:.4g} {x['unit']}"
+            for n, x in found["base_shift"].items()
+        ),
+        conditions=", ".join(
+            [f"{len(rows)} rows", *(f"{n} {x.min():.4g} to {x.max():.4g}" for n, x in ranges.items())]
+        ),
+    )  # fmt: skip
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -114,7 +176,11 @@ def main() -> None:
     parser.add_argument("--environments", type=int, default=4096)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--joints", type=int, default=64, help="Environments of the comparison with <motor>")
+    parser.add_argument("--shelf", type=Path, help="folder of a run of the loop; its name is that of the page")
     told = parser.parse_args()
+    if told.shelf is not None:
+        Path(f"docs/actuators/{told.shelf.name}.md").write_text(shelf_page(told.shelf), encoding="utf-8")
+        return
     module = law(told.law)
     found = {
         "device": str(jax.devices()[0].device_kind), "environments": told.environments, "steps": told.steps,

@@ -244,7 +244,6 @@ def test_errors_are_of_the_rows_that_both_fits_predict():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_line_holds_what_the_findings_rest_on():
     """A resistance of five sigmas, told nothing of the noise."""
     x = loop.work(campaign.Task("library_unstated", 3, replicates=100, brief=True, stratum="plain"))

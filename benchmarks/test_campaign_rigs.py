@@ -101,7 +101,6 @@ def test_errors_and_refused_cases_are_listed():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_clean_rig_goes_through_the_loop():
     from campaign import Task
 

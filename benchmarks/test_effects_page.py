@@ -27,6 +27,5 @@ def same(page, other):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_effects_page_is_what_the_library_gives(written):
     same((ROOT / "docs" / "reference" / "effects.md").read_text(encoding="utf-8"), written)

@@ -20,7 +20,6 @@ def missions():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(comparison.CASES)))
 def test_mission_follows_the_integral(case, missions):
     """Work at the wheel both ways, distance and Wh/km. The rest is what windings and sliding take."""

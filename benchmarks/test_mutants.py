@@ -104,6 +104,6 @@ print(mutants.run(tree, [sys.argv[2]], "not slow", tree / "log", ("-q", "-W", "e
 
 
 def test_a_slow_test_does_not_count_as_quick():
-    assert marks_of_tests("tests/test_directions.py")["test_loop_names_it"] == {"slow", "nightly"}
+    assert marks_of_tests("tests/test_directions.py")["test_loop_names_it"] == {"nightly"}
     quick = "test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed"
     assert marks_of_tests("tests/test_directions.py")[quick] == set()

@@ -44,7 +44,6 @@ def test_quick_commands_leave_what_is_recorded(name, folder, monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_every_command_leaves_what_is_recorded():
     command = [sys.executable, str(ROOT / "benchmarks" / "record.py"), "--check"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -145,7 +145,6 @@ def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path, st
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     robot = read_rig(tmp_path, FILE)
     truth = params.replace(robot, {"bench.backlash": 0.06})

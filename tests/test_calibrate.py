@@ -320,7 +320,6 @@ def test_infeasible_starts_are_refused_with_the_rows(measured):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     """Among them one on which the calibrated robot could not start: docs/lab/figures.md."""
     rows = measured.where(np.array([1, 3, 4]))

@@ -77,7 +77,6 @@ def found(base, made, told):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_track_calibration_recovers_the_guide_friction(found, made, told):
     answer = found.parameters[GUIDE_FRICTION]
     assert found.converged and found.starts.agree == 2 and (found.status == "converged").all()

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jsonschema
 import numpy as np
@@ -151,53 +150,6 @@ def point(**given):
     return EnvelopePoint(
         **{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()}
     )
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "speed_m_s",
-        "side_slope_deg",
-        *(
-            pytest.param(n, marks=pytest.mark.slow)
-            for n in (
-                "slope_deg",
-                "payload_kg",
-                "endurance_min",
-                "energy_per_metre_Wh",
-                "turn_in_place_rad_s",
-                "turning_radius_mm",
-            )
-        ),
-    ],
-)
-def test_derivatives_are_differences(robot, name):
-    at = point(slope_deg=5.0, share=0.5, payload=2.0, charge=0.9)
-    given = (
-        "gearbox.ratio",
-        "motor.resistance",
-        "battery.capacity",
-        "battery.current_other",
-        "6T2A.ground.friction.static",
-    )
-    known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
-    theta = jnp.asarray([known[n] for n in given])
-
-    @jax.jit
-    def value(theta):
-        return evaluate_requirement(
-            params.replace(robot, dict(zip(given, theta, strict=True))), at, ratings(robot), name
-        ).value
-
-    exact = np.asarray(jax.grad(value)(theta))
-    for k in range(len(given)):
-        up, down = (float(value(theta.at[k].multiply(1 + s * 1e-4))) for s in (1, -1))
-        difference = (up - down) / (2e-4 * float(theta[k]))
-        assert exact[k] * float(theta[k]) == pytest.approx(
-            difference * float(theta[k]), rel=1e-4, abs=1e-5 * float(value(theta))
-        )
 
 
 def test_a_robot_slides_or_tips_across_a_slope(robot):

@@ -62,7 +62,6 @@ def given(values):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_derivatives_are_the_limits_of_finite_differences_with_contacts_at_the_edge():
     """From standing onto the edge, whose grousers open and close: the same to four digits. Over a stretch slopes tell."""
     values = jnp.array([1.0, 60.0])

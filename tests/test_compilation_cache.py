@@ -56,7 +56,6 @@ def first(tmp_path_factory):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_second_process_compiles_nothing_and_answers_the_same(first):
     cache, began = first
     again = process(cache)

@@ -38,7 +38,6 @@ def space_of(world, folder):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])
 def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
     rng = np.random.default_rng([5, len(kind)])

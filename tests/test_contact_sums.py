@@ -213,7 +213,6 @@ def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name)
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_second_derivatives_are_those_of_what_is_computed(recessed):
     run = Conditions(**RUNS["tracked"])
     motion = motion_of(recessed, run, 1)

@@ -113,7 +113,6 @@ def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(sup
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "amplitude", "voltages"),
     [("directional_friction", 0.06, EITHER), ("backdriving_loss", 0.3, FORWARD)],

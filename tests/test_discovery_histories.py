@@ -87,7 +87,6 @@ def oval():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_clean_histories_lack_nothing(clean):
     found = clean.traced
     assert found.verdict == "none" and found.screened.outliers == found.screened.base.unusable == ()
@@ -97,7 +96,6 @@ def test_clean_histories_lack_nothing(clean):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     runs, label = case("pulley_eccentricity", seed=2)
     found = ANALYST.discover(runs)

@@ -138,7 +138,6 @@ def test_pictures_are_of_todays_pages():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_the_example_is_what_the_loop_says_today(tmp_path, mmrjax):
     """Else: mmrjax loop measured --out found, python docs/site.py found."""
     assert mmrjax("loop measured --out found --no-report")[0] == 0

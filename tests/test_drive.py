@@ -180,7 +180,6 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
     """Also on the slope where a start from standstill slides. Above the limit it slides all the same."""
     runs = Conditions(voltage=[24.0, 24.0, 24.0], slope_deg=[5.0, 12.0, 20.0], configuration=[1.0, 0.0, 0.0])

@@ -746,51 +746,18 @@ def _travel(voltage, slope_deg=0.0, changes=None, gearbox=None, **amplitudes):
     return runs, steady_batch(with_effects(*present, robot=robot), runs)
 
 
-@pytest.mark.slow
-def test_directional_friction_is_dry_loss_with_a_size_for_each_direction():
-    def with_loss(change, voltage):
-        loss = {f"{c}.track.loss_coulomb": m + change for c, m in (("6T2A", 0.350), ("4W2T", 0.070))}
-        return _travel([voltage], changes=loss)[1]
-
-    for voltage, change in ((24.0, 0.03), (-24.0, -0.03)):
-        _, found = _travel([voltage], directional_friction=0.03)
-        assert (np.sign(found.motor_speed) == np.sign(voltage)).all()
-        _same(found, with_loss(change, voltage))
-        assert (np.abs(found.total_current - with_loss(0.0, voltage).total_current) > 0.01).all()
-
-
 def test_directional_friction_fades_at_rest_and_does_not_turn_round():
     turning = np.asarray(STATES.direction)
     assert_allclose(_term("directional_friction", amplitude=0.2), 0.2 * turning**2, rtol=1e-12)
     assert (turning > 0.99).any() and (turning < -0.99).any() and (np.abs(turning) < 0.5).any()
 
 
-@pytest.mark.slow
 def test_backdriving_loss_is_a_share_of_a_load_that_drives():
-    """Against the load of each state, and steady travel: (C_m I - losses) i = η_b (1 - a) M_load down, M_load / η up."""
-    load = np.asarray(STATES.torque_carried)
-    turning = np.asarray(STATES.direction)
+    load, turning = np.asarray(STATES.torque_carried), np.asarray(STATES.direction)
     driven = load * turning < 0
     assert 40 < driven.sum() < 360
     expected = np.where(driven, 0.2 * np.abs(load) * np.abs(turning) * turning, 0.0)
     assert_allclose(_term("backdriving_loss", amplitude=0.2), expected, rtol=1e-12, atol=1e-15)
-
-    runs, found = _travel([24.0, -24.0], [-20.0, -10.0, 0.0, 10.0, 20.0], {f"{c}.{k}": v for c in ("6T2A", "4W2T")
-                          for k, v in (("ground.friction.static", 0.9), ("ground.friction.dynamic", 0.7))},
-                          backdriving_loss=0.2)  # fmt: skip
-    speed, sign, wheeled = np.asarray(found.motor_speed), np.sign(runs.voltage), np.asarray(runs.configuration) == 1
-    weight = np.where(wheeled, 11.5, 13.1) * 9.80665 / 2
-    slope = np.radians(runs.slope_deg)
-    pull = weight * (np.sin(slope) + sign * np.where(wheeled, 0.03, 0.06) * np.cos(slope))
-    guide = sign * np.where(wheeled, 0.0, 0.2 * 0.3) * weight * np.cos(slope)
-    radius = np.where(wheeled, 0.05, 0.24 / (2 * np.pi))
-    load = (
-        sign * np.where(wheeled, 0.07, 0.35) + np.where(wheeled, 0.003, 0.016) * speed / 48 + radius * (pull + guide)
-    )
-    motor = 0.0259 * np.asarray(found.total_current) / 2 - sign * 3e-3 - (5.5e-7 + 1.4e-6) * speed
-    driven = load * sign < 0
-    assert 4 <= driven.sum() <= 16 and np.isfinite(speed).all()
-    assert_allclose(48 * motor, load * np.where(driven, 0.74 * (1 - 0.2), 1 / 0.74), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -827,40 +794,6 @@ def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     step = 1e-6
     at = [term(jnp.asarray(1.0 + s), jnp.asarray(8.0), jnp.asarray(exponent)) for s in (-step, step)]
     assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
-
-
-def _on_shaft(torque_constant, *present):
-    """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
-    load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
-    robot = paper_robots.blank_robot(Configurations({"bench": load}))
-    stated = {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.0259}
-    robot = params.replace(robot, stated)
-    runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
-    return np.asarray(steady_batch(with_effects(*present, robot=robot), runs).total_current)
-
-
-@pytest.mark.slow
-def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
-    """C_m I i = M / η where the motor drives M, η M (1 - a) where it is driven. M = M_c + dry, viscous and added loss."""
-    speed = np.array([100.0, -100.0, 300.0, -300.0])
-    sign, output = np.sign(speed), speed / 20.0
-
-    def current(constant, dry, share=0.0):
-        load = constant + dry + 1e-3 * output
-        return load * np.where(load * sign > 0, 1 / 0.8, 0.8 * (1 - share)) / 20.0 / 0.0259
-
-    for constant in (0.0, 0.3):  # a winch that is let down drives its motor
-        found = _on_shaft(constant, fitted(BY_NAME["directional_friction"], 0.02))
-        assert_allclose(found, current(constant, 0.05 * sign + 0.02), rtol=1e-9)
-        found = _on_shaft(constant, fitted(BY_NAME["stribeck_exponent"], 0.1))
-        assert_allclose(found, current(constant, (0.05 + 0.1 * np.exp(-((output / 8) ** 2))) * sign), rtol=1e-5)
-        found = _on_shaft(constant, fitted(BY_NAME["directional_viscous"], 5e-4))
-        assert_allclose(found, current(constant, 0.05 * sign + 5e-4 * np.abs(output)), rtol=1e-9)
-        found = _on_shaft(constant, fitted(BY_NAME["torque_offset"], 0.02))
-        assert_allclose(found, current(constant + 0.02, 0.05 * sign), rtol=1e-9)
-        found = _on_shaft(constant, fitted(BY_NAME["backdriving_loss"], 0.3))
-        assert_allclose(found, current(constant, 0.05 * sign, 0.3), rtol=1e-9)
-    assert (current(0.3, 0.05 * sign)[1::2] * sign[1::2] < 0).all()
 
 
 def _torque(name, memory, **signals):

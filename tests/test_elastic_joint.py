@@ -162,7 +162,6 @@ def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(lo
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_the_loop_names_no_effect_for_a_joint_that_twists(log):
     """The strongest effect of the library passes every threshold (117 of 3 σ) and explains a tenth of the misfit."""
     folder, _ = log

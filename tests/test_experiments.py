@@ -123,7 +123,6 @@ def seen():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_is_what_an_engineer_would_do(pair, seen):
     proposal = experiments.choose_experiment(seen[pair][3])

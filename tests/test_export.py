@@ -217,7 +217,7 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
     assert verdicts["series_resistance"].kept > 0.97
     assert verdicts["presliding"].verdict == comparison.HELD  # by lugre, although settled runs do not show it
     assert verdicts["churning"].verdict == comparison.APPROXIMATED
-    errors = {e.label: e.percent["total_current"] for e in found.errors}
+    errors = {label: percent["total_current"] for label, percent in found.errors.items()}
     assert errors[comparison.EXPORTED] < 0.2 * min(errors[comparison.TRANSLATED], errors[comparison.WITHOUT])
 
 
@@ -649,7 +649,7 @@ def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
     got = mujoco.settle_in_mujoco(
         found.files, motor, other, situation.JointResult(*map(np.asarray, near)), range(len(other.load))
     )
-    stated = found.comparison.of(comparison.EXPORTED)
+    stated = found.comparison.errors[comparison.EXPORTED]
     assert len(other.load) >= 6
     assert stated["total_current"] > 1
     assert 100 * apart(got.current, other.inside.current) < 1.3 * stated["total_current"]

@@ -51,7 +51,6 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_third_of_the_table_has_the_effective_width_of_its_wheels(robot, runs):
     """The difference of the wheels' speeds over the yaw rate is 0.75 to 0.85 m."""
     found = calibrate(runs.where(np.arange(len(runs)) % 3 == 0), robot, starts=1, blocks=())

@@ -249,14 +249,6 @@ def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_calibration_of_histories_gives_the_friction_back(robot, tmp_path):
-    runs = log(tmp_path, robot, 0.5, dry=0.25)
-    found = calibrate(runs, robot, starts=2, profiles=False, blocks=())
-    dry = found.parameters["bench.loss_coulomb"]
-    assert abs(dry.value - 0.25) < 4 * dry.sd < 0.05
-
-
-@pytest.mark.slow
 def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
     ends(mmrjax("simulate --robot rig.toml --motor-current 2 --no-report --out one"), code=0)
     row = (tmp_path / "one" / "runs.csv").read_text().splitlines()

@@ -312,7 +312,6 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
     """Of one voltage, from a file that is off by a tenth: R 0.5, k 0.05, M0 0.01."""
     torque = np.arange(9) * 0.1

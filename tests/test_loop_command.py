@@ -377,7 +377,6 @@ def started(quick, tmp_path_factory):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_histories_go_through_the_command(started):
     assert started.answer.code == 0, started.answer.err
     r = read_json(started.folder / "found" / "result.json")
@@ -396,7 +395,6 @@ def test_histories_go_through_the_command(started):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_robot_found_in_histories_starts_with_the_effect(started):
     robot = tomllib.loads((started.folder / "found" / "robot.toml").read_text())
     assert robot["effects"]["churning"]["amplitude"] > 0
@@ -406,7 +404,6 @@ def test_robot_found_in_histories_starts_with_the_effect(started):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_report_of_histories_shows_what_only_they_tell(started):
     page = (started.folder / "found" / "report.html").read_text()
     for words in ("What only histories tell", "Ljung and Box", "246 of 246 samples", "t [s]"):

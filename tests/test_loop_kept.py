@@ -174,7 +174,6 @@ def test_a_budget_ends_a_step_that_says_nothing():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
     rigs.case(world, "iron_loss", 12.0).write(tmp_path)

@@ -37,7 +37,7 @@ from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
 from sweeps.pages import page as page_room
-from sweeps.pages.figure_style import figure_settings
+from sweeps.pages.figure_style import NARROW, figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.fit_tables import Change
 from sweeps.report.terminal_renderer import print_document
@@ -189,7 +189,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
         head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
     )
-    assert "May I use it for …" in head and "new law, band of 95 %" in head
+    assert "May I use it for …" in head and "new law, 95 % band" in head
     with figure_settings():
         (axes,) = loop_figures.draw_effect_laws(
             got.found, loop_report.rows_for_figures(got.found), room.changes_by_effect(got.found)
@@ -255,7 +255,7 @@ def test_a_law_over_two_quantities_is_a_line_for_each_level():
     axes, names = drawn_law(table, "load torque [N·m]", -torque * (1 + 4 / volts))
     lines = curves_of(axes, loop_figures.BLUE)
     assert len(lines) == 3 and all(np.all(np.diff(line.get_ydata()) < 0) for line in lines)
-    assert "new law at each supply voltage, band of 95 % (±20 %)" in names
+    assert "new law by supply voltage, 95 % band (±20 %)" in names
     band = axes.collections[-1].get_paths()[0].get_extents()
     assert band.y0 == pytest.approx(1.196 * min(lines[-1].get_ydata()), rel=1e-3)
 
@@ -434,3 +434,14 @@ def test_the_head_of_a_page_is_read_in_a_minute(shown, capsys):
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):
     resolved(shown("churning", capsys).found, 1e-6).save(tmp_path / "saved")
     assert (tmp_path / "saved" / "robot_track.toml").exists()
+
+
+def test_labels_of_many_groups_do_not_cover_each_other():
+    """Forty configurations on a phone were a black bar."""
+    speed, count = channels.find_channel("speed"), 40
+    table = {"configuration": np.array([f"t{k:02d}" for k in range(count)]), "supply_voltage_V": np.full(count, 12.0)}
+    table |= {f"residual_{when}_speed_sigma": np.zeros(count) for when in ("before", "after")}
+    with figure_settings(NARROW):
+        (axes,) = loop_figures.draw_residuals_before_after(table, (speed,), "named").axes
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert len(labels) == count and 10 <= len([*filter(None, labels)]) <= 20 and labels[0] == "t00, 12 V"

@@ -284,7 +284,6 @@ def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_derivatives_by_every_parameter_and_row_match_differences(robot):
     """Of Wh/m and peak temperature of a mission, in one Jacobian. Endurance has its closed form below."""
     time, mode, values = MANY

@@ -99,7 +99,6 @@ def test_numbers_of_either_side_follow_from_their_totals():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_equal_sides_are_a_mission_of_straight_travel(robot, demanded):
     straight = jax.device_get(simulate_batch(robot, conditions(1), profile(ROWS, MODES, **RAMP), None, 512))
     for name, value in straight.total.of.items():
@@ -150,7 +149,6 @@ def test_held_duties_are_a_run_of_drive(robot, driven):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_derivatives_of_a_turn_match_differences(robot):
     """Of energy and of what it turns by, by parameters of the robot and by speed and yaw rate that are demanded."""
     names = ("motor.resistance", "6T2A.turning.width", "6T2A.turning.lateral", "6T2A.ground.friction.static")

@@ -21,7 +21,6 @@ def test_there_are_notebooks():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=[p.stem for p in SCRIPTS])
 def test_notebook_runs(script, tmp_path):
     env = {

@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from interval_coverage import coverage
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import runs as records
-from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem, solvers
@@ -347,7 +345,6 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     """With the noise that is estimated of them the rows pull static friction down to the margin. From just inside of
     it nothing shows the penalty."""
@@ -362,16 +359,6 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     found, _, _ = fit.search_rollout(posed, inside, posed.data)
     assert found.converged and float(found.decrement) < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
     assert float(found.cost) == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
-
-
-@pytest.mark.slow
-def test_intervals_cover_the_truth(posed, truth):
-    measured = dataclasses.replace(
-        posed, data=dataclasses.replace(posed.data, measured=posed.observation(truth).reading)
-    )
-    found = coverage(measured, truth, draws=500, seed=1, profiles=True)
-    assert found.converged.mean() > 0.99
-    assert np.all((found.profile > 0.92) & (found.profile < 0.98)), found.profile
 
 
 def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
@@ -457,46 +444,6 @@ def test_blocks_of_what_does_not_vary_are_none(measured):
         and len(holdout.blocks_of_kind(flat, "voltage_configuration")) == 4
     )
     assert holdout.blocks_of_kind(flat, "run") == {}
-
-
-def history_runs(robot, seed=None, noise_share=0.01):
-    """Starts of both configurations as a table of histories, from `drive`."""
-    from mmrjax.fidelities.drive import drive_batch
-
-    times = np.concatenate([np.linspace(0.0002, 0.004, 8), np.linspace(0.02, 0.6, 12)])
-    conditions = records.Runs(
-        "made",
-        {
-            "configuration": np.array(["6T2A", "6T2A", "4W2T"]), "supply_voltage_V": np.array([15.0, 33.0, 24.0]),
-            "total_mass_kg": np.array([13.1, 21.1, 13.1]), "payload_kg": np.array([0.0, 8.0, 0.0]),
-            "slope_deg": np.array([0.0, 10.0, 5.0]),
-        },
-    )  # fmt: skip
-    run = drive_batch(robot, conditions.conditions(robot), jnp.asarray(np.concatenate([[0.0], times])))
-    s = jax.tree.map(lambda x: np.asarray(x)[:, 1:], run.signals)
-    n = len(times)
-    columns = {k: np.repeat(v, n) for k, v in conditions.columns.items()}
-    columns |= {
-        "run_id": np.repeat(["a", "b", "c"], n), "time_s": np.tile(times, 3),
-        "total_current_A": s.total_current.ravel(), "motor_speed_rpm": s.speed_motor.ravel() / records.RPM,
-        "speed_mm_s": s.speed.ravel() / records.MM,
-    }  # fmt: skip
-    if seed is not None:
-        rng = np.random.default_rng(seed)
-        for column in Layout().measured_columns:
-            columns[column] = columns[column] * (1 + noise_share * rng.standard_normal(len(columns[column])))
-    return records.Runs("made", columns)
-
-
-@pytest.mark.slow
-def test_histories_pad_runs_of_different_length():
-    runs = history_runs(paper_robots.nominal())
-    kept = (runs["run_id"] != "b") | (runs["time_s"] < 0.3)
-    robot = paper_robots.nominal()
-    seen, whole = (observers.Histories.of(r, robot)(robot).reading for r in (runs.where(kept), runs))
-    assert_allclose(seen, whole[kept], rtol=1e-8)
-    # against `drive`, which made them: tests/test_histories.py says how close
-    assert_allclose(seen, runs.measured()[kept], rtol=5e-4, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -144,7 +144,6 @@ def test_comparison_can_fail(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("name", list(UNNAMED))
 def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):
     reading, again = curves(name)

@@ -14,7 +14,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import identifiability, multistart, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import ReachedBound, Remark, remarks_with_codes
+from calibration.inference.fit_notes import ReachedBound, Remark
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import MemberObservations, MemberRunner
 from calibration.inference.problem import Observation
@@ -295,25 +295,6 @@ def test_what_members_did_is_counted_and_said(found):
     ]  # fmt: skip
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
-    """A prior far from what the rows say, and narrow."""
-    name = "6T2A.ground.rolling_resistance"
-    found = calibrate(
-        runs, paper_robots.nominal(), model="drive", free=(name,), stated={name: (0.02, 0.004)}, population=6, generations=3,
-        noise="current=0.5%,motor_speed=2%,speed=2%", profiles=False, blocks=(),
-    )  # fmt: skip
-    best = found.searched.found.z[found.searched.at]
-    assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
-    assert list(found.searched.edge) == [name]
-    assert list(found.to_json()["optimizer"]["population"]["at_edge"]) == [name]
-    (ended,) = remarks_with_codes(found.remarks, "ended_at_edge")
-    assert list(ended.edge) == [name] and ended.edge[name].sds > 0
-    assert any(n.code == "far_from_prior" and n.name == name for n in found.remarks)
-    assert np.isfinite(found.posterior.covariance).all()
-
-
 @pytest.mark.slow
 def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     true = population._observe_points
@@ -346,7 +327,6 @@ def test_options_of_a_population_that_cannot_be_are_refused(options, says):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_running_gear_is_found_through_the_track_model(tmp_path):
     """Readings of a shaking gear. The population comes near its slip, which the flush gear does not."""
     table = records.read_runs("measured")

@@ -99,7 +99,6 @@ def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_page_of_a_check_draws_the_robot_as_its_geometry_is_asked_about(robot):
     outcomes = [
         SimpleNamespace(

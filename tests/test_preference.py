@@ -128,7 +128,6 @@ def traced():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_held_out_data_choose_the_leader(traced):
     by_fit = SETTLED.trace(RUNS)
     assert by_fit.verdict == "class" and by_fit.held_out == ()

@@ -69,7 +69,6 @@ def test_a_tutorial_runs(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_the_tutorial_about_a_log_finds_the_fan(tmp_path, mmrjax):
     """What the page says: 24 settled runs, and windage in the class."""
     bench = DOCS / "start" / "bench"

@@ -66,7 +66,6 @@ def left(seed, columns=None, shift=None, channel=SPEED):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_clean_residuals_cluster_no_more_often_than_stated():
     """Of 300 tables of five columns, three channels and tests over all rows and by configuration."""
     assert sum(bool(find_residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300

@@ -159,7 +159,6 @@ def agree(values, runs, effects, seconds=12.0):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, EFFECTS], ids=["plain", "effects"])
 def test_statuses_agree_over_random_robots_slopes_and_voltages(effects):
     terms = tuple(params.replace(BY_NAME[name](), {"amplitude": a}) for name, a in effects.items())

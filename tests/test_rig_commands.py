@@ -345,7 +345,6 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
     _, told, err = ends(
@@ -406,7 +405,6 @@ def precise_table(path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     """170 σ of it: without the effect the fit is so far off that by its slopes another effect would explain more."""
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")

@@ -139,7 +139,6 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
     robot = read_rig(
         tmp_path, DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH

@@ -552,19 +552,6 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     assert {"voltage", "slope", "speed_motor", bases.CONDITIONS, "window"} <= over
 
 
-@pytest.mark.slow
-def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
-    robot = bench("voltage", ("total_current", "motor_speed"), sides=3.0)
-    volts = np.array([-24.0, -18, -12, -6, 6, 12, 18, 24] * 2)
-    true = {"rig.loss_coulomb": 0.07, "rig.loss_viscous": 0.006}
-    conditions = Conditions(np.zeros(len(volts), int), voltage=volts)
-    runs = measured(tmp_path, robot, conditions, {"supply_voltage_V": volts}, true)
-    assert (np.sign(runs.measured()) == np.sign(volts)[:, None]).all()
-    found = calibrate(runs, robot, noise="current=1%,motor_speed=1%", **QUICK)
-    assert found.converged and max(inside(found, true).values()) < 3
-    assert set(found.status) == {"converged", "reverses"}
-
-
 # --- instruments of which the table tells --------------------------------------------------------------
 
 

@@ -251,7 +251,6 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_current_sensors_offset_is_named(tmp_path, signed):
     """Of a bench driven both ways. Where the sensor shows magnitudes a friction may look alike."""

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_rig_histories import BENCH, DRIVE, history
 
-from calibration.inference import multistart, noise, observers, priors, scans
+from calibration.inference import noise, observers, priors, scans
 from calibration.inference.calibration import calibrate
 from calibration.inference.identifiability import Z95
 from calibration.inference.observers import time_histories
@@ -42,23 +42,6 @@ def posed(robot, runs):
     return observers.pose_problem(
         runs, robot, priors.parameter_coordinates(robot, names), noise.noise_from_table(runs, kind.sizes(runs)).sd
     )
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_search_finds_a_delay_between_coarse_samples(coarse):
-    """From the prior mean, 1.5 prior sds away and behind two cliffs."""
-    robot, runs = coarse
-    problem, kind = posed(robot, runs), observers.observer_kind(runs)
-    known = noise.noise_from_table(runs, kind.sizes(runs))
-    starts = problem.observe.starts(problem, np.random.default_rng(0), 1)
-    found = multistart.search_one_by_one(
-        problem, known, starts, multistart.initial_noise_shares(known), lambda said: None
-    )
-    low, high = (0.02 * z for z in scans.scans_at_optimum(problem, found.best.z)[1].interval())
-    assert found.best.converged
-    assert low <= TRUTH <= high and 0.02 < low < high < 0.04
-    assert abs(0.02 * found.best.z[1] - TRUTH) < 4 * 0.02 * found.best.sd[1] < 0.01
 
 
 @pytest.mark.slow

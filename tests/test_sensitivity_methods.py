@@ -101,7 +101,6 @@ def test_size_covers_the_evaluations_that_are_asked_for():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [8, 128])
 def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
     held = np.zeros((2, 3))
@@ -111,18 +110,6 @@ def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
         for k, (e, truth) in enumerate(((found.first, FIRST), (found.total, TOTAL))):
             held[k] += (e.low <= truth) & (truth <= e.high)
     assert np.all((held / 200 >= 0.9) & (held / 200 <= 0.98)), held / 200
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_sobol_intervals_cover_those_of_the_steady_model_in_scipy():
-    from sensitivity import coverage
-
-    record = coverage(200, 32, 512)
-    shares = np.array([x for by in record["steady"].values() for order in by.values() for x in order])
-    # 36 indices of 200 seeds each: a share of 0.95 has an sd of 0.015, so that some lie outside by chance
-    assert 0.93 <= shares.mean() <= 0.97 and shares.min() >= 0.88
-    assert np.mean((shares >= 0.9) & (shares <= 0.98)) >= 0.85
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------
@@ -164,11 +151,11 @@ def test_chosen_runs_are_the_best_of_all_sets():
     jacobian = rng.normal(size=(9, 2, 3)) * rng.uniform(0.2, 3, size=(9, 1, 1))
     each = next_runs.fisher_information(jacobian, np.full((9, 2), 0.5))
     value = lambda rows: np.linalg.slogdet(np.eye(3) + each[list(rows)].sum(0))[1]  # noqa: E731
-    choice = next_runs.choose_runs(each, 3)
+    rows, gain, covariance = next_runs.choose_runs(each, 3)
     best = max(itertools.combinations(range(9), 3), key=value)
-    assert value(choice.rows) == pytest.approx(value(best))
-    assert np.sum(choice.gain) * 2 * np.log(2) == pytest.approx(value(choice.rows))
-    assert_allclose(choice.covariance[-1], np.linalg.inv(np.eye(3) + each[list(choice.rows)].sum(0)))
+    assert value(rows) == pytest.approx(value(best))
+    assert np.sum(gain) * 2 * np.log(2) == pytest.approx(value(rows))
+    assert_allclose(covariance[-1], np.linalg.inv(np.eye(3) + each[rows].sum(0)))
 
 
 def test_missing_readings_tell_nothing():

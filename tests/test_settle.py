@@ -92,7 +92,6 @@ def test_noise_does_not_cut_levels_short(tmp_path, noise):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_sds_hold_over_random_logs(tmp_path):
     """Holds of 1 to 4 s, lags up to 0.4 s, 50 to 250 Hz, noise, steps, delays and clocks that jitter."""
     z, levels, kept = [], 0, 0

@@ -54,7 +54,6 @@ def is_global(adhesion, creep, seed=3):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("adhesion", "creep"),
     [

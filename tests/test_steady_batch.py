@@ -113,7 +113,6 @@ def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [96, 97])
 def test_steady_blocks_change_no_number(robot, monkeypatch, size):
     """97 points have no block that divides them, and go together."""

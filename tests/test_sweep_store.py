@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 import tomllib
 import zlib
 from pathlib import Path
@@ -448,37 +447,6 @@ def test_identity_differences_are_few_words():
     said = zarr_store.identity_differences(old, new)
     assert said == "configuration (a was 1, is 2, b was 2, is 3, c was 3, is 4 and 2 more); code (x.py)"
     assert zarr_store.identity_differences(old, old) == ""
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_killed_at_twenty_random_moments_goes_on_to_equal_stores(tmp_path):
-    """SIGKILL at a random moment (after some number of chunks and a few milliseconds), and the same command again:
-    five times a store, from fifth to fifth of its chunks."""
-    config = CONFIG.replace("number = 50", "number = 20000").replace("chunk = 40", "chunk = 500")
-    (tmp_path / "plan.toml").write_text(config)
-    command = [*MMRJAX, "sweep", "plan.toml", "--out"]
-    done = subprocess.run([*command, "whole"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    expected, rng, chunks, kills = arrays(tmp_path / "whole"), np.random.default_rng(12), 240, 5
-    for k in range(4):
-        journal, before = tmp_path / f"s{k}.partial" / "journal" / "1-of-1.jsonl", -1
-        for part in range(kills):
-            process = subprocess.Popen(
-                [*command, f"s{k}"], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-            )
-            reached = max(chunks // kills * part + rng.integers(0, chunks // kills - 20), before + 1)
-            while process.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < reached):
-                time.sleep(0.001)
-            time.sleep(rng.uniform(0, 0.02))
-            process.kill()
-            process.wait()
-            assert journal.exists() and before < journal.read_bytes().count(b"\n") < chunks  # it was in the middle
-            before = journal.read_bytes().count(b"\n")
-        again = subprocess.run([*command, f"s{k}"], cwd=tmp_path, capture_output=True, text=True)
-        assert again.returncode == 0, again.stderr
-        assert arrays(tmp_path / f"s{k}") == expected, k
-        shutil.rmtree(tmp_path / f"s{k}")
 
 
 # --- shares -------------------------------------------------------------------------------------------------------

@@ -159,7 +159,6 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("drive", DRIVES)
 def test_a_run_shows_what_it_shows_in_the_whole_log(drive):
     """Its readings are those of the whole log at the same rows, to what its longer steps make."""

@@ -78,19 +78,6 @@ def of_world(robot, tmp_path_factory):
 TRUE = {LATERAL: 1.45, WIDTH: 0.236}
 
 
-@pytest.mark.slow
-def test_settled_turns_are_observed_as_turns(robot, of_world):
-    assert observers.observer_kind(of_world) is SettledTurns
-    names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH))
-    sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in SHOWN], of_world.measured().shape)
-    truth = {name: (TRUE[name.partition(".")[2]], 0.05) for name in names}
-    posed = observers.pose_problem(of_world, robot, priors.parameter_coordinates(robot, names, truth), sd)
-    seen = posed.observation(jnp.zeros(2))
-    whitened = (np.asarray(seen.reading) - of_world.measured()) / sd
-    assert np.sqrt((whitened**2).mean()) == pytest.approx(1.0, abs=0.2)  # noise alone
-    assert not np.asarray(seen.adhesion_used).any()
-
-
 def posed_turns(robot, runs):
     names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
     sd = np.broadcast_to([channels.find_channel(n).factor * SDS[n] for n in SHOWN], runs.measured().shape)
@@ -164,7 +151,6 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_truth_of_a_second_implementation_is_found(robot, of_world):
     found = calibrate(of_world, robot, noise=NOISE)
     assert found.converged and found.adequacy.p_value > 0.01

@@ -7,17 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from test_turn_calibration import DUTIES, NOISE, SHOWN, written
 from test_turning import flat
 
 import mmrjax as mm
-from calibration.data import runs as records
-from calibration.inference.calibration import calibrate
 from mmrjax import effects
 from mmrjax.model import balances, energy, paper_robots, params
 from mmrjax.model.signals import PlaneMotion, State
 from mmrjax.turning import circling
-from tests.commands import read_rig, text_file
+from tests.commands import read_rig
 
 OF_SIDES = ("side_friction", "side_torque", "side_voltage", "side_radius")
 #: In units of the prior sd.
@@ -130,24 +127,3 @@ def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_p
     assert not set(effects.OF_TURNS) & set(effects.BY_NAME)
     for kind in effects.OF_TURNS.values():
         assert "Source:" in (kind.__doc__ or "") and kind.balance in balances.BALANCES
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_sides_that_are_not_alike_are_found(tmp_path):
-    """A table of a robot whose left side rubs more, calibrated with that effect's amplitude free."""
-    true = with_amplitudes(paper_robots.nominal(), {"side_friction": jnp.asarray(0.0025)})
-    duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
-    seen = mm.simulate(true, mm.Conditions(["6T2A"] * len(DUTIES), voltage=33.0, **duties)).reading
-    path = tmp_path / "robot.toml"
-    shown = f"channels = [{', '.join(map(repr, SHOWN))}]\n"
-    robot = mm.read_robot(
-        text_file(path, f'base = "nominal"\n{shown}[effects.side_friction]\n[effects.side_torque]\n')
-    )
-    mass = float(robot.configurations["6T2A"].mass)
-    table = written(tmp_path / "turns.csv", "6T2A", mass, {name: seen[name] for name in SHOWN})
-    free = [f"effects.{name}.amplitude" for name in ("side_friction", "side_torque")] + ["6T2A.turning.lateral"]
-    found = calibrate(records.read_runs(table, robot=robot), robot, free=free, noise=NOISE, starts=1, blocks=())
-    friction, torque = (found.parameters[name] for name in free[:2])
-    assert abs(friction.value - 0.0025) < 3 * friction.sd < 0.001
-    assert abs(torque.value) < 3 * torque.sd

@@ -49,7 +49,6 @@ def linear(posed):
     return jax.device_get(found)
 
 
-SCORED = ("side_voltage", "side_torque", "turning_resistance", "lateral_grip", "iron_loss")
 CURVES = ("curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate")
 
 
@@ -59,7 +58,7 @@ def shown(posed):
     difference. The others that are asked for here stand beside it without amplitude, so that one program serves."""
     problem, space = posed
     robot = problem.robot(jnp.zeros(space.free))
-    kinds = [(effects.BY_NAME | effects.BESIDE)[name] for name in (*SCORED, *CURVES)]
+    kinds = [(effects.BY_NAME | effects.BESIDE)[name] for name in CURVES]
     absent = {kind: kind(amplitude=0.0) for kind in kinds}
 
     @jax.jit

@@ -349,7 +349,6 @@ def test_what_is_wrong_with_a_robot_that_turns_is_said(rig):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_width_or_ratio_of_a_kinematic_robot_is_calibrated(rig, table):
     robot = rig(KINEMATIC)
     speeds = [

@@ -175,7 +175,6 @@ def test_rates_are_those_of_a_second_implementation(robot, configuration):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_run_over_time_is_that_of_a_second_implementation(robot):
     times = np.array([0.0, 0.05, 0.3, 0.8])
     run = mm.Conditions(

@@ -75,20 +75,6 @@ def test_evaluate_compiles_once_a_shape(variation, compilations):
     assert compilations == []
 
 
-@pytest.mark.slow
-def test_derivatives_go_through_evaluate(variation):
-    def current(values):
-        return evaluate_points(variation, "steady", values, Conditions(), {}, ("total_current",))[
-            "total_current"
-        ].sum()
-
-    values, h = jnp.asarray(VALUES[:2]), 1e-6
-    exact = jax.grad(current)(values)[1, 0]
-    central = (current(values.at[1, 0].add(h)) - current(values.at[1, 0].add(-h))) / (2 * h)
-    assert_allclose(exact, central, rtol=1e-6)
-    assert float(exact) != 0.0
-
-
 def test_axes_know_unit_bounds_prior_and_meaning(variation):
     axes = variation.axes
     resistance = axes["motor.resistance"]

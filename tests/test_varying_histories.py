@@ -19,8 +19,6 @@ from calibration.discovery.reach import reach_of_table
 from calibration.discovery.settings import settings_for
 from calibration.inference import checks
 from calibration.inference.blocks import blocks_of_kind, distinct_held_out_blocks
-from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
@@ -320,21 +318,6 @@ def test_conditions_that_change_between_many_levels_are_few(observer, runs):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
-def test_calibration_finds_the_truth_within_its_intervals(simulated):
-    found = calibrate(simulated, paper_robots.nominal(), free=tuple(TRUTH), model="drive", starts=3, profiles=False, blocks=False,
-                      stated={n: (v, 0.3 * v) for n, v in NOMINAL.items()})  # fmt: skip
-    assert found.adequacy.adequate and found.converged
-    for name, truth in TRUTH.items():
-        estimate = found.parameters[name]
-        assert abs(estimate.value - truth) < 3 * estimate.sd, name
-        assert estimate.sd < 0.05 * truth, name
-    assert {"mode", "supply_voltage_V"} <= set(found.conditions)
-    assert len(remarks_with_codes(found.remarks, "stops_on_slope")) == 1
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
 def test_loop_finds_what_was_not_declared_on_a_stair(engine):
     stairs = engine({**NOMINAL, f"effects.{UNDECLARED}.amplitude": 0.4}, ("stair", "reversal"))
     analyst = Analyst(

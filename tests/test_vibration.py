@@ -120,7 +120,6 @@ def shaken():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("gear", GEARS)
 def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
     slip, law, _, normal = shaken[gear]
@@ -129,14 +128,12 @@ def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_fig_7_alone_misses_the_slip_of_the_gear_that_shakes(shaken):
     slip, law, alone, _ = shaken["recess 0.35 mm, soft"]
     assert np.sqrt(np.mean((law - slip) ** 2)) < 0.5 * np.sqrt(np.mean((alone - slip) ** 2))
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_loop_finds_the_effect_in_what_the_track_model_made():
     """Seventy rows of a gear that shakes (set S of 2026-11-22), with noise. Nobody tells the loop of it."""
     gear = {

@@ -86,7 +86,6 @@ def test_series_hold_every_effect_that_only_a_series_shows():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("battery", [0.0, 1.0])
 def test_clean_histories_agree_with_drive(package, battery):
     _, y = histories.histories(RUNS, DURATION, EVERY, battery=battery)
@@ -96,7 +95,6 @@ def test_clean_histories_agree_with_drive(package, battery):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PASSING)
 def test_effect_of_a_series_agrees_with_drive(package, name):
     law, battery = SERIES[name], float(name == "battery_sag")
@@ -263,7 +261,6 @@ def test_each_of_two_leaves_its_sigmas_beside_the_other(quick):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_oracle_finds_a_mimic_and_none_for_a_law_of_its_own(quick):
     made = histories.case(brief(world("plain"), 0.25, 1), ["supply_recovery"], 30.0, seed=1)
     near = dataclasses.replace(SERIES["churning"], cls="", of=lambda s, q: s.w_k**2 * s.d * 1.0001)

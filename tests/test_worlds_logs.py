@@ -50,7 +50,6 @@ def shown(tmp_path, case, terms=()):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("imposed", logs.IMPOSED)
 def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
     rig = logs.rig(np.random.default_rng([3, logs.IMPOSED.index(imposed)]), imposed)
@@ -128,26 +127,6 @@ def test_logs_of_about_one_length_share_what_is_compiled():
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_a_log_is_reproducible_and_its_effect_has_its_strength():
-    rig = logs.rig(np.random.default_rng(7), "voltage", 0.005)
-    clean, again = (logs.case(rig, "", 0.0, 4).table for _ in range(2))
-    assert all((clean[n] == again[n]).all() for n in clean)
-    one = logs.case(rig, "series_resistance", 9.0, 4)
-    assert one.label["effects"][0]["class"] == "series_resistance"
-    assert len(one.table["time_s"]) == logs.RUNS * logs.ROWS
-    y, base, (change,) = logs.slopes(rig, rig.p, (), [one.terms])
-    left = remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))
-    assert np.linalg.norm(left) == pytest.approx(9.0, rel=0.1)
-    assert np.sqrt(np.mean((one.measured - y - change) ** 2)) == pytest.approx(1.0, abs=0.05)
-    # A resistor before a winding is more of its resistance: a refit leaves what that one's tolerance says.
-    taken_up = one.terms[0].amplitude / rig.p["resistance"]
-    assert one.label["effects"][0]["sigmas"] == pytest.approx(
-        np.log1p(taken_up) / logs.RELATIVE["resistance"], rel=0.1
-    )
-
-
 def test_an_effect_of_a_servo_is_sized_by_two_simulations(monkeypatch):
     """A search for the amplitude took a simulation for each of its steps."""
     monkeypatch.setattr(logs, "ROWS", 60)
@@ -160,33 +139,3 @@ def test_an_effect_of_a_servo_is_sized_by_two_simulations(monkeypatch):
     _, base, (change,) = logs.slopes(rig, rig.p, (), [one.terms])
     left = remainder(change.ravel(), np.stack([b.ravel() for b in base], 1))
     assert np.linalg.norm(left) == pytest.approx(9.0, rel=0.03)
-
-
-def line(kind, seed, verdict="none", classes=(), **more):
-    held = {"refit": 1.2, "found": 1.05, "own": 1.3, "own_with_term": 1.0}
-    truth = [] if kind == "clean" else [{"name": "churning", "class": "churning", "balance": "track", "sigmas": 9.0}]
-    made = {"imposed": logs.IMPOSED[seed % 3], "every": 0.01, "delay": 0.0}
-    return {"kind": kind, "seed": seed, "verdict": verdict, "classes": [list(c) for c in classes], "where": None,
-            "truth": truth, "made": made, "seconds": 60.0, "read_again": True, "held_out": held, "written": True,
-            "delay": [0.0001, 0.0001], **more}  # fmt: skip
-
-
-def test_a_campaign_says_what_its_logs_came_to():
-    lines = [
-        line("clean", 0), line("library", 1, "named", [("churning",)]), line("library", 2, "unnamed"),
-        line("outside", 3, "named", [("churning",)], held_out={"refit": 1.0, "found": 1.2, "own": 1.0, "own_with_term": 1.0}),
-    ]  # fmt: skip
-    said = "\n".join(rig_logs.summary(lines))
-    assert "churning: right 1 of 2; {'unnamed': 1}" in said
-    shares = {text[:60].strip(): text[76:].split("%")[0].strip() for text in said.split("\n") if "%  [" in text}
-    assert shares["clean: a false finding (goal <= 5 %)"] == "0.0"
-    assert shares["outside: a wrong established name (goal <= 3 %)"] == "100.0"
-    assert [v for k, v in shares.items() if k.startswith("held out")] == ["75.0", "75.0"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", rig_logs.KINDS)
-def test_cases_are_of_their_kind(kind):
-    for seed in range(3):
-        case = rig_logs.attempt(kind, seed)
-        assert isinstance(case, str) or case.label["kind"] == kind

@@ -205,7 +205,6 @@ def test_posterior_of_what_nothing_shows_is_its_prior(worlds):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("names", [laws.RIGS, laws.OUTSIDE_RIGS], ids=["library", "outside"])
 def test_effects_leave_the_sigmas_that_are_asked_for(names, worlds):
     """By another optimiser, and from another start, than those by which amplitudes are sized."""
@@ -244,7 +243,6 @@ def _refitted(w, y, start):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [("churning",), pytest.param(tuple(laws.RIGS), marks=pytest.mark.slow)], ids=["one", "every"]
 )

@@ -15,22 +15,6 @@ from mmrjax.model.conditions import Conditions
 # --- Fisher information, and D-optimal choices from a list ----------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class ChosenRuns:
-    """Runs to make next, the most informative first.
-
-    Attributes:
-        rows: indices of the chosen candidates.
-        gain: information that each run adds to those before it [bit], shape (runs,).
-        covariance: covariance of the scores after each number of runs, from none to all, shape (runs + 1, inputs,
-            inputs).
-    """
-
-    rows: tuple[int, ...]
-    gain: np.ndarray
-    covariance: np.ndarray
-
-
 def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Fisher information of each run about the scores, shape (runs, inputs, inputs).
 
@@ -45,12 +29,16 @@ def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return np.einsum("rci,rcj->rij", whitened, whitened)
 
 
-def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
+def choose_runs(information: np.ndarray, count: int) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Runs that together are most informative. Each candidate is chosen at most once.
 
     Args:
         information: Fisher information of each candidate, from `fisher_information`.
         count: number of runs.
+
+    Returns:
+        Indices of the chosen candidates, the most informative first. Information that each adds to those before it
+        [bit]. Covariance of the scores after each number of runs, from none to all, shape (runs + 1, inputs, inputs).
     """
     candidates, size, _ = information.shape
     count = min(count, candidates)
@@ -60,8 +48,8 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
     improved = True
     while improved:
         improved = False
-        for run_number in range(count):
-            other_runs = run_indices[:run_number] + run_indices[run_number + 1 :]
+        for place in range(count):
+            other_runs = run_indices[:place] + run_indices[place + 1 :]
             best = _best_candidate(information, other_runs)
             if _log_determinant(information, [*other_runs, best]) > _log_determinant(information, run_indices) + 1e-9:
                 run_indices = [*other_runs, best]
@@ -73,7 +61,7 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
     values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
     eye = np.eye(size)
     covariances = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
-    return ChosenRuns(tuple(ordered), np.diff(values) / (2 * np.log(2)), np.stack(covariances))
+    return ordered, np.diff(values) / (2 * np.log(2)), np.stack(covariances)
 
 
 def _log_determinant(information: np.ndarray, rows: list[int]) -> float:
@@ -159,22 +147,21 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     if not finite.any():
         return None
     information_of = fisher_information(jacobian[finite], candidates.deviations(reading)[finite])
-    choice = choose_runs(information_of, candidates.count)
-    picked = np.flatnonzero(finite)[list(choice.rows)]
+    chosen, gain, covariance = choose_runs(information_of, candidates.count)
+    picked = np.flatnonzero(finite)[chosen]
     slope = study.inputs.slope[study.inputs.places][:, :p]
-    sd_after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
+    sd_after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, covariance, slope))
     outputs = {}
     for name, g in found.by_score.items():
         g = g[np.isfinite(g).all(1)][:, :p]
-        variance = np.einsum("pi,kij,pj->kp", g, choice.covariance, g)
-        outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(choice.covariance), np.nan)
+        variance = np.einsum("pi,kij,pj->kp", g, covariance, g)
+        outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(covariance), np.nan)
     safe_variance = np.where(sd_after[0] > 0, sd_after[0], 1.0)
-    next_points = points.at(picked)
     return NextRuns(
         int(finite.sum()),
         candidates.source,
-        next_points,
-        choice.gain,
+        points.at(picked),
+        gain,
         candidates.words,
         sd_after / safe_variance,
         outputs,

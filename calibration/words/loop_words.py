@@ -318,8 +318,10 @@ def regression_verdict(found: EffectRanking) -> str:
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies]
     alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
     families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
-    lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "but no effect explains it"
-    lacks = f"something is missing, {lacks}" if found.missing else "no effect of the library exceeds chance"
+    lacks = "something may be missing, but no effect explains it"
+    if alike:
+        lacks = f"perhaps {families} is missing ({' or '.join(e.name for e in alike)})"
+    lacks = lacks if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
     numbers = f". Parameters [SI]: {numbers}" if numbers else ""
     return f"regression only, not confirmed by simulation: {lacks}{numbers}"

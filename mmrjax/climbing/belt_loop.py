@@ -135,20 +135,16 @@ class BeltLoop(eqx.Module):
         return jnp.mod(jnp.arctan2(-arm[..., 0], -arm[..., 1]) + self.taper, 2 * jnp.pi)
 
 
-class GrouserTips(NamedTuple):
-    """Tips of grousers [m], and their displacement per displacement of the belt [-], each of shape (n, 2)."""
+def grouser_tips(loop: BeltLoop, place: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Tips of the grousers at `place` [m along the path], and their displacement per displacement of the belt [-].
 
-    at: Array
-    rate: Array
-
-
-def grouser_tips(loop: BeltLoop, place: Float[Array, " n"]) -> GrouserTips:
-    """Tips of the grousers at `place` [m along the path]. Their rigid bases: see `belt.tips_on_path`."""
+    Both have the shape (n, 2). Their rigid bases: see `belt.tips_on_path`.
+    """
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     height = loop.grouser_height
     run = running_direction(loop.normal(loop.turned(place)))
-    return GrouserTips(loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal))
+    return loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal)
 
 
 class CornerGaps(NamedTuple):

@@ -157,15 +157,15 @@ def _belt_contacts(
     """
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
-    tips = belt_loop.grouser_tips(belt, place)
-    points = frame.world(tips.at)
+    tips, rate = belt_loop.grouser_tips(belt, place)
+    points = frame.world(tips)
     gap, normal = terrain.distance(points)
 
     def contact_group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _ContactGroup:
         guided = _guided_share(shape, place) if main else jnp.zeros_like(gap)
         return _ContactGroup(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
 
-    groups = [contact_group(points, gap, normal, frame.along(tips.rate), place)]
+    groups = [contact_group(points, gap, normal, frame.along(rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
     for near in (belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local)):

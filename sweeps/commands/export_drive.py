@@ -49,7 +49,7 @@ def to_json(found: Export) -> Json:
         "runs": len(compared.situation.command),
         "source": compared.situation.source,
         "reference": compared.reference,
-        "errors_percent": {e.label: dict(e.percent) for e in compared.errors},
+        "errors_percent": compared.errors,
         "translated": dict(compared.translated),
         "refitted": dict(compared.refitted),
         "effects": [

@@ -8,7 +8,6 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -121,7 +120,12 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             _report_stored_stages(stages, folder, config.robot)
             raise
         if config.resolve:
-            verdict = _add_track_model_test(verdict, config, beside.members, progress)
+            # Does a different running gear explain the misfit?
+            resolved = fit_track_model(
+                verdict, noise=config.noise or None, population=config.population, generations=config.generations,
+                members=beside.members, seed=config.seed, tell=report_in_words(progress),
+            )  # fmt: skip
+            verdict = dataclasses.replace(verdict, resolved=resolved)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
@@ -131,17 +135,6 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": verdict.verdict}
         return finish_run_folder(folder, config, manifest, solved=verdict.converged, page=page, runs=verdict.runs)
-
-
-def _add_track_model_test(
-    found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
-) -> DiscoveryResult:
-    """Adds the test with the track model: does a different running gear explain the misfit?"""
-    resolved = fit_track_model(
-        found, noise=config.noise or None, population=config.population, generations=config.generations,
-        members=members, seed=config.seed, tell=report_in_words(progress),
-    )  # fmt: skip
-    return dataclasses.replace(found, resolved=resolved)
 
 
 def _report_out_of_time(within: float, begun: bool) -> None:

@@ -56,7 +56,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     with open_folder("simulate", config, robot, beside, runs) as folder:
         conditions = run.conditions_of_runs(robot, runs, config)
         run.check_runs_bearable(robot, conditions, config)
-        readings = _displayed_channels(robot, settled)
+        turn_channels = channels.channels_named((*robot.rig.channels, *SHOWN))
+        readings = tuple(c for c in turn_channels if c.settled or not settled)
         stages = 2 + config.demands
         if config.demands:
             with report_stage(1, stages, "duties of the demanded turn"):
@@ -201,12 +202,6 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     volts = np.array([config.left_V, config.right_V])
     source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))
     return columns | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
-
-
-def _displayed_channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
-    """Channels shown for a turn."""
-    channels_to_show = channels.channels_named((*robot.rig.channels, *SHOWN))
-    return tuple(c for c in channels_to_show if c.settled or not settled)
 
 
 def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:

@@ -64,14 +64,6 @@ class EffectFate:
 
 
 @dataclasses.dataclass(frozen=True)
-class ModelErrors:
-    """Error of one model against the reference by channel: rms error over rms [%]."""
-
-    label: str
-    percent: Mapping[str, float]
-
-
-@dataclasses.dataclass(frozen=True)
 class ExportComparison:
     """An exported drive compared with the native model.
 
@@ -79,7 +71,7 @@ class ExportComparison:
         situation: the runs.
         translated, refitted: parameters of the format by name [SI], before and after the refit.
         fates: fates of base terms and effects.
-        errors: errors of native, exported, translated, and exported without the effects.
+        errors: rms error over rms [%] by channel, of native, exported, translated, and exported without the effects.
         reference: what errors are relative to, in words.
         readings: readings of the exported drive [SI], (runs, channels).
         exported: result of the exported drive at the joint.
@@ -89,14 +81,10 @@ class ExportComparison:
     translated: Mapping[str, float]
     refitted: Mapping[str, float]
     fates: tuple[EffectFate, ...]
-    errors: tuple[ModelErrors, ...]
+    errors: Mapping[str, Mapping[str, float]]
     reference: str
     readings: np.ndarray
     exported: JointResult
-
-    def of(self, label: str) -> Mapping[str, float]:
-        """Errors of a model [%] by channel."""
-        return next(e.percent for e in self.errors if e.label == label)
 
 
 #: Labels of the models whose errors are stated.
@@ -146,7 +134,7 @@ def compare_format(
     return ExportComparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
         dict(zip(law.names, map(float, theta), strict=True)), tuple(fates_found),
-        tuple(ModelErrors(label, channel_errors(joint, readings, reference)) for label, readings in models.items()),
+        {label: channel_errors(joint, readings, reference) for label, readings in models.items()},
         "the measured readings" if situation.is_measured else "the native model",
         models[EXPORTED], exported,
     )  # fmt: skip

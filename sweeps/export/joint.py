@@ -223,7 +223,8 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
         raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing; the drive law needs it; add it")
     members: Any = {name: robot.configurations[name]}
     one = dataclasses.replace(robot, configurations=members)
-    acting = tuple(e for e in robot.effects if _effect_acts(one, e))
+    moving = Signals(configuration=0, on_tracks=jnp.asarray(one.configurations.members[0].on_tracks))
+    acting = tuple(e for e in robot.effects if e.acts_everywhere or bool(e.acts(one, moving)))
     idle = tuple(e.name for e in robot.effects if e not in acting)
     effects_inside = tuple(
         e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks
@@ -232,11 +233,6 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     one = dataclasses.replace(one, effects=effects_inside)
     joint = DriveJoint(file, name, one, effects_inside, outside, idle, ())
     return dataclasses.replace(joint, parts=tuple(_trace_parts(joint)))
-
-
-def _effect_acts(robot: Robot, effect: Effect) -> bool:
-    on_tracks = jnp.asarray(robot.configurations.members[0].on_tracks)
-    return effect.acts_everywhere or bool(effect.acts(robot, Signals(configuration=0, on_tracks=on_tracks)))
 
 
 class _ExpressionTracer:

@@ -52,7 +52,7 @@ def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.
     outlines = []
     for belt, frame, belt_angle in belts:
         path = frame.world(belt.point(jnp.linspace(0.0, belt.length, 120)[:-1]))
-        tips = frame.world(belt_loop.grouser_tips(belt, belt.places(belt.first * belt_angle)).at)
+        tips = frame.world(belt_loop.grouser_tips(belt, belt.places(belt.first * belt_angle))[0])
         outlines.append((np.asarray(path), np.asarray(tips)))
     if np.asarray(chassis.on_tracks) < 0.5:
         round_ = np.linspace(0, 2 * np.pi, 60)

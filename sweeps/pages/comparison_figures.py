@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from calibration.data import Columns
 from mmrjax.model.channels import Channel
-from sweeps.export.comparison import ExportComparison
+from sweeps.export.comparison import NATIVE, ExportComparison
 from sweeps.export.joint import channels_of
 from sweeps.pages.figure_style import (
     BLUE,
@@ -29,9 +29,7 @@ from sweeps.pages.figure_style import (
 def draw_export_readings(compared: ExportComparison) -> Figure:
     """Readings of the exported drive over those of the reference, a panel for each channel."""
     situation = compared.situation
-    channel_places = [
-        (k, c) for k, c in enumerate(channels_of(situation.joint)) if c.name in compared.errors[0].percent
-    ]
+    channel_places = [(k, c) for k, c in enumerate(channels_of(situation.joint)) if c.name in compared.errors[NATIVE]]
     reference = situation.measured if situation.is_measured else situation.native
     fig, grid = new_figure(1, max(len(channel_places), 1), 3.4)
     for axes, (k, channel) in zip(grid[0], channel_places, strict=False):

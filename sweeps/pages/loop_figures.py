@@ -65,8 +65,8 @@ CONDITION_WORDS = {
 }
 
 
-#: Letters of labels that fit side by side below a figure.
-ABREAST = 110
+#: Letters of labels that fit side by side below a figure, and most labels there.
+ABREAST, NAMED = 110, 36
 
 
 def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
@@ -102,7 +102,8 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
         axes.set_ylabel(f"{channel.label} [σ]")
     outer_legend(grid[0, 0], "upper left")
     starts = [0, *edges]
-    group_labels = [groups[a] for a in starts]
+    step = -(-len(starts) // (NAMED // 2 if is_narrow() else NAMED))
+    group_labels = [groups[a] if k % step == 0 else "" for k, a in enumerate(starts)]
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], group_labels,
                            rotation=90 if sum(len(word) + 2 for word in group_labels) > ABREAST else 0)  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
@@ -401,9 +402,9 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
             axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if is_labelled else None)
             is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
             levels = np.zeros(len(rows)) if is_line else imposed[rows]
-            by_level = "" if is_line else f" at each {imposed_label.partition(' [')[0]}"
+            by_level = "" if is_line else f" by {imposed_label.partition(' [')[0]}"
             for line in (rows[levels == level] for level in np.unique(levels)):
-                law_words = f"new law{by_level}, band of 95 % (±{share:.2g} %)" if is_labelled else None
+                law_words = f"new law{by_level}, 95 % band (±{share:.2g} %)" if is_labelled else None
                 if not (is_line or _turns_once(law[line])):
                     axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
                                   alpha=0.6, label=law_words)  # fmt: skip

@@ -52,9 +52,10 @@ def export_document(found: Export) -> Document:
 
 
 def _errors(found: Export) -> Table:
-    names = list(found.comparison.errors[0].percent)
+    errors = found.comparison.errors
+    names = list(next(iter(errors.values())))
     heads = (f"{channels.find_channel(n).label} [%] | .3g" for n in names)
-    rows = [(e.label, *(e.percent[n] for n in names)) for e in found.comparison.errors]
+    rows = [(label, *map(percent.get, names)) for label, percent in errors.items()]
     return catalogue.table("export.error-table", rows, *heads, title=words.errors_title(found))
 
 

@@ -336,17 +336,14 @@ def _on_a_grid(
         return not is_measured(column) and column_of[column] not in lines
 
     if not over_time:
-        raise BadData(f"{source.name}: no signal has the name of a column; {_how_to_name(source)}")
+        paths = [s.path for s in source.signals]
+        raise BadData(
+            f"{source.name}: no signal has the name of a column; {suggested_paths('', paths)}; give their columns in "
+            f'the robot\'s file, for example [columns] supply_voltage_V = "{paths[0]}" (mmrjax inspect proposes the '
+            "lines)"
+        )
     time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
     return {"time_s": time, **values, **_in_rows(source, other_signals, len(time))}, notes
-
-
-def _how_to_name(source: Source) -> str:
-    paths = [s.path for s in source.signals]
-    return (
-        f"{suggested_paths('', paths)}; give their columns in the robot's file, for example [columns] "
-        f'supply_voltage_V = "{paths[0]}" (mmrjax inspect proposes the lines)'
-    )
 
 
 def _raw_values(values: np.ndarray) -> Raw:

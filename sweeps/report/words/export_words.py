@@ -67,7 +67,7 @@ BACKWARD = "Runs in which the load drives the motor, because none is among the r
 def export_statement(found: Export) -> str:
     """One sentence: the exported drive, and its error compared with the native model."""
     compared = found.comparison
-    exported, native = compared.of(EXPORTED), compared.of(NATIVE)
+    exported, native = compared.errors[EXPORTED], compared.errors[NATIVE]
     channels_shown = ", ".join(
         f"{channels.find_channel(n).label} {three_digits(exported[n])} %"
         + (f" (native {three_digits(native[n])} %)" if compared.situation.is_measured else "")
@@ -243,9 +243,10 @@ def law_text(found: Export) -> str:
     refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
     table = f"\n| of the format | translated | refitted |\n|---|---|---|\n{refitted}\n" if refitted else ""
     errors = "\n".join(
-        f"| {e.label} | {' | '.join(f'{x:.3g}' for x in e.percent.values())} |" for e in compared.errors
+        f"| {label} | {' | '.join(f'{x:.3g}' for x in percent.values())} |"
+        for label, percent in compared.errors.items()
     )
-    names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[0].percent]
+    names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[NATIVE]]
     fates = "\n".join(
         f"* {f.name}: {verdicts[f.verdict]} "
         f"{f.how}{f' ({share_kept(f)} of its change is kept)' if share_kept(f) else ''}"
