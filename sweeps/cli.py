@@ -1,4 +1,4 @@
-"""The command line `mmrjax`: options only. What a command does is in `commands`, imported when it is needed."""
+"""The command line `mmrjax`: options only. Each command imports its module in `commands` when it runs."""
 
 from __future__ import annotations
 
@@ -328,7 +328,7 @@ def sensitivity() -> None:
     "--set running_gear.guide_recess=1e-4",
 )
 def resonance() -> None:
-    """Find speeds at which the tracks excite the chassis.
+    """Find the speeds at which the tracks excite the chassis.
 
     The track model gives the ripple of ground reaction, current and speed over speed and payload. A Campbell diagram
     compares the grouser-passing frequency and its harmonics with the bounce and pitch modes of the robot on its

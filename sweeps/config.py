@@ -336,7 +336,7 @@ class AxesPart(Part):
     """Axes of a grid. The default of an axis is from `sweeps.points.grid.resolve_grid`: Table 8 for the packaged
     robot.
 
-    The drive axis is voltage or motor speed, whichever the robot imposes. On the battery there is none. Payload,
+    The drive axis is voltage or motor speed, whichever the robot imposes. It is absent on the battery. Payload,
     slope and surface apply to vehicles only.
     """
 
@@ -520,7 +520,7 @@ class ProfilePart(FidelityPart):
 
     @property
     def options(self) -> dict[str, float]:
-        """Options of the fidelity. With a profile there are none."""
+        """Options of the fidelity. None with a profile."""
         return super().options if self.profile is None else {}
 
 

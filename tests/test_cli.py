@@ -229,7 +229,7 @@ BAD_RUNS = {
     ),
     "misspelt channel": (
         HEADER.replace("speed_mm_s", "spede_mm_s") + "\n6T2A,15,13.1,0,5,2.75,4800,400",
-        "column speed_mm_s is missing; is spede_mm_s meant?",
+        "column speed_mm_s is missing; did you mean spede_mm_s?",
     ),
     "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column with readings"),
     "slope": (

@@ -28,7 +28,7 @@ def table():
     runs = Sized(channels=(CURRENT, SPEED), measured=lambda: measured)
     weight = np.ones((ROWS + 8, 2))
     weight[ROWS:] = 0.0
-    return runs, SimpleNamespace(weight=weight)
+    return runs, SimpleNamespace(weight=weight, bare=SimpleNamespace(observe=SimpleNamespace(reads=True)))
 
 
 def judged(refit, sd=SD, source="columns", outlier=False):

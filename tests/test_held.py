@@ -260,4 +260,4 @@ def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
     assert rig_check.check_rig_file(tmp_path / "rig.toml", str(tmp_path / "runs.csv"), (), False) == 0
     printed = capsys.readouterr().out
-    assert "parameters that these data can determine" in printed and "some rows have no steady state" not in printed
+    assert "These data determine" in printed and "some rows have no steady state" not in printed

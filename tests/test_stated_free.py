@@ -130,7 +130,7 @@ def test_nothing_to_fit_is_not_put_down_to_an_option_that_nobody_gave(tmp_path):
 def test_a_width_of_the_programs_is_said(tmp_path, mmrjax):
     bench(tmp_path, lambda text: text.replace('"1.2 ± 5 %"', "1.2"))
     _, out, _ = ends(mmrjax("rig check rig.toml"), code=0)
-    assert "no ± is given, so the default ± is used: motor.resistance (±5 %)" in " ".join(out.split())
+    assert "No ± is given, so the default ± is used: motor.resistance (±5 %)" in " ".join(out.split())
     assert "bench.loss_coulomb (±50 %)" in " ".join(out.split())
 
 

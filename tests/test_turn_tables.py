@@ -154,7 +154,7 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
         ),
         (
             "U_1,U_2",
-            "row 2, motor_current_left_A: got -2 at 24 V; only this .*; for a turn, give duty_left and duty_right",
+            "row 2, motor_current_left_A: got -2 at 24 V; nothing else drives .*; for a turn, give duty_left and duty_right",
         ),
     ],
 )

@@ -99,7 +99,7 @@ def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy
 def test_a_measured_torque_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot, torque):
     runs = table(tmp_path, robot, torque=torque)
     assert not runs.has("output_torque_Nm") and runs.has("motor_current_A")
-    assert any("output_torque_Nm: equals 0.64" in note and "it is left out" in note for note in runs.notes)
+    assert any("output_torque_Nm: equals 0.64" in note and "It is left out" in note for note in runs.notes)
 
 
 def test_a_load_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot):

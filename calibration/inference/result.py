@@ -331,7 +331,7 @@ class CalibrationResult:
         return undetermined_names(self.held_by_prior, self.together)
 
     def determined(self, name: str) -> str:
-        """Whether the data determine a parameter: `yes`, `no`, or the parameters with which only a combination is
+        """Determination of a parameter by the data: `yes`, `no`, or the parameters with which only a combination is
         determined.
         """
         return describe(Determination.from_pairs(name, self.parameters[name].held_by_prior, self.together))
