@@ -1,4 +1,4 @@
-"""Configuration of a sweep into a store: its tables or the grid of the options, and its execution."""
+"""Configuration of a sweep that is written to a store: input tables or the grid of the options, and execution."""
 
 from __future__ import annotations
 

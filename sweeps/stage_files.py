@@ -1,9 +1,7 @@
-"""Files with results of stages: JSON with values, names of our classes and places of arrays, and the bytes of the
-arrays.
-
-A file is an archive of `np.savez`, whose checksum covers both. Reading runs no code from the file. A file can name
-only dataclasses of `mmrjax` and `calibration`, effects that the user has loaded, and the functions in `FUNCTIONS`.
-Fields are set without calling a constructor.
+"""Files that store stage results. A JSON part holds values, names of our classes and positions of arrays; a binary
+part holds the arrays. Each file is an `np.savez` archive whose checksum covers both parts. Reading runs no code from
+the file. A file can name only dataclasses of `mmrjax` and `calibration`, effects that the user has loaded, and the
+functions in `FUNCTIONS`. Fields are set without calling a constructor.
 """
 
 from __future__ import annotations

@@ -397,7 +397,7 @@ def test_wrong_calls_are_said(message, robot):
 def test_other_wrong_use_is_said(robot):
     assert refused(robot, {"voltage": 3.0}) == "conditions: got dict; expected mmrjax.Conditions(...)"
     said = refused(robot, mm.Conditions(voltage=np.full(1001, 24.0)), model="drive")
-    assert said == "history: got 1001 runs; at most 1000 can be kept over time; set history=False"
+    assert said == "history: got 1001 runs; time histories can be kept for at most 1000; set history=False"
     with pytest.raises(ValueError, match="shapes do not broadcast"):
         mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
 

@@ -96,7 +96,7 @@ class ColumnCandidate:
     factor: float = 1.0
 
     def line(self, question: str) -> str:
-        """Line of a table `[columns]`."""
+        """The candidate as a line of a table `[columns]`."""
         name = f'"{self.signal.path}"'
         value_text = name if self.factor == 1.0 else f"{{column = {name}, factor = {self.factor:g}}}"
         return f"{self.column} = {value_text}{f'  # {question}' if question else ''}"

@@ -552,7 +552,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
         if not is_shown and not assumed:
             continue
         if p.name in names_in_file:
-            why = "the file, from mass and travel of the linear unit" if head in file.linear else "the file"
+            why = "computed from mass and travel of the linear unit" if head in file.linear else "the file"
         elif robot.rig.inherits:
             why = "its base"
         elif head == BATTERY and not robot.knows([p.name]):

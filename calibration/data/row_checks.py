@@ -429,9 +429,10 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
 
 
 def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.ndarray) -> bool:
-    """True if readings of backward rows rise with the imposed value towards zero: they have signs and an offset.
+    """True if the readings of backward rows rise as the imposed value rises towards zero, so they
+    are signed and have an offset.
 
-    Without signs they would mirror the forward readings and fall towards zero.
+    Unsigned readings would mirror the forward readings and fall towards zero.
     """
     read = backward & np.isfinite(readings)
     if len(np.unique(imposed[read])) < LEVELS_OF_SIGN:

@@ -68,8 +68,9 @@ class Signal:
     Attributes:
         channel: channel of the table of settled runs.
         shown: its readings [unit of the column], NaN if missing or a glitch.
-        angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
-        step: step of its instrument [unit], 0 if there is none.
+        angle: readings of the angle whose derivative the channel is [unit of its column], empty if the channel is
+            read directly.
+        step: resolution of its instrument [unit], 0 if there is none.
         largest: 98th percentile of the magnitudes of its readings.
         glitches: True for readings far from their neighbours, see `find_glitches`, shape (rows,).
     """

@@ -869,7 +869,8 @@ def goes_both_ways(runs: Runs) -> bool:
 
 
 def padded_rows(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Row indices, padded to the next of `sizes` (or a multiple of the last one) by repeating the first row.
+    """Row indices, padded to the next larger length in `sizes` (or to a multiple of the largest) by repeating
+    the first row.
 
     Also returns True for each index that is not padding.
     """

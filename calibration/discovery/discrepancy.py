@@ -100,10 +100,10 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
 
 
 def _places_of_same_response(linear: Linearization, similar: Sequence[str]) -> Names:
-    """Places, each followed by the balances without curves of their own whose errors change the readings alike.
+    """Places, each followed by the balances without own curves that the readings cannot distinguish from it.
 
-    A loss in the gearbox is like one of the load, unless a channel shows the output torque. It is then like an error
-    of the ammeter if the speed is imposed.
+    A gearbox loss is indistinguishable from a load loss unless a channel measures the output torque. With such a
+    channel and an imposed speed, it is indistinguishable from an ammeter error.
     """
     without_curves, errors = tuple(itertools.chain(*bases_room.STANDS_FOR.values())), np.ones((linear.points, 1))
     responses = np.stack([bases_room.place_signature(linear, p, errors)[:, 0] for p in (*similar, *without_curves)])

@@ -115,7 +115,11 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
     basis = _basis_functions(variable, x, low, high)
     a, b = Projection(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    roots = [np.eye(2)] if variable in ORDERS else [_prior_root(length, happens is not None) for length in LENGTHS]
+    roots = (
+        [np.eye(2)]
+        if variable in ORDERS
+        else [_prior_root(correlation, happens is not None) for correlation in LENGTHS]
+    )
     best: tuple[float, tuple] = (-np.inf, ())
     for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size

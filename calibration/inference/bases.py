@@ -139,7 +139,9 @@ def variable_in_words(variable: str) -> str:
 
 
 def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
-    """Change of the readings by errors of one place, for errors of shape (rows, terms). Shape (readings, terms)."""
+    """Change of the readings caused by errors in one place, shape (readings, terms). The errors have shape (rows,
+    terms).
+    """
     if is_channel_place(place):
         return np.asarray(linear.shown(linear.channels.index(place), shapes))
     return np.asarray(linear.columns(linear.probed.index(place), shapes))

@@ -290,7 +290,7 @@ def loop_parameter_names(
         for name in (
             *friction_names(robot, c),
             *([f"{c}.radius"] if robot.shows_travel else []),
-            *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
+            *(f"{c}.{n}" for n in chassis if _parameter_is_nonzero(robot, c, n)),
         )
     ]
     names = [n for n in names if _leading_parameter(robot, n) is None]
@@ -317,7 +317,7 @@ def _leading_parameter(robot: Robot, name: str) -> str | None:
     return None if leader is None or key.startswith(GROUND) else f"{leader}.{key}"
 
 
-def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
+def _parameter_is_nonzero(robot: Robot, configuration: str, name: str) -> bool:
     """True if a load has a parameter of this name that is not zero."""
     field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0

@@ -279,12 +279,12 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
     Args:
         noise: standard deviation of the speed readings, which is subtracted.
     """
-    size = float(np.var(speed)) - noise**2
-    if len(time) < FEWEST or size <= 0:
+    signal_variance = float(np.var(speed)) - noise**2
+    if len(time) < FEWEST or signal_variance <= 0:
         return 0.0
     lags = np.unique(np.geomspace(1, len(time) // 2, 60).astype(int))
     changed = np.array([np.mean((speed[k:] - speed[:-k]) ** 2) for k in lags]) - 2 * noise**2
-    beyond = np.flatnonzero(changed >= size)
+    beyond = np.flatnonzero(changed >= signal_variance)
     lag = lags[beyond[0]] if len(beyond) else lags[-1]
     return 0.0 if lag == 1 else float(lag * np.median(np.diff(time)))
 
@@ -361,7 +361,7 @@ class _LogArrays:
         return max(CORRELATED * float(np.median(lasting)) if lasting else 0.0, LONG * self.step)
 
     def points(self, run: int, size: int, delay: float | None) -> Columns:
-        """Averages of `size` rows each in a run, within segments without a gap or a jump.
+        """Averages over groups of `size` consecutive rows of a run, within segments without a gap or a jump.
 
         Args:
             delay: delay of the jumps [s]. None: segments may contain jumps.

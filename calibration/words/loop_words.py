@@ -344,7 +344,7 @@ def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
 
 def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> str:
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
-    also = f" (or {', '.join(others)}, which these data do not distinguish)" if others else ""
+    also = f" (or {', '.join(others)}, which these data cannot distinguish from it)" if others else ""
     family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
         f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
@@ -515,7 +515,7 @@ def proposed_header(found: DiscoveryResult, robot_name: str) -> str:
 def refit_header(found: DiscoveryResult, robot_name: str) -> str:
     """Header of the refitted robot's file."""
     start = f" from {robot_name}" if robot_name else ""
-    return f"fitted by the loop{start} to {found.runs.source}, with nothing added"
+    return f"fitted by the loop{start} to {found.runs.source}, with no effect added"
 
 
 #: In the place of a formula.

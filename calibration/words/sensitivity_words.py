@@ -64,7 +64,7 @@ def points_studied(found: SensitivityResult) -> str:
     why = (
         "the robot does not travel"
         if found.method == "local"
-        else ("too many robots of the sample do not travel there")
+        else ("too many robots in the sample do not travel there")
     )
     fewest = min(int(x.sum()) for x in parts.values())
     if len(parts) > 1:
@@ -95,7 +95,7 @@ def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
 
 def points_left_out(points: int, total: int, sampled: bool, outputs: Names) -> str:
     """Points that are left out."""
-    who = "too many robots of the sample do" if sampled else "the robot does"
+    who = "too many robots in the sample do" if sampled else "the robot does"
     return f"{points} of {total} operating points are left out, since {who} not travel there ({', '.join(outputs)})"
 
 

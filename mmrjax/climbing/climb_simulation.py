@@ -292,7 +292,7 @@ class _LeveredContacts(eqx.Module):
 
     @property
     def normal(self) -> Scalar:
-        """Normal load of one side, of all rolling contacts [N]."""
+        """Total normal load on all rolling contacts of one side [N]."""
         return jnp.sum(self.at.force * self.at.rolls)
 
     def pull(self, chassis: Chassis, signals: Signals) -> _ContactForces:

@@ -106,10 +106,10 @@ def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = Non
     axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
     zeros = jnp.zeros_like(half)
     corners = [-half - reach * jnp.cos(rear), -half, half, half + reach * jnp.cos(front)]
-    lie = [reach * jnp.sin(rear), zeros, zeros, reach * jnp.sin(front)]
+    corner_heights = [reach * jnp.sin(rear), zeros, zeros, reach * jnp.sin(front)]
     forward, up, radius = (
         jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x) for x in row)), -1)
-        for row in (corners, lie, [roller, axle, axle, roller])
+        for row in (corners, corner_heights, [roller, axle, axle, roller])
     )
     return SideOutline(forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, ahead, high)
 

@@ -36,7 +36,7 @@ class GearLoadLoss(GearboxEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the output torque lost beyond eq. (19)", (-0.2, 0.5),
-        "η_rm of two or three planet stages: 0.70 to 0.80", sd=0.05,
+        "η_rm of two or three planetary stages: 0.70 to 0.80", sd=0.05,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

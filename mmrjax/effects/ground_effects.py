@@ -105,7 +105,7 @@ class Sinkage(GroundEffect):
     )
     exponent: Scalar = parameter(
         1.0, "-", "sinkage exponent n", (0.3, 2.0),
-        "0.5 clay, 1 sand, felt and lacquer like springs (Wong 2008, ch. 2)", relative_sd=0.3,
+        "0.5 for clay, 1 for sand; felt and lacquer are like springs (Wong 2008, ch. 2)", relative_sd=0.3,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

@@ -140,7 +140,7 @@ class Cogging(Periodic, MotorEffect):
         relative_sd=0.01,
     )  # fmt: skip
     rate_fade: Scalar = parameter(
-        1000.0, "rad/s", "ripple rate ω_f above which it is faded out", (10.0, 1e5),
+        1000.0, "rad/s", "ripple rate ω_f above which the ripple is faded out", (10.0, 1e5),
         "a choice of the model, see the source", relative_sd=0.1,
     )  # fmt: skip
 

@@ -202,8 +202,8 @@ def drive(
     *,
     rolling: bool = False,
 ) -> DriveTrajectory:
-    """Simulates one robot over time under constant conditions, from standstill or rolling, and returns the given
-    times.
+    """Simulates one robot over time under constant conditions, from standstill or rolling, and returns the
+    trajectory at the given times.
 
     Args:
         robot: any robot. Its parameters may be tracers.

@@ -209,7 +209,7 @@ class Robot(eqx.Module):
     def radius_pulley(self) -> Scalar:
         """Pitch radius of the pulleys that carry the belts [m].
 
-        It is the rolling radius of the first configuration on tracks, without tracks, the radius of 48 teeth of 5 mm.
+        With tracks, it is the rolling radius of the first configuration; without, that of 48 teeth of 5 mm.
         """
         radius: Scalar = jnp.asarray(RADIUS_PULLEY)
         for chassis in reversed(self.configurations.members):

@@ -87,7 +87,7 @@ class Shaft(eqx.Module):
 
     @property
     def has_two_bodies(self) -> bool:
-        """True if motor and load can turn relative to each other, because of a backlash or an elastic joint."""
+        """True if motor and load can turn relative to each other, because of backlash or an elastic joint."""
         return bool(self.backlash > 0) or bool(self.stiffness > 0)
 
     def frequency(self, inertia_motor: Scalar) -> Scalar:

@@ -87,10 +87,9 @@ def solve_factorised(factors: Factors, vector: Float[Array, " n"]) -> Float[Arra
 
 
 def regularise(factors: Factors) -> tuple[Factors, Bool[Array, ""]]:
-    """Replaces factors that are singular or not finite by those of the unit matrix.
-
-    Also returns whether the factors are the matrix's own. One member of a batch then does not affect the others, in
-    derivatives of either mode.
+    """Replaces singular or non-finite factors with those of the identity matrix. Also returns True if the original
+    factors were kept. A failed member of a batch then does not affect the others, in forward-mode or reverse-mode
+    derivatives.
     """
     size = sum((jnp.abs(x) for row in factors for x in row if x is not None), jnp.zeros(()))
     is_regular = jnp.isfinite(size)

@@ -495,7 +495,9 @@ def has_tipped(robot: Robot, travel: balances.Travel) -> Array:
 
 
 def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Result:
-    """Result of an instant: readings, powers and warnings, as means over both sides or for the worse side."""
+    """Result at one instant of a turn: readings, powers and warnings. Each is a mean of both sides or the
+    worse side's value.
+    """
     signals = travel.signals
     side_results = jax.vmap(lambda s: result_of_signals(robot, s, status))(signals)
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), side_results)

@@ -31,7 +31,7 @@ class Levers(eqx.Module):
     )
     worm_efficiency: Scalar = parameter(
         0.5, "-", "efficiency of the worm gear, driven by its worm; self-locking up to 0.5", (0.05, 0.99),
-        "Fig. 5b, without a table; a worm of one start: 0.4-0.6", sd=0.15,
+        "Fig. 5b, without a table; single-start worm: 0.4-0.6", sd=0.15,
     )  # fmt: skip
     planetary_ratio: Scalar = parameter(
         23.04, "-", "ratio of the planetary gear between motor and worm", (1.0, 1e4),

@@ -1,4 +1,4 @@
-"""One loop for each joint of a MuJoCo model. The load of each joint is the torque of the moving model."""
+"""One loop for each joint of a MuJoCo model. Its load is the torque that the model needs for the joint's motion."""
 
 from __future__ import annotations
 

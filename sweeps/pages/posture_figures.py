@@ -132,7 +132,7 @@ def draw_highest_steps(over: StepMap) -> Figure:
     the posture of the highest step.
     """
     fig, grid = new_figure(2, 2, 7.6)
-    maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
+    maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin against tipping at rest [mm]"))
     for axes, (values, label) in zip(grid[:, 0], maps, strict=True):
         contours = axes.contourf(over.angles_deg, over.angles_deg, values, levels=12, cmap="cividis")
         colour_bar(fig, contours, axes, label=label)

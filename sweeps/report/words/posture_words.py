@@ -43,7 +43,7 @@ class Drawn:
 
 @dataclasses.dataclass(frozen=True)
 class StepMap:
-    """Highest steps and margins of tipping over angles of the levers.
+    """Highest step and tipping margin as functions of the lever angles.
 
     Attributes:
         angles_deg: angles of front and rear levers [deg].
