@@ -1,6 +1,8 @@
 """Backlash, play and soft couplings are noticed in a log by the angle that each reversal loses."""
 
+import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,3 +164,21 @@ def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
         runs, robot = read(tmp_path, servo(play=play))
         given = discover.LoopInput(runs, None, robot, *[None] * 4)
         assert given.shows_unmodelled_backlash == (play > 0)
+
+
+@dataclasses.dataclass
+class Windows:
+    keep: Any = None
+
+    def trace(self):
+        return [self.keep(name, None) for name in ("ranking", "base", "search 0")]
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_stages_of_windows_are_stored_apart_and_only_without_lost_motion(lost, monkeypatch):
+    """Windows without a finding left their base fit to the simulated path, which ended with an internal error."""
+    monkeypatch.setattr(discover, "equations_of_log", lambda *_: Windows())
+    monkeypatch.setattr(discover, "_confirm_by_simulation", lambda given, windows, traced: traced)
+    given = discover.LoopInput(*[None] * 7, keep=lambda name, make: name)
+    given.__dict__["shows_unmodelled_backlash"] = lost
+    assert given.trace_windows() == (None if lost else ["ranking", "windows base", "windows search 0"])

@@ -283,8 +283,15 @@ class LoopInput:
         """
         if self.equations is not None or (self.known is not None and self.known.run is None):
             return None
-        equations = equations_of_log(self, LONG)
-        return None if equations is None else _confirm_by_simulation(self, equations, equations.trace())
+        if self.shows_unmodelled_backlash or (equations := equations_of_log(self, LONG)) is None:
+            return None
+
+        def keep(name: str, make: Callable[[], Any]) -> Any:
+            """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
+            return self.keep(name if name == "ranking" else f"windows {name}", make)
+
+        equations = dataclasses.replace(equations, keep=keep)
+        return _confirm_by_simulation(self, equations, equations.trace())
 
     @functools.cached_property
     def shows_unmodelled_backlash(self) -> bool:
