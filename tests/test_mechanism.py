@@ -59,7 +59,7 @@ def found(monkeypatch):
     library = {n: SimpleNamespace(family=lambda f=f: f) for n, f in FAMILIES.items()}
     space = SimpleNamespace(
         weight=np.ones((ROWS, 1)), library=library, included=np.ones(ROWS, bool),
-        bare=SimpleNamespace(channels=(), observe=SimpleNamespace(long=False, reads=True, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
+        bare=SimpleNamespace(channels=(), observe=SimpleNamespace(long=False, reads=True, over_time=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
@@ -72,7 +72,7 @@ def found(monkeypatch):
     monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False):
-        space.bare.observe.long = long
+        space.bare.observe.long = space.bare.observe.over_time = long
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
         beside = SimpleNamespace(where=where, curve=drawn)
         return room.find_mechanism(

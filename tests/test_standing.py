@@ -380,7 +380,9 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
         curve_variable=lambda place, name: (variables.get(name, np.ones(rows)), np.ones(rows)),
     )  # fmt: skip
     space = SimpleNamespace(
-        free=0, included=np.ones(rows, bool), bare=SimpleNamespace(observe=SimpleNamespace(long=False, reads=True))
+        free=0,
+        included=np.ones(rows, bool),
+        bare=SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, over_time=False)),
     )
     linear.jacobian = np.concatenate([column[:, None], np.eye(1)])
     noise = rng.standard_normal(2 * rows)
@@ -398,7 +400,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
             for a in (linear.jacobian, np.concatenate([linear.jacobian, line], 1))
         ]
         assert not seen or varies**2 == pytest.approx(left[0] - left[1], rel=1e-8)
-    space.bare.observe.long = True  # a history's readings answer to all of its past
+    space.bare.observe.long = space.bare.observe.over_time = True  # a history's readings answer to all of its past
     assert _largest_variation(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf, math.inf)
 
 
@@ -497,7 +499,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
     monkeypatch.setattr(discover.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
-    bare = SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, blocks=("slope",)))
+    bare = SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, over_time=False, blocks=("slope",)))
     screened = SimpleNamespace(
         base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
     )

@@ -237,7 +237,7 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     If they stayed, the fit would raise the adhesion, and distort all other parameters, until the robot grips in them.
     """
     problem = space.bare
-    if problem.observe.long or not problem.observe.reads:
+    if problem.observe.over_time:
         return np.zeros(len(space.included), bool)
     ground = [name.endswith("ground.friction.static") for name in problem.coordinates.names]
     observation = observe_at(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))

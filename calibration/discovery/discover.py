@@ -304,9 +304,7 @@ class LoopInput:
         For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
         is appended to `ranked`, unless effects would only stand in for a backlash.
         """
-        space = self.equations or build_candidate_space(
-            self.runs, self.robot, noise.sd, self.settings, self.stated, self.library
-        )
+        space = self.equations or _space_of(self, noise)
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         near = None
         if before is not None:
@@ -736,8 +734,8 @@ def choose_effects(
     )
 
 
-def _space_of(given: LoopInput) -> CandidateSpace:
-    return build_candidate_space(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
+    return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
 
 
 def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
@@ -746,7 +744,7 @@ def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
     Args:
         fewest: fewest steps of the longest run.
     """
-    space = _space_of(given)
+    space = _space_of(given, given.noise)
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < fewest:
         return None
@@ -787,7 +785,7 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     if best is base:
         named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
         best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
-    run = simulate_models(_space_of(given), base, best, given.settings)
+    run = simulate_models(_space_of(given, given.noise), base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:

@@ -63,7 +63,7 @@ def find_mechanism(
     """
     ladder = simulate_leading_families(space, base, ladder, settings)
     best, location_families = _best_by_family(space, ladder), _families_of_location(beside.where)
-    curved = space.bare.observe.reads and not space.bare.observe.long
+    curved = not space.bare.observe.over_time
     if not curved:  # fits of curves take long, and windows have none
         by_curve = beside.where.explained - OF_CURVE
     else:

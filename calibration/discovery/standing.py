@@ -295,7 +295,7 @@ def judge_each_name(
         better: candidates that are the better explanation but not of a plausible size.
     """
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
-    over_time = space.bare.observe.long or not space.bare.observe.reads
+    over_time = space.bare.observe.over_time
     most = searched.diagnosis or after
     lacks = _deficient_equations(space, most, bases)
     fewer = dict(zip(largest.effects, refit_without_each(space, largest, settings, searched.ladder), strict=True))
@@ -386,7 +386,7 @@ def _largest_variation(
         share: family-wise error of the critical value.
     """
     most = 0.0, "", math.inf
-    if space.bare.observe.long or not space.bare.observe.reads:
+    if space.bare.observe.over_time:
         return *most[:2], math.inf, math.inf
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     slot = space.free + best.active.index(effect)

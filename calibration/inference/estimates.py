@@ -64,6 +64,7 @@ def parameter_estimates(
     coordinates = posed.coordinates
     point, sd = np.asarray(z), np.asarray(about.sd)
     value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
+    stated = coordinates.stated
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
@@ -90,7 +91,7 @@ def parameter_estimates(
             meaning=fields[name].spec.meaning,
             prior=PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
-                float(coordinates.stated[k]),
+                float(stated[k]),
                 _float_pair(wide[k]),
                 sources.get(name, fields[name].spec.source),
             ),

@@ -70,11 +70,8 @@ def unit_at_end(text: str, known: Iterable[str]) -> str | None:
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
     last = re.split(r"[^A-Za-z/]", end)[-1]
     written = unit_in_column(last) if len(last) > 1 else ""
-    units = [
-        unit
-        for unit in known
-        if unit and (unit == written or re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end)))
-    ]
+    end = unit_in_column(end)
+    units = [u for u in known if u and (u == written or re.search(rf"(?:^|[^A-Za-z]){u}$", end))]
     return max(units, key=len, default=None)
 
 

@@ -244,6 +244,11 @@ class Observer(eqx.Module):
         """True if the model is a rollout. Searches then run one at a time and end sooner."""
 
     @property
+    def over_time(self) -> bool:
+        """True if a row does not depend on its own conditions alone: in a rollout, and in a window of a log."""
+        return self.long or not self.reads
+
+    @property
     @abc.abstractmethod
     def starts_from_steady(self) -> bool:
         """True if a search may start at the optimum of the same problem with `steady`."""
