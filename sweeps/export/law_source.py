@@ -13,7 +13,7 @@ from types import ModuleType
 
 import numpy as np
 
-from calibration.data import Json, posterior_file
+from calibration.data import posterior_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.posterior_file import Posterior
 from mmrjax import __version__
@@ -170,14 +170,10 @@ def _function_text(name: str, symbol: Symbol, document: str, dialect: Dialect) -
         return "memory" if word.startswith("memory.") else f"p[{quoted(word)}]"
 
     head = f"def {name}({', '.join(['p', *function_arguments(symbol)])}):"
-    body = textwrap.indent(_wrap_docstring(document), "    ")
-    return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
-
-
-def _wrap_docstring(document: str) -> str:
     lines = textwrap.wrap(document, 108)
     short = len(lines) == 1 and len(document) < 104
-    return _docstring(document if short else "\n".join(lines) + "\n")
+    body = textwrap.indent(_docstring(document if short else "\n".join(lines) + "\n"), "    ")
+    return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
 
 
 def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
@@ -525,11 +521,6 @@ def _states_a_law(tree: ast.Module) -> bool:
         else isinstance(f, ast.Attribute) and isinstance(f.value, ast.Name) and f.value.id in ("jnp", "torch")
         for f in called
     )
-
-
-def constant_values(constants: Sequence[LawConstant]) -> Json:
-    """Values of constants by name."""
-    return {c.name: c.value for c in constants}
 
 
 # --- an actuator of mjlab -------------------------------------------------------------------------
