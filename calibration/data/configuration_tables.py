@@ -237,7 +237,7 @@ def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassi
     if like is not None:
         return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
-        pattern = have.members[0]
+        pattern = dataclasses.replace(have.members[0], on_tracks=_movers(movers, where))
         defaults = dict(_parameter_defaults(pattern))
         missing = [name for name, default in defaults.items() if default is None and not _table_states(table, name)]
         if missing:
@@ -246,7 +246,7 @@ def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassi
                 f"completely; {_list_in_words(missing)} missing"
             )
         known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
-        return params.replace(dataclasses.replace(pattern, on_tracks=_movers(movers, where)), known_values)
+        return params.replace(pattern, known_values)
     if name in have:
         return have[name]
     raise BadConfiguration(

@@ -90,7 +90,7 @@ def find_mechanism(
         else location_families[:1]
     )
     for leader in (*by_name[:1], *curve, *by_name[1:]):
-        # If a curve refutes the form of the effects, their driver is no better than those that curves cannot separate.
+        # A driver whose form a curve refutes is no better than those that smooth curves cannot separate.
         refuted = leader in by_name and (
             evidence_over_curves(space, best[leader], base, best[leader].effects, left.linear, bases, settings)
             < -BETTER

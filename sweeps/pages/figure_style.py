@@ -30,7 +30,6 @@ from matplotlib.transforms import Affine2D, Bbox
 
 from calibration.data import Json
 from mmrjax.model.channels import Channel
-from sweeps import pages
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
@@ -140,11 +139,6 @@ def outer_legend(axes: Axes, place: str) -> None:
     handles, labels = axes.get_legend_handles_labels()
     placement: Any = f"outside {place}"
     axes.figure.legend(handles, labels, loc=placement, ncols=legend_columns(labels))
-
-
-def can_stack(fig: Figure) -> bool:
-    """True if phone versions are on and `new_figure` made the figure, so that its panels can be stacked."""
-    return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
 def colour_bar(fig: Any, drawn: ScalarMappable, axes: Any, **keywords: Any) -> Any:
