@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parent
-FIGURES = ("before_after", "laws", "errors-figure")
+FIGURES = ("before_after", "laws")
 PACKAGES = ("mmrjax", "calibration", "sweeps")
 #: What the tutorial about the loop was written from, and the parts of `result.json` in it.
 RECORD = DOCS / "start" / "loop.json"
@@ -384,8 +384,6 @@ errors show how well the robot file predicts conditions that were not measured:
 | rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
 |---|---|---|---|---|---|
 {unseen}
-
-![Errors of runs that the fit has seen and has not seen](figures/errors-figure.svg)
 
 ## What next?
 

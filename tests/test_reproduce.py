@@ -26,7 +26,6 @@ FIGURES = {
     "fig28_current_over_slope",
     "fig29_model_errors",
     "fig23_24_from_standstill",
-    "energy_split",
     "fig05a_gearbox_efficiency",
     "fig10_battery",
     "fig11_motor_friction",

@@ -155,23 +155,6 @@ def draw_climb_course(found: ClimbResult) -> Figure:
     return fig
 
 
-def draw_size_search(found: ClimbResult) -> Figure:
-    """Outcome of each size tried."""
-    sizes, verdicts = np.array([s for s, _ in found.tried]), [v for _, v in found.tried]
-    kinds = list(dict.fromkeys(verdicts))
-    fig, axes = new_figure(1, 1, 1.0 + 0.4 * len(kinds))
-    ax = axes[0, 0]
-    for k, kind in enumerate(kinds):
-        sizes_of_kind = sizes[[v == kind for v in verdicts]]
-        ax.plot(
-            sizes_of_kind, np.full(len(sizes_of_kind), k), "o", color=GREEN if kind == "over" else VERMILION, ms=5
-        )
-    ax.set_yticks(range(len(kinds)), kinds)
-    ax.set_ylim(-0.6, len(kinds) - 0.4)
-    ax.set_xlabel(f"{found.sought} [mm]")
-    return fig
-
-
 class ClimbFilm(NamedTuple):
     """A climb in the form that `mmrjax.undercarriage.rendering` draws."""
 

@@ -11,12 +11,10 @@ from matplotlib.figure import Figure
 from calibration.inference import simulation_errors
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
-from sweeps.pages import words
 from sweeps.pages.figure_style import (
     BLUE,
     GREEN,
     INK,
-    ORANGE,
     PURPLE,
     SKY,
     VERMILION,
@@ -122,58 +120,6 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.PaperRows]) -> F
         axes.set_xlabel("slope [°]")
     labels = [str(h.get_label()) for h in handles]
     fig.legend(handles=handles, loc="outside lower center", ncols=legend_columns(labels))
-    return fig
-
-
-_SPLIT_COLOURS = {
-    "winding": VERMILION,
-    "motor friction": ORANGE,
-    "gearbox": PURPLE,
-    "track and guides": BLUE,
-    "slip": INK,
-    "rolling resistance": SKY,
-    "lift": GREEN,
-    "other": "#cccccc",
-}
-
-
-def draw_energy(used: data.EnergyUse) -> Figure:
-    """Breakdown of the supply's power at twelve operating points, in percent, with watts at the end."""
-    fig, grid = new_figure(1, 1, 5.2)
-    axes = grid[0, 0]
-    height = [float(k) + 0.6 * (k // 3) for k in range(len(used.labels))]
-    bar_starts = np.zeros(len(used.labels))
-    for item in (*data.SPLIT, "other"):
-        share = 100 * used.power[item] / used.total
-        share = np.where(np.isfinite(share), share, 0.0)
-        if np.abs(share).max() < 0.05:  # invisible, and not in the legend
-            continue
-        axes.barh(
-            height, share, left=bar_starts, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6
-        )
-        for y, x, width in zip(height, bar_starts, share, strict=True):
-            if width >= 4:
-                dark = item in ("winding", "track and guides", "slip", "gearbox", "lift")
-                axes.text(
-                    x + width / 2,
-                    y,
-                    f"{width:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if dark else INK,
-                )
-        bar_starts = bar_starts + share
-    for y, total, status in zip(height, used.total, used.status, strict=True):
-        alive = np.isfinite(total)
-        text = f"{total:.0f} W" if alive else words.short_status(str(status))
-        axes.text(101 if alive else 1, y, text, va="center", fontsize=8.5)
-    axes.set_yticks(height, used.labels, fontsize=8.5)
-    axes.invert_yaxis()
-    axes.grid(False)
-    remark = "\n* slides with its own adhesion; shown with raised adhesion" if "*" in "".join(used.labels) else ""
-    axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
-    outer_legend(axes, "upper center")
     return fig
 
 

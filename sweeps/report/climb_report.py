@@ -265,22 +265,21 @@ def climb_document(found: ClimbResult, file: RobotFile) -> Document:
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (
         run_tables.note_on_robot(file, more=lead),
+        *[Note(f"{tried}.", terminal=True)] * bool(tried),
         catalogue.figure("climb.silhouettes", found),
         catalogue.figure("climb.course", found),
     )
-    if tried:
-        blocks = (*blocks, catalogue.figure("climb.search", found, finding=tried))
-    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found, tried)))
+    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found)))
 
 
-def _sections(found: ClimbResult, tried: str) -> Iterable[Section]:
+def _sections(found: ClimbResult) -> Iterable[Section]:
     numbers = [
         (name.rpartition("_")[0].replace("_most", ", largest").replace("_least", ", least").replace("_", " "), value,
          name.rpartition("_")[2])
         for name, value in found.numbers().items()
     ]  # fmt: skip
     of_run = catalogue.table("climb.run", numbers)
-    yield Section("The run in numbers", (of_run, *[Note(f"{tried}.", terminal=True)] * bool(tried)), "numbers")
+    yield Section("The run in numbers", (of_run,), "numbers")
     if found.margins:
         rows = [(n.removeprefix("margin_"), 100 * value, OUTPUTS[n][1]) for n, value in found.margins.items()]
         shares = catalogue.table("climb.shares", rows)
