@@ -1,4 +1,4 @@
-"""Figures of the loop: residuals before and after, the score ladder, defects, look-alikes, base parameters."""
+"""Figures of the loop: residuals before and after, the score ladder, defects, laws."""
 
 from __future__ import annotations
 
