@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from pathlib import Path as File
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,19 +70,6 @@ class RunScene(NamedTuple):
     def sheet(self, k: int) -> Any:
         """Figure of sample `k`."""
         return figure_of_sample(self, k)
-
-
-class RunView(Protocol):
-    """Data of a run that can be drawn: times of its samples [s], and a figure of each sample."""
-
-    @property
-    def time(self) -> np.ndarray:
-        """Times of the samples [s]."""
-        ...
-
-    def sheet(self, k: int) -> Any:
-        """Figure of sample `k`."""
-        ...
 
 
 def check_finite(run: TrackTrajectory) -> None:
@@ -301,7 +288,7 @@ def frame_times(
 
 
 def render(
-    view: RunView,
+    view: Any,
     file: str | File,
     begin: float = 0.0,
     end: float | None = None,
@@ -311,7 +298,8 @@ def render(
     """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
-        view: view from `scene_of_run`, of this module or of `rendering_from_above`.
+        view: view from `scene_of_run`, of this module or of `rendering_from_above`. Its attributes are `time`, the
+            times of the samples [s], and `sheet`, which returns the figure of a sample.
         file: its suffix decides the format.
         begin, end: part of the run to film [s]. None: to its end.
         slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.
@@ -331,7 +319,7 @@ def render(
     return file
 
 
-def _write_frames(view: RunView, file: File, frames: list[int], rate: int) -> None:
+def _write_frames(view: Any, file: File, frames: list[int], rate: int) -> None:
     if file.suffix == ".png":
         view.sheet(frames[0]).savefig(file)
         return

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,6 @@ from sweeps.pages.figure_style import (
     is_narrow,
     new_figure,
 )
-from sweeps.report.climb_report import FILMED as IN_TITLE
 from sweeps.report.climb_report import ClimbResult, Seen, footing_coordinates
 
 #: File types that can be written.
@@ -155,38 +155,27 @@ def draw_climb_course(found: ClimbResult) -> Figure:
     return fig
 
 
-class ClimbFilm(NamedTuple):
-    """A climb in the form that `mmrjax.undercarriage.rendering` draws."""
-
-    found: Drawable
-
-    @property
-    def time(self) -> np.ndarray:
-        """Times of the samples [s]."""
-        return self.found.table["time_s"]
-
-    def sheet(self, k: int) -> Figure:
-        """The robot at sample `k`."""
-        found, q = self.found, footing_coordinates(self.found.table)
-        low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
-        with figure_settings():
-            sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
-            ax = sheet.subplots()
-            _draw_ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
-            _draw_robot(ax, found, q[k])
-            ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
-            time, current = (found.table[name][k] for name in IN_TITLE)
-            ax.set_title(f"{found.obstacle}, {time:.2f} s, motors {current:.1f} A")
-            ax.axis("off")
-        return sheet
-
-
 def render_climb(
     found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
 ) -> Path:
     """The run as a film (.gif, .mp4), or a picture (.png) at the instant `begin`, by default that of the largest
     pitch."""
-    view = ClimbFilm(found)
+    time, q = found.table["time_s"], footing_coordinates(found.table)
+
+    def sheet(k: int) -> Figure:
+        low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
+        with figure_settings():
+            picture = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
+            ax = picture.subplots()
+            _draw_ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
+            _draw_robot(ax, found, q[k])
+            ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
+            current = found.table["traction_current_A"][k]
+            ax.set_title(f"{found.obstacle}, {time[k]:.2f} s, motors {current:.1f} A")
+            ax.axis("off")
+        return picture
+
     if begin is None:
-        begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
+        begin = float(time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
+    view = SimpleNamespace(time=time, sheet=sheet)
     return rendering.render(view, file, begin, end, SLOW if slow is None else slow, RATE)
