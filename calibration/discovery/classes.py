@@ -170,10 +170,10 @@ def find_classes(
         left: diagnosis of the base fit.
         after: diagnosis of the best fit.
     """
-    names, of = space.library.names, space.library.of
+    names, effect_of = space.library.names, space.library.of
     # Largest |cos| between the projected signatures of every two effects, over their shapes.
     cosine = np.zeros((len(names), len(names)))
-    np.maximum.at(cosine, (of[:, None], of[None, :]), np.abs(np.asarray(left.scores.cosine)))
+    np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(np.asarray(left.scores.cosine)))
     fewer = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     requests: list[tuple[int, str, Names]] = []

@@ -72,16 +72,6 @@ class RunScene(NamedTuple):
         return figure_of_sample(self, k)
 
 
-def check_finite(run: TrackTrajectory) -> None:
-    """Rejects a run that cannot be drawn.
-
-    Raises:
-        ValueError: it holds numbers that are not finite (a failed member).
-    """
-    if not np.isfinite(np.asarray(run.q)).all():
-        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
-
-
 def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> RunScene:
     """Collects the data of one run for drawing (scalar conditions, one member of a batch).
 
@@ -89,7 +79,8 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
         ValueError: the run holds numbers that are not finite (a failed member).
     """
     gear = robot.running_gear
-    check_finite(run)
+    if not np.isfinite(np.asarray(run.q)).all():
+        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
@@ -298,8 +289,8 @@ def render(
     """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
-        view: view from `scene_of_run`, of this module or of `rendering_from_above`. Its attributes are `time`, the
-            times of the samples [s], and `sheet`, which returns the figure of a sample.
+        view: view with `time`, the times of the samples [s], and `sheet`, which returns the figure of a sample. See
+            `scene_of_run`.
         file: its suffix decides the format.
         begin, end: part of the run to film [s]. None: to its end.
         slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.

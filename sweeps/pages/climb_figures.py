@@ -28,10 +28,7 @@ from sweeps.pages.figure_style import (
     is_narrow,
     new_figure,
 )
-from sweeps.report.climb_report import ClimbResult, Seen, footing_coordinates
-
-#: File types that can be written.
-Drawable = ClimbResult | Seen
+from sweeps.report.climb_report import ClimbResult, footing_coordinates
 
 _GROUND = "#b8a98f"
 #: Most silhouettes on a page. Frames of a film per second, and slow-motion factor.
@@ -40,7 +37,7 @@ SHOWN, RATE, SLOW = 6, 12, 2.0
 NEAR = (0.03, 0.09)
 
 
-def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _belt_outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Closed outlines of the belts, and tips of their grousers, in the world [m]."""
     robot = found.robot
     chassis = robot.configurations[found.configuration]
@@ -61,7 +58,7 @@ def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.
     return outlines
 
 
-def _draw_ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
+def _draw_ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
     points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
     points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
     bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
@@ -70,7 +67,7 @@ def _draw_ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
     axes.plot(*points.T, color=INK, lw=1.2)
 
 
-def _draw_robot(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None:
+def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
     outlines = _belt_outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
@@ -87,7 +84,7 @@ def _draw_robot(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -
             axes.plot(*tips.T, ".", color=INK, ms=2.5)
 
 
-def decisive_instants(found: Drawable) -> list[tuple[str, int]]:
+def decisive_instants(found: ClimbResult) -> list[tuple[str, int]]:
     """Decisive samples of the run in order of time: label and index."""
     t = found.table
     picked = {
@@ -155,11 +152,8 @@ def draw_climb_course(found: ClimbResult) -> Figure:
     return fig
 
 
-def render_climb(
-    found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
-) -> Path:
-    """The run as a film (.gif, .mp4), or a picture (.png) at the instant `begin`, by default that of the largest
-    pitch."""
+def render_climb(found: ClimbResult, file: Path) -> Path:
+    """Writes the run as a film in slow motion."""
     time, q = found.table["time_s"], footing_coordinates(found.table)
 
     def sheet(k: int) -> Figure:
@@ -175,7 +169,4 @@ def render_climb(
             ax.axis("off")
         return picture
 
-    if begin is None:
-        begin = float(time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
-    view = SimpleNamespace(time=time, sheet=sheet)
-    return rendering.render(view, file, begin, end, SLOW if slow is None else slow, RATE)
+    return rendering.render(SimpleNamespace(time=time, sheet=sheet), file, slow=SLOW, rate=RATE)
