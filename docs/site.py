@@ -113,7 +113,7 @@ def statuses() -> str:
     from sweeps.report.climb_report import VERDICTS
 
     parts = {
-        "Statuses": {name: _sentence(status.meaning) for name, status in words.STATUSES.items()},
+        "Statuses": {name: _sentence(meaning) for name, (_, meaning) in words.STATUSES.items()},
         "Flags": {name: _sentence(meaning) for name, meaning in words.FLAGS.items()},
         "Verdicts of the loop": {name: _sentence(meaning) for name, meaning in words.LOOP_VERDICTS.items()},
         "Verdicts of a climb": {name: _sentence(verdict[1]) for name, verdict in VERDICTS.items()},

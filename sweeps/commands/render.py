@@ -54,6 +54,6 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
             raise BadConfiguration(f"render: {error}".replace(temporary.name, file.name)) from error
         advance(1)
     status = STATUSES[int(trajectory.result.status)]
-    print_output(f"{status}: {words.STATUSES[status].why}")
+    print_output(f"{status}: {words.status_meaning(status)}")
     print_output(str(file))
     return SOLVER_FAILED if status == "failed" else DONE

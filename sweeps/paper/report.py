@@ -188,7 +188,6 @@ def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows]
     certainty = data.slope_certainty(own_rows)
     table = [(*row[:3], f"{row[3]:.3f} ({row[4]})", *row[5:]) for row in certainty]
     blocks: list[Block] = [
-        catalogue.figure("paper.rows", own_rows, name),
         catalogue.figure("paper.fig28_current_over_slope", robots[name], own_rows, certainty),
         catalogue.table("paper.certainty", table),
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.inference import simulation_errors
-from mmrjax.model.paper_tables import TRACKED, WHEELED
+from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import (
     BLUE,
@@ -19,15 +19,13 @@ from sweeps.pages.figure_style import (
     SKY,
     VERMILION,
     add_corner_note,
-    axis_label,
     label_line_end,
     legend_columns,
     new_figure,
-    outer_legend,
 )
 from sweeps.pages.words import displayed_robot_name
 from sweeps.paper import data
-from sweeps.paper.components import CONFIGURATION, MODEL
+from sweeps.paper.components import MODEL
 
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 
@@ -120,51 +118,4 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.PaperRows]) -> F
         axes.set_xlabel("slope [°]")
     labels = [str(h.get_label()) for h in handles]
     fig.legend(handles=handles, loc="outside lower center", ncols=legend_columns(labels))
-    return fig
-
-
-def row_parity(rows: data.PaperRows, name: str) -> Figure:
-    """Simulated over measured readings for every channel, with raised adhesion and both masses for 4W2T."""
-    channels_shown = data.channels_of_paper()
-    fig, grid = new_figure(1, len(channels_shown), 3.7)
-    kind = rows.conditions["configuration"]
-    raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
-    has_other_mass = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
-    is_sliding = rows.plain["status"] == "slides"
-    for k, (axes, channel) in enumerate(zip(grid[0], channels_shown, strict=True)):
-        measured = rows.measured[:, k]
-        span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
-        axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
-        axes.plot(span, span, color="#666666", lw=0.9)
-        for c in rows.ratio:
-            for pick, face, label in (
-                ((kind == c) & ~is_sliding, CONFIGURATION[c], c),
-                ((kind == c) & is_sliding, "white", f"{c}, adhesion raised"),
-            ):
-                axes.plot(
-                    measured[pick],
-                    raised[pick, k],
-                    "o" if c == TRACKED else "s",
-                    color=CONFIGURATION[c],
-                    mfc=face,
-                    ms=6,
-                    ls="",
-                    label=label if pick.any() else None,
-                )
-        if has_other_mass.any():
-            axes.plot(
-                measured[has_other_mass],
-                weighed[has_other_mass, k],
-                "+",
-                color=INK,
-                ms=8,
-                mew=1.4,
-                label="4W2T with the robot's own mass",
-            )
-        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
-        axes.set_xlim(*span)
-        axes.set_ylim(*span)
-        axes.locator_params(nbins=5)
-    add_corner_note(grid[0, 0], f"{displayed_robot_name(name)}; band ±5 %", fontsize=8.5)
-    outer_legend(grid[0, 0], "lower center")
     return fig
