@@ -16,10 +16,10 @@ SHOWN, TALLEST, PANELS = 8, 10, 4
 _MAP = "Blues"
 
 
-def leading_inputs(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
+def leading_inputs(share: np.ndarray) -> np.ndarray:
     """Indices of the inputs with the largest shares. Negligible inputs are left out unless all are negligible."""
     order = np.argsort(-share, kind="stable")
-    leading = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
+    leading = [k for k in order[:SHOWN] if share[k] >= NEGLIGIBLE]
     return np.array(leading or order[:1], int)
 
 
