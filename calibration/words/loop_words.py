@@ -291,7 +291,7 @@ def verdict_line(stages: LoopStages) -> str:
     return f"at one noise level: {', '.join((stages.verdict, *sure))}"
 
 
-def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> list[str]:
+def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
     method_words = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
@@ -300,7 +300,7 @@ def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> l
             f"{found.p_value:.2g})"
         ]
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
-    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:5]
     if not beyond:
         return [f"{first}. No effect explains more than chance would"]
     if brief:

@@ -400,9 +400,9 @@ def _fixed_point_lines(name: str, given: str, parts: Sequence[Part], later: Mapp
     ]
 
 
-def constants_text(constants: Sequence[LawConstant], name: str = "PARAMS") -> str:
+def constants_text(constants: Sequence[LawConstant]) -> str:
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
-    lines = [f"{name} = {{"]
+    lines = ["PARAMS = {"]
     for c in constants:
         comment = f"{c.meaning} [{c.unit}]{f'; {c.interval}' * bool(c.interval)}; {c.source}"
         lines += [f"    # {text}" for text in textwrap.wrap(printable(comment), 106)]
@@ -480,7 +480,7 @@ def _module_text(
     )
 
 
-def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
+def module_from_source(source: str) -> ModuleType:
     """Module of the source of a law.
 
     Raises:
@@ -490,8 +490,8 @@ def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
     tree = ast.parse(source)
     if not _states_a_law(tree):
         raise BadConfiguration("export: the generated source contains more than the drive law, so it is not executed")
-    module = ModuleType(name)
-    exec(compile(tree, f"<{name}>", "exec"), module.__dict__)
+    module = ModuleType("exported_law")
+    exec(compile(tree, "<exported_law>", "exec"), module.__dict__)
     return module
 
 
