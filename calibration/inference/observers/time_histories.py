@@ -360,10 +360,15 @@ class Histories(Observer):
                         "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
-        thinned: list[Remark | str] = []
+        remarks: list[Remark | str] = []
         if runs.log is not None:
-            thinned.append(Remark("thinned", source=runs.source, rows=len(runs.log), kept=len(runs)))
-        return [*thinned, *_undriven_remarks(runs)]
+            remarks.append(Remark("thinned", source=runs.source, rows=len(runs.log), kept=len(runs)))
+        undriven = runs.run_names[(applied_drive(runs) == 0) & (runs["slope_deg"] != 0)]
+        if len(undriven):
+            remarks.append(
+                Remark("stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in undriven)))
+            )
+        return remarks
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
@@ -1027,18 +1032,6 @@ def _check_signs(runs: Runs) -> None:
                         "expected readings with a sign, negative in reverse; or state [instruments."
                         f"{channel.name}] signed = false in the robot's file, if it shows the magnitude only"
                     )
-
-
-def _undriven_remarks(runs: Runs) -> list[Remark | str]:
-    """Remark on runs on a slope whose motors are not driven."""
-    is_undriven = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
-    if not is_undriven.any():
-        return []
-    return [
-        Remark(
-            "stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[is_undriven]))
-        )
-    ]
 
 
 def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
