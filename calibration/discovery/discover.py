@@ -891,12 +891,6 @@ def diagnose_base_by_bootstrap(
     return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 
 
-def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
-    """Number of rows after which a table repeats itself exactly, or all of its rows."""
-    rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
-    return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
-
-
 def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     """Runs without exact copies, their row numbers, and remarks on the copies.
 
@@ -913,7 +907,9 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
             (copies if row in seen_columns else keep).append(k)
             seen_columns.add(row)
     else:
-        first_rows = _rows_until_repeat(columns)
+        rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
+        # rows after which the table repeats itself exactly, or all of its rows
+        first_rows = next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
         keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []

@@ -613,12 +613,6 @@ def support_sentence(found: DiscoveryResult) -> str:
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
 
-def effect_called(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """The name of an effect, and where it is tentative what speaks against it."""
-    reason = tentative_reason(found, effect)
-    return f"{effect.name}\n({reason})" if reason else effect.name
-
-
 def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
     """In a few words, what speaks against the name of an effect, empty where it is established."""
     if found.support is None or is_established(found, effect):
