@@ -216,6 +216,7 @@ SAMPLES = [
     Remark("phases_differ", free=80.4, held=12.0),
     Remark("still_lacks", place="motor_speed", variable="speed_motor"),
     Remark("late", delay=0.0312, sd=0.0004),
+    Remark("late", delay=-0.2, sd=0.001, ends=True),
     Remark(
         "led",
         names=("a", "b"),

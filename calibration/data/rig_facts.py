@@ -473,23 +473,24 @@ def held_sentence(runs: Runs) -> str:
 
 
 def swapped_sentence(runs: Runs) -> str:
-    """Sentence on a speed whose sign changes within a log although the drive does not, empty for others."""
+    """Sentence on a motion whose sign changes within a log although the drive does not, empty for others."""
     imposed = runs.layout.imposed_column
     if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
         return ""  # a signal that never changes sign may lack it, which other checks report
-    for name in np.unique(runs.run_names):
-        rows = runs.in_order(name)
-        for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
-            power = np.nan_to_num(runs[imposed][rows] * readings)
-            total = np.cumsum(power) / max(float(np.abs(power).sum()), 1e-300)
+    drive, of_runs = runs[imposed], list(runs.rows_by_run().values())
+    for channel, readings in zip(runs.channels, runs.measured().T, strict=True):
+        power = np.zeros(len(drive))
+        for rows in of_runs if channel.zero_at_rest else ():
+            motion = readings[rows] if channel.settled or len(rows) < 2 else np.gradient(readings[rows])
+            power[rows] = np.nan_to_num(drive[rows] * motion)
+            power[rows] /= max(float(np.abs(power[rows]).mean()), 1e-300)
+        for rows in (*of_runs, np.concatenate(of_runs)) if channel.zero_at_rest else ():
+            total = np.cumsum(power[rows]) / max(float(np.abs(power[rows]).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
-            sum_before, sum_after = total[turn], total[-1] - total[turn]
-            if (
-                channel.zero_at_rest
-                and channel.settled
-                and sum_before * sum_after < 0
-                and min(abs(sum_before), abs(sum_after)) > SWAPPED
-            ):
+            sums, parts = (total[turn], total[-1] - total[turn]), np.split(drive[rows], [turn + 1])
+            # Of an angle, both parts need both directions: a load without friction returns its energy as it brakes.
+            both = channel.settled or all(x.min(initial=0.0) < 0 < x.max(initial=0.0) for x in parts)
+            if both and sums[0] * sums[1] < 0 and min(map(abs, sums)) > SWAPPED:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "

@@ -67,6 +67,7 @@ from calibration.discovery.result import (
     FoundEffect,
     HeldOutAlternative,
     NoiseVerdict,
+    ParameterShift,
     ReadingsOfRows,
 )
 from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
@@ -90,7 +91,7 @@ from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.windows import problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
-from calibration.inference.weak_form import fit_weak_form
+from calibration.inference.weak_form import TENTH, fit_weak_form
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -105,8 +106,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Size of a delay in its sds from which a note reports it.
-LATE = 4.0
+#: Size of a delay in its sds from which a note reports it, and as a share of the longest that is searched.
+LATE, ENDS = 4.0, 0.95
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
@@ -772,10 +773,17 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
 
     None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
     gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
-    level.
+    level. No effect is named if the simulation misses a channel.
     """
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+
+    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
+        return LoopStages("undescribed", screened, left, traced.sds, searched, beside=beside, run=traced.run,
+                          predicted=traced.predicted, missed=missed, unused=unused_inputs(given.runs))  # fmt: skip
+
     if given.known is not None:  # only the noise differs
+        if given.known.verdict == "undescribed":
+            return undescribed(given.known.missed)
         refuted = given.known.run is not None and given.known.run.contradicts
         return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
     if searched is None or beside is None or given.shows_unmodelled_backlash:
@@ -791,6 +799,8 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
         return None
     traced = dataclasses.replace(traced, run=run)
+    if missed := missed_channels(run.space, given.runs, given.noise, run.diagnosis(run.best, left).linear):
+        return undescribed(missed)
     if not run.contradicts or traced.verdict == "place":
         return traced
     if traced.verdict == "mechanism":
@@ -1260,8 +1270,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
     delay = found.base_shift.get(priors.DELAY)
-    if delay is not None and priors.DELAY not in found.robot.rig.stated and abs(delay.after) > LATE * delay.sd_after:
-        remarks.append(Remark("late", delay=delay.after, sd=delay.sd_after))
+    remarks += delay_remarks(found.runs, delay, priors.DELAY in found.robot.rig.stated) if delay is not None else []
     if found.remains is not None:
         remarks.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
     names = [e.name for e in found.effects]
@@ -1277,6 +1286,15 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if 1 / (1 + settled) > min(found.settings.shares.values()):
         remarks.append(Remark("too_few_replicates", settled=settled))
     return tuple(remarks)
+
+
+def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remark]:
+    """Remark on a delay that the robot's file does not state, or that is the longest of the search."""
+    limit = TENTH * float(np.median([runs["time_s"][rows].max() for rows in runs.rows_by_run().values()]))
+    ends = abs(delay.after) > ENDS * limit
+    if abs(delay.after) <= LATE * delay.sd_after or (stated and not ends):
+        return []
+    return [Remark("late", delay=delay.after, sd=delay.sd_after, ends=ends)]
 
 
 def _repeat_run_remark(found: DiscoveryResult, test: NameTest) -> Remark:

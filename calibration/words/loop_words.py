@@ -811,13 +811,14 @@ def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
-def imposed_delay(delay: float, sd: float) -> str:
-    """Delay of the imposed quantity, and the line for the rig's file."""
+def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
+    """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is the longest of the search."""
     when = "later" if delay > 0 else "earlier"
-    return (
-        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, and "
-        f'the rig file gives no delay. To start the fit from this delay, set [rig] delay = "{delay:.3g} ± {sd:.2g}"'
-    )
+    acts = f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, "
+    if ends:
+        return f"{acts}the longest delay that is searched. Check the clocks of the columns"
+    line = f'"{delay:.3g} ± {sd:.2g}"'
+    return f"{acts}and the rig file gives no delay. To start the fit from this delay, set [rig] delay = {line}"
 
 
 def leader_choice(
