@@ -365,11 +365,10 @@ def saturation_sentence(runs: Runs) -> str:
     if limited.sum() < ROWS_INNER or np.std(np.abs(predicted[limited])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(limited)[0])
-    column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
-        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The driver limits "
-        f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
+        f"{runs.source} row {row + 1}, {_drive_heading(runs)}: commands {three_digits(drive[row])} V, but current "
+        f"and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The "
+        f"driver limits the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -450,14 +449,18 @@ def still_sentence(runs: Runs) -> str:
     )
 
 
+def _drive_heading(runs: Runs) -> str:
+    column = "duty" if runs.has("duty") else runs.layout.imposed_column
+    return runs.headings.get(column, column)
+
+
 def held_sentence(runs: Runs) -> str:
     """Sentence on readings that repeat their last value while the imposed quantity changes, empty for others."""
-    imposed = runs.layout.imposed_column
-    if not (runs.sampled and runs.has(imposed)):
+    if not (runs.sampled and runs.has(runs.layout.imposed_column)):
         return ""
-    drive, range_ = runs[imposed], float(np.ptp(np.nan_to_num(runs[imposed])))
-    for name in np.unique(runs.run_names):
-        rows = runs.in_order(name)
+    drive = np.nan_to_num(applied_drive(runs))
+    range_ = float(np.ptp(drive))
+    for rows in runs.rows_by_run().values():
         for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
             begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
             for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
@@ -466,7 +469,7 @@ def held_sentence(runs: Runs) -> str:
                     column, last_row = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
                         f"{runs.source} rows {rows[begin] + 1} to {last_row}, {column}: the same reading while "
-                        f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated. Empty "
+                        f"{_drive_heading(runs)} changes, as if the last value was repeated. Empty "
                         "these cells to use the other rows"
                     )
     return ""
@@ -474,10 +477,11 @@ def held_sentence(runs: Runs) -> str:
 
 def swapped_sentence(runs: Runs) -> str:
     """Sentence on a motion whose sign changes within a log although the drive does not, empty for others."""
-    imposed = runs.layout.imposed_column
-    if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
+    if not (runs.sampled and runs.has(runs.layout.imposed_column)):
+        return ""
+    drive, of_runs = np.nan_to_num(applied_drive(runs)), list(runs.rows_by_run().values())
+    if not drive.min() < 0 < drive.max():
         return ""  # a signal that never changes sign may lack it, which other checks report
-    drive, of_runs = runs[imposed], list(runs.rows_by_run().values())
     for channel, readings in zip(runs.channels, runs.measured().T, strict=True):
         power = np.zeros(len(drive))
         for rows in of_runs if channel.zero_at_rest else ():
@@ -494,7 +498,7 @@ def swapped_sentence(runs: Runs) -> str:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
-                    f"{runs.headings.get(imposed, imposed)}. Correct the sign in one of the two parts"
+                    f"{_drive_heading(runs)}. Correct the sign in one of the two parts"
                 )
     return ""
 
