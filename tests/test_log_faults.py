@@ -188,3 +188,11 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
     (note,) = error_after_steps(runs, off)
     assert note.code == "shifted" and note.shift == pytest.approx(late, rel=0.1) and note.share > 0.9
     assert f"ms {'late' if late > 0 else 'early'}. To fit this delay, set [rig] delay" in describe(note)
+
+
+def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
+    runs = Runs("log.csv", motor()).of(robot)
+    assert discover.missing_states_remarks(runs, robot) == []
+    silent = Runs("log.csv", {**motor(), SPEED: np.full(600, np.nan)}).of(robot)
+    (note,) = discover.missing_states_remarks(silent, robot)
+    assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)

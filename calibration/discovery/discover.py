@@ -90,6 +90,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.windows import problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
+from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
 from calibration.inference.weak_form import TENTH, fit_weak_form
 from mmrjax import effects, fidelities
@@ -358,8 +359,11 @@ def prepare_loop(
     for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
-    notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
+    unshown = missing_states_remarks(distinct, ready.robot)
+    at_first = (*ready.foreign, *ready.doubted, *unshown, *remarks_with_codes(ready.checked, "lost_motion"))
+    notes_so_far: Notes = (
+        *notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted, *unshown
+    )  # fmt: skip
     output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
@@ -372,6 +376,13 @@ def prepare_loop(
     return LoopInput(
         distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, notes_so_far, at_first
     )
+
+
+def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
+    """Remark on a log that does not show the states of its equations."""
+    read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
+    plan = state_plan_or_reason(robot, read) if read else None
+    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -799,8 +810,10 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
         return None
     traced = dataclasses.replace(traced, run=run)
-    if missed := missed_channels(run.space, given.runs, given.noise, run.diagnosis(run.best, left).linear):
-        return undescribed(missed)
+    linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
+    refit, fit = (missed_channels(run.space, given.runs, given.noise, x) for x in linear)
+    if fit:
+        return undescribed(refit)
     if not run.contradicts or traced.verdict == "place":
         return traced
     if traced.verdict == "mechanism":

@@ -821,6 +821,17 @@ def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
     return f"{acts}and the rig file gives no delay. To start the fit from this delay, set [rig] delay = {line}"
 
 
+#: Reason why a log does not show the states of its equations → sentence part, and what to log.
+UNSHOWN = {
+    "motion": "no channel reads a speed or an angle. For an answer from its equations, log one",
+    "sign": "an instrument shows only a magnitude. For an answer from its equations, log the sign",
+    "slack": "motor and load move apart",
+    "turn": "the robot turns",
+    "goal": "a controller gives the voltage. For an answer from its equations, log the duty",
+    "follower": "no channel follows the imposed speed. For an answer, log the current",
+}
+
+
 def leader_choice(
     names: Names,
     rms_sigma: tuple[float, ...],
@@ -902,6 +913,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
+    "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
     "led": leader_choice,
     "not_predictable": lambda kinds: (
         f"some blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} contain all runs of a "
