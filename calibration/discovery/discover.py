@@ -32,7 +32,6 @@ from calibration.discovery.classes import (
     ammeter_families,
     errors_of_ammeters,
     find_classes,
-    signature_cosines,
 )
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
@@ -1092,7 +1091,6 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
             ask = observe.menu and not observe.long
             concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
     scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
-    library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -1131,7 +1129,6 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=scores,
-        cosine=signature_cosines(decided[0], diagnosis.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, shown, ends),
         readings_of_rows=row_readings,
         errors_as_stated=error(row_readings.as_stated),
