@@ -13,9 +13,8 @@ from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied_drive, changing_columns, intervals_by_run
 from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
-from calibration.data.row_checks import time_constant
+from calibration.data.row_checks import JUMP, time_constant
 from calibration.data.runs import Runs
-from mmrjax.errors import count_noun
 from mmrjax.model import channels, params
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
@@ -260,35 +259,6 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     )
 
 
-#: Time between rows beyond which rows may be missing, in multiples of the usual time.
-LONG = 100.0
-
-
-def _time_steps_of_runs(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """For each run of a log: its name, its rows in order of time, and the time steps between them [s]."""
-    for name in np.unique(runs.run_names) if runs.sampled else ():
-        rows = runs.in_order(name)
-        yield name, rows, np.diff(runs["time_s"][rows])
-
-
-def gap_sentence(runs: Runs) -> str:
-    """Sentence on the longest time step of a log, if rows may be missing there. Otherwise empty."""
-    worst, sentence = 0.0, ""
-    for _, rows, steps in _time_steps_of_runs(runs):
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        long = steps > LONG * usual
-        if not (usual > 0 and long.any() and steps.max() > worst):
-            continue
-        k, worst = int(np.argmax(steps)), float(steps.max())
-        other_gaps = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
-        sentence = (
-            f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
-            f"{three_digits(usual)} s is usual{other_gaps}. A fit keeps the imposed quantity constant in the gap. If "
-            'rows are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
-        )
-    return sentence
-
-
 #: A clock jitters if the time between rows has at least this relative spread and at most this correlation with the
 #: next. Fewest rows.
 UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
@@ -300,11 +270,12 @@ def jitter_sentence(runs: Runs) -> str:
     With even rows and independent clock errors, successive time steps have a correlation of -1/2. If the rows
     themselves are uneven, time steps are independent.
     """
-    for name, rows, steps in _time_steps_of_runs(runs):
+    for name, rows in runs.rows_by_run().items() if runs.sampled else ():
+        steps = np.diff(runs["time_s"][rows])
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
         deviation = np.clip(steps - usual, -usual, usual)
         spread = float(np.std(deviation))
-        if usual <= 0 or spread <= UNEVEN * usual or (steps > LONG * usual).any():
+        if usual <= 0 or spread <= UNEVEN * usual or (steps > JUMP * usual).any():
             continue
         if float(np.mean(deviation[1:] * deviation[:-1])) < TURNS_BACK * spread**2:
             run = f" of run {name}" if name else ""
@@ -506,7 +477,6 @@ def swapped_sentence(runs: Runs) -> str:
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
     doubts = (
-        gap_sentence(runs),
         jitter_sentence(runs),
         saturation_sentence(runs),
         constant_conditions_sentence(runs),
