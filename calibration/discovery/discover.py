@@ -176,7 +176,9 @@ def discover(
     told, known = dataclasses.replace(ready, progress=tell, keep=keep), ready.noise
     for note in ready.at_first:
         tell(note)
-    traced, notes = keep("verdict", lambda: told.trace(ahead=True)), ready.notes
+    traced = keep("verdict", lambda: told.trace(ahead=True))
+    refuted = remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
+    notes: Notes = tuple(n for n in ready.notes if n not in refuted)
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
@@ -274,7 +276,9 @@ class LoopInput:
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
-                word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
+                # A rigid base that leaves only noise refutes a backlash.
+                loose = self.shows_unmodelled_backlash and diagnosis.test.rejected
+                word = "undescribed" if missed or loose else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
 
