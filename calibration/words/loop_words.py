@@ -291,7 +291,7 @@ def verdict_line(stages: LoopStages) -> str:
     return f"at one noise level: {', '.join((stages.verdict, *sure))}"
 
 
-def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> list[str]:
+def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
     method_words = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
@@ -300,7 +300,7 @@ def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> l
             f"{found.p_value:.2g})"
         ]
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
-    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:5]
     if not beyond:
         return [f"{first}. No effect explains more than chance would"]
     if brief:
@@ -611,12 +611,6 @@ def support_sentence(found: DiscoveryResult) -> str:
     if found.verdict in WITHOUT_NAME:
         return f"Why no name: {found.standing}."
     return f"{found.standing[0].upper()}{found.standing[1:]}."
-
-
-def effect_called(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """The name of an effect, and where it is tentative what speaks against it."""
-    reason = tentative_reason(found, effect)
-    return f"{effect.name}\n({reason})" if reason else effect.name
 
 
 def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
