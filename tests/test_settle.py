@@ -643,7 +643,8 @@ def test_gaps_and_a_clock_that_jitters_are_said_with_rows_and_remedy(tmp_path, c
     }[case]
     columns["time_s"] = columns["time_s"] + off - off[0]
     robot = bench(tmp_path, columns)
-    (found,) = rig_facts.log_doubts(records.read_runs(tmp_path / "log.csv", robot=robot), robot) or ("",)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    (found,) = (*runs.notes, *rig_facts.log_doubts(runs, robot)) or ("",)
     assert re.search(said, found) and bool(found) == bool(said)
 
 

@@ -182,7 +182,9 @@ def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
     Args:
         at_rest: True if runs begin at rest. Rows after a jump then stay in their run.
     """
-    time = columns.get("time_s", np.zeros(0))
+    if not set(TIME) <= set(columns):
+        return ()
+    time = columns["time_s"]
     run = columns.get("run_id", np.full(len(time), ""))
     steps = np.where(run[1:] == run[:-1], np.diff(time), 0.0)
     usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
