@@ -83,7 +83,7 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
         return None
     if why := reason_without_stance(robot):
         return 0, lever_columns[0], why
-    on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
+    on_tracks = robot.configurations.tracked[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))
         return row, lever_columns[0], reason_without_levers(robot, runs["configuration"][row])

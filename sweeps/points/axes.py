@@ -158,7 +158,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
 
 def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
     """Adhesion of each configuration on a surface, relative to that on the bench."""
-    return tuple(adhesion_ratio(surface, float(c.on_tracks) > 0.5) for c in robot.configurations.members)
+    return tuple(adhesion_ratio(surface, tracked) for tracked in robot.configurations.tracked)
 
 
 def _known_axis(name: str, robot: Robot, where: str) -> Axis:
