@@ -269,8 +269,8 @@ def judge_each_name(
     bases: Bases,
     after: Diagnosis,
     settings: Settings,
-    blocks: Sequence[np.ndarray] = (),
-    better: Sequence[Candidate] = (),
+    blocks: Sequence[np.ndarray],
+    better: Sequence[Candidate],
 ) -> tuple[NameTest, ...]:
     """Tests each effect on its own, with all other effects fitted.
 

@@ -101,7 +101,7 @@ def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
 
 
 def search_from_starts(
-    posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None = None
+    posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None
 ) -> MultistartResult:
     """Searches from all points in one batch. Unknown noise is estimated and the search repeated until the noise
     settles.
@@ -134,7 +134,7 @@ def search_one_by_one(
     points: np.ndarray,
     shares: np.ndarray,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None = None,
+    solver: optimizers.Solver | None,
 ) -> MultistartResult:
     """Searches from several points as `search_from_starts`, but one after another.
 
@@ -225,7 +225,7 @@ def optimum_of_population(
     shares: np.ndarray,
     searched: PopulationSearch,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None = None,
+    solver: optimizers.Solver | None,
 ) -> MultistartResult:
     """Result of a population, after a further search by gradients from its best member where gradients are
     reliable.

@@ -881,7 +881,7 @@ def _conditions_over_time(
     each: list[np.ndarray],
     time: np.ndarray,
     times: np.ndarray,
-    on_lines: Names = (),
+    on_lines: Names,
 ) -> Conditions:
     """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
@@ -1046,7 +1046,7 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
+def _drive_changes(runs: Runs, rows: np.ndarray, share: float) -> np.ndarray:
     """True for rows of a run where its command changes. For the supply of motors, only changes above a share of
     the largest value count.
     """
