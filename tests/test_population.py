@@ -291,7 +291,7 @@ def test_what_members_did_is_counted_and_said(found):
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
     assert told.remarks()[1:] == [
-        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": ReachedBound("upper", 9.0)})
+        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("ended_at_edge", edge={"a": ReachedBound("upper", 9.0)})
     ]  # fmt: skip
 
 

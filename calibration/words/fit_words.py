@@ -134,15 +134,6 @@ def sentence_on_failing_members(members: dict[str, int]) -> str:
     return f"some members fail in at least one row: {row_outcomes}. They rank below the others"
 
 
-def sentence_on_jumping_members(members: int, best: tuple[int, ...]) -> str:
-    """Members whose running gear jumps."""
-    row_words = f"rows {', '.join(map(str, best))}" if best else "none"
-    return (
-        f"{members} members jump in at least one row: the weight moves between guides and pulleys so abruptly that "
-        f"they leave the ground at times. Rows in which the best member does so: {row_words}"
-    )
-
-
 def distance_from_prior(at: fit_notes.ReachedBound) -> str:
     """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
@@ -309,8 +300,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     "no_covariance": "the posterior has no finite covariance. The values can be used, but not the intervals",
     "no_grip": "every run slides, so static friction and the slip below its limit are known only from their priors",
     "estimated_noise": estimated_noise,
-    "beside_steady": "{inside} of {total} parameters agree with the optimum of the steady model within their 95 "
-    "% intervals. The largest difference is {sds:.2f} sd ({furthest})",
     "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
@@ -342,10 +331,6 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because the "
         "robot fitted to the other blocks slides in them. The errors exclude these rows"
     ),
-    "same_predictions": lambda kind, others: (
-        f"blocks by {' or by '.join(blocks.kind_in_words(k) for k in others)} are the same as blocks by "
-        f"{blocks.kind_in_words(kind)}, because these runs do not vary them separately. Their errors are shown once"
-    ),
     "block_not_converged": "the search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
@@ -354,7 +339,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     "would show which part is right",
     "generations": search_generations,
     "lost_rows": sentence_on_failing_members,
-    "members_jump": sentence_on_jumping_members,
     "ended_at_edge": lambda edge: (
         "the search ended at the edge of the allowed range: its best member has "
         + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
