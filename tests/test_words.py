@@ -194,9 +194,7 @@ SAMPLES = [
     Remark("in_pieces", name="rig.delay", pieces=2),
     Remark("generations", members=96, generations=8, settled=True),
     Remark("generations", members=96, generations=8, settled=False),
-    Remark("lost_rows", members={"tips": 3, "slides": 2, "failed": 1}),
     Remark("ended_at_edge", edge={"a": of_fit.ReachedBound("upper", 9.0), "b": of_fit.ReachedBound("", -2.64)}),
-    Remark("read_from_members", names=("a", "b"), left=0.4),
     Remark("assumed_noise", channels=("speed",), usual="speed=2%"),
     Remark(
         "noise_from_series",
@@ -262,7 +260,6 @@ SAMPLES = [
         rise_chi2=0.0,
     ),
     Remark("outstanding", factors=(0.5, 2.0), word="assumed"),
-    Remark("not_predictable", kinds=("configuration",)),
     Remark("lost_replicates", settled=400, asked=500),
     Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, 2.4, what="run")),
     Remark(

@@ -47,8 +47,8 @@ LOST = 1e3
 MEMBERS_EACH = 3
 #: Distance from the middle of a prior beyond which a search is at its edge [prior sd].
 EDGE = 2.5
-#: Statuses with which a member loses a row.
-LOST_AS = ("slides", "tips", "failed", "stalled")
+
+
 #: Step of the differences that check derivatives [posterior sd], and largest relative difference between the two.
 STEP, APART = 0.2, 0.25
 
@@ -421,9 +421,5 @@ class PopulationSearch:
                 settled=self.found.settled,
             )
         ]
-        status_counts = self.outcomes()
-        lost_counts = {status: status_counts[status] for status in LOST_AS if status in status_counts}
-        notes += [Remark("lost_rows", members=lost_counts)] * bool(lost_counts)
         notes += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
-        notes += [Remark("read_from_members", names=self.apart, left=self.left)] * bool(self.apart)
         return notes

@@ -30,11 +30,6 @@ FAR = {
 }
 #: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "the prior of its product with the guide share in the other fidelities"}
-#: Reasons why a member of a population loses a row.
-LOST_AS = {
-    "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
-    "stalled": "stall",
-}  # fmt: skip
 
 
 def sentence_on_wrong_noise(channel: str, factor: float, source: str) -> str:
@@ -126,12 +121,6 @@ def search_generations(members: int, generations: int, settled: bool) -> str:
     if not settled:
         end = "The last generation still improved the best member, so continue with more --generations"
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
-
-
-def sentence_on_failing_members(members: dict[str, int]) -> str:
-    """Members with a row that is lost."""
-    row_outcomes = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
-    return f"some members fail in at least one row: {row_outcomes}. They rank below the others"
 
 
 def distance_from_prior(at: fit_notes.ReachedBound) -> str:
@@ -338,12 +327,8 @@ SAID: dict[str, str | Callable[..., str]] = {
     "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Readings at more closely spaced conditions "
     "would show which part is right",
     "generations": search_generations,
-    "lost_rows": sentence_on_failing_members,
     "ended_at_edge": lambda edge: (
         "the search ended at the edge of the allowed range: its best member has "
         + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
     ),
-    "read_from_members": "derivatives of the run with respect to {names} disagree with finite differences, because "
-    "contacts open and close. The combinations that the data determine therefore come from a regression "
-    "over the members near the best one, with residuals of {left:.2g} sd rms",
 }
