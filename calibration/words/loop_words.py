@@ -805,13 +805,25 @@ def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
-def imposed_delay(delay: float, sd: float) -> str:
-    """Delay of the imposed quantity, and the line for the rig's file."""
+def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
+    """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is the longest of the search."""
     when = "later" if delay > 0 else "earlier"
-    return (
-        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, and "
-        f'the rig file gives no delay. To start the fit from this delay, set [rig] delay = "{delay:.3g} ± {sd:.2g}"'
-    )
+    acts = f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, "
+    if ends:
+        return f"{acts}the longest delay that is searched. Check the clocks of the columns"
+    line = f'"{delay:.3g} ± {sd:.2g}"'
+    return f"{acts}and the rig file gives no delay. To start the fit from this delay, set [rig] delay = {line}"
+
+
+#: Reason why a log does not show the states of its equations → sentence part, and what to log.
+UNSHOWN = {
+    "motion": "no channel reads a speed or an angle. For an answer from its equations, log one",
+    "sign": "an instrument shows only a magnitude. For an answer from its equations, log the sign",
+    "slack": "motor and load move apart",
+    "turn": "the robot turns",
+    "goal": "a controller gives the voltage. For an answer from its equations, log the duty",
+    "follower": "no channel follows the imposed speed. For an answer, log the current",
+}
 
 
 def leader_choice(
@@ -895,6 +907,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
+    "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
     "led": leader_choice,
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted. The thresholds use only these",
     "outstanding": lambda factors, word: (
