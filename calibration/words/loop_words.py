@@ -904,11 +904,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     "late": imposed_delay,
     "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
     "led": leader_choice,
-    "not_predictable": lambda kinds: (
-        f"some blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} contain all runs of a "
-        "configuration with its own parameters. The other runs cannot predict these blocks, so they are neither "
-        "scored nor tested"
-    ),
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted. The thresholds use only these",
     "outstanding": lambda factors, word: (
         f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "
