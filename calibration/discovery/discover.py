@@ -288,7 +288,7 @@ class LoopInput:
         """
         if self.equations is not None or (self.known is not None and self.known.run is None):
             return None
-        if self.shows_unmodelled_backlash or (equations := equations_of_log(self, LONG)) is None:
+        if self.shows_unmodelled_backlash or (equations := equations_of_log(self)) is None:
             return None
 
         def keep(name: str, make: Callable[[], Any]) -> Any:
@@ -727,15 +727,13 @@ def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
     return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
 
 
-def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
-    """The same input with the windows of a log as its table. None if the log does not show its states.
-
-    Args:
-        fewest: fewest steps of the longest run.
+def equations_of_log(given: LoopInput) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states, or if its
+    longest run has fewer than `LONG` steps.
     """
     space = _space_of(given, given.noise)
     observe: Any = space.bare.observe
-    if not observe.long or observe.times.shape[1] < fewest:
+    if not observe.long or observe.times.shape[1] < LONG:
         return None
     fit = fit_weak_form(space.bare, space.library.scored)
     if fit is None or not fit.plan.mechanical:
