@@ -728,7 +728,6 @@ def _two_numbers(before: float, after: float) -> str:
 
 
 def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
-    """Question to the track model."""
     return {
         "missing": f"the error of the {about.balance} balance over {bases.variable_in_words(about.variable)}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
@@ -737,7 +736,6 @@ def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
 
 
 def track_model_answer(found: TrackModelResult) -> str:
-    """Answer of the track model."""
     before, after = found.slip_rms
     gear = ", ".join(
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
