@@ -655,18 +655,6 @@ def sentence_on_ruled_out_effects(found: DiscoveryResult) -> str:
 # --- beside names ---------------------------------------------------------------------------------------
 
 
-def hidden_effects_sentence(found: DiscoveryResult) -> str:
-    """Sentence on effects that the findings could hide, and on runs that would show them, empty for none."""
-    if not found.hidden:
-        return ""
-    effect_words = [
-        f"{h.name} up to {h.amplitude:.2g} {h.unit}".rstrip(" -")
-        + (f" ({h.experiment} would show it)" if h.experiment else "")
-        for h in found.hidden
-    ]
-    return f"These data could also hide {', '.join(effect_words)}."
-
-
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
     """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated value 4e-06 (+2.3 prior sds)`."""
     ratio = f"{value / stated:.2g} times the " if stated and value / stated > 0 else ""
