@@ -727,7 +727,7 @@ def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
     return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
 
 
-def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
+def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states.
 
     Args:

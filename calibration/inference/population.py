@@ -262,7 +262,7 @@ def run_evolution(
     *,
     size: int,
     seed: int,
-    generations: int = GENERATIONS,
+    generations: int,
     beside: np.ndarray | None = None,
     tell: Callable[[Remark], None] = lambda step: None,
 ) -> Population:

@@ -173,18 +173,13 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
 
 
 def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
-    """A mechanism with its evidence."""
+    """A mechanism with its evidence: share of the misfit, gain on held-out runs, and repeatability."""
     names = " or ".join(map(with_article, found.families))
-    return f"{names}{within}, established as a mechanism. It {mechanism_evidence(found)}"
-
-
-def mechanism_evidence(found: loop_notes.Mechanism) -> str:
-    """Evidence for a mechanism: share of the misfit, gain on held-out runs, and repeatability."""
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
-        f"explains {100 * found.share:.0f} % of the misfit beyond noise, raises the log likelihood of held-out runs "
-        f"by {found.gain:.2g} per affected reading{errors}, and is found again in {100 * found.again:.0f} % of the "
-        "fits with one block left out"
+        f"{names}{within}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit beyond "
+        f"noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected reading{errors}, and is "
+        f"found again in {100 * found.again:.0f} % of the fits with one block left out"
     )
 
 

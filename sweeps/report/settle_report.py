@@ -22,12 +22,12 @@ IMPOSED = {
 }
 
 
-def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Document:
+def settle_document(found: Settled, few: str, notes: Names) -> Document:
     """The report. `few`: sentence on too few settled runs. `notes`: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step
     all_remarks = (*words.settle_remarks(found), *notes)
-    omitted = words.omitted_stretches(found.stretches, bool(few))
+    omitted = words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
     log = catalogue.figure("settle.log", found, finding=words.settle_statement(found))
     sections = [Section("Over the log", (log,))]
     if omitted:
