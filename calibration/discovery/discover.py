@@ -87,7 +87,7 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.observers.windows import LinearHistories, problem_of_readings, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
 from calibration.inference.weak_form import fit_weak_form
@@ -266,10 +266,18 @@ class LoopInput:
         """
         if (by_windows := self.trace_windows()) is not None:
             return by_windows
+        if self.known is not None and isinstance(self.known.screened.base.space.bare.observe, LinearHistories):
+            equations = self.known.screened.base.space.with_sd(self.noise.sd)
+            traced = dataclasses.replace(self, equations=equations, known=None).trace()
+            run = self.known.run
+            refuted = run is not None and run.contradicts and traced.verdict != "none"
+            return dataclasses.replace(traced, verdict="place") if refuted else traced
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
+            if screened.base.space.bare.observe.long and not self.shows_unmodelled_backlash:
+                return _trace_readings(self, screened, sds, bool(ranked))
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
@@ -314,8 +322,7 @@ class LoopInput:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 if not self.shows_unmodelled_backlash:
                     ranked.append(self.keep("ranking", make))
-                begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
-                space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
+                near = ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
         self.progress(progress_remark("base"))
@@ -767,6 +774,72 @@ def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
     )  # fmt: skip
 
 
+def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: bool) -> LoopStages:
+    """Stages of a log whose readings are linear about the simulated fit of its base, and the simulation of the model
+    that they choose.
+
+    Args:
+        screened, sds: simulated fit of the base, and its noise.
+        ranked: True if the effects have been ranked.
+    """
+    space, settings, measured = screened.base.space, given.settings, given.runs.measured()
+    weight = space.weight.copy()
+    weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
+    problem = space.with_weights(weight).bare
+    z = screened.base.candidate.z[: space.free]
+    posed = problem_of_readings(problem, z, space.library.scored, settings.width)
+    equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+
+    def keep(name: str, make: Callable[[], Any]) -> Any:
+        """Stores a stage apart from the simulated one of this name."""
+        if name == "ranking":
+            return None if ranked else given.keep(name, make)
+        return given.keep(f"readings {name}", make)
+
+    table = dataclasses.replace(given, equations=equations, noise=sds.noise, known=None, keep=keep)
+    traced = table.trace()
+    if not traced.sds.factors:
+        traced = dataclasses.replace(traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks))
+    linear = traced.screened.base
+    space = space.with_sd(traced.sds.noise.sd).with_weights(linear.space.weight)
+    given.progress(progress_remark("confirm"))
+    best = _chosen_fit(traced)
+    run = simulate_models(space, linear.candidate, best, settings)
+    traced = dataclasses.replace(traced, run=run)
+    if traced.searched is None:
+        return traced
+    confirmed = traced.left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    if not confirmed.rejected and traced.screened.cluster is None:
+        left = dataclasses.replace(traced.left, test=confirmed)
+        none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
+        return LoopStages("none", traced.screened, left, traced.sds, run=none)
+    return _lower_if_contradicted(table, traced)
+
+
+def _chosen_fit(traced: LoopStages) -> Candidate:
+    """Fit of the verdict: the proposal, or else the best set of its mechanism."""
+    base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
+    if searched is None or traced.best is not base:
+        return traced.best
+    named = frozenset(() if mechanism is None else mechanism.effects)
+    return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+
+
+def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
+    """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
+    run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
+    if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
+        return traced
+    if traced.verdict == "mechanism":
+        return dataclasses.replace(traced, verdict="place")
+    mechanism = find_mechanism(
+        screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
+        traced.predicted, windows.settings,
+    )  # fmt: skip
+    level = "place" if mechanism is None or mechanism.fails else "mechanism"
+    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+
+
 def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
     """Stages of a log's windows after the simulation of the base model and of the chosen one.
 
@@ -781,26 +854,13 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     if searched is None or beside is None or given.shows_unmodelled_backlash:
         return None
     given.progress(progress_remark("confirm"))
-    base, best = screened.base.candidate, traced.best
-    if best is base:
-        named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
-        best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+    base, best = screened.base.candidate, _chosen_fit(traced)
     run = simulate_models(_space_of(given, given.noise), base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
         return None
-    traced = dataclasses.replace(traced, run=run)
-    if not run.contradicts or traced.verdict == "place":
-        return traced
-    if traced.verdict == "mechanism":
-        return dataclasses.replace(traced, verdict="place")
-    mechanism = find_mechanism(
-        screened.base.space, windows.runs, base, left, searched.ladder, screened.bases, beside, traced.predicted,
-        windows.settings,
-    )  # fmt: skip
-    level = "place" if mechanism is None or mechanism.fails else "mechanism"
-    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+    return _lower_if_contradicted(windows, dataclasses.replace(traced, run=run))
 
 
 # --- stages without a module of their own ---------------------------------------------------------------
@@ -1014,7 +1074,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     decided, shown = (space, best), diagnosis
     if (run := traced.run) is not None:
         best = run.base if best is base else run.best
-        space, base, noise, traced = run.space, run.base, given.noise, dataclasses.replace(traced, predicted={})
+        noise = noise if space.bare.observe.reads else given.noise
+        space, base, traced = run.space, run.base, dataclasses.replace(traced, predicted={})
         shown, ends = run.diagnosis(base, diagnosis), run.diagnosis(best, ends)
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
@@ -1083,7 +1144,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         runs=runs,
         numbers=numbers,
         included=included,
-        outliers=() if run is not None else tuple(int(numbers[k]) for k in screened.outliers),
+        outliers=tuple(int(numbers[k]) for k in screened.outliers if screened.base.space.bare.observe.reads),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
         unnamed=None
