@@ -326,9 +326,6 @@ class Picture(OneRun):
     )
     end: float | None = option_field(None, "End of the film (s)", usual="begin + 0.1")
     slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
-    climb: Path | None = option_field(
-        None, "Folder of mmrjax climb to draw instead. The default is the whole climb at half speed"
-    )
     force: bool = option_field(False, "Replace an existing file")
 
 
@@ -444,13 +441,6 @@ class TurnPart(Part):
         """True if the robot is free to turn."""
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
-    def refuse_volts(self, battery: bool) -> None:
-        """Reject side voltages on battery power, which sets the voltage."""
-        if battery and self.left_V is not None:
-            raise PydanticCustomError(
-                "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
-            )
-
     @model_validator(mode="after")
     def _of_both_sides(self) -> Self:
         pairs = ("left_V", "right_V"), ("duty_left", "duty_right"), ("speed_m_s", "yaw_rate_rad_s")
@@ -534,7 +524,10 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
             if beside:
                 option = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
                 raise PydanticCustomError("idle", f"`{option}` cannot be combined with `{beside[0]}`")
-            self.refuse_volts(self.battery)
+            if self.battery and self.left_V is not None:
+                raise PydanticCustomError(
+                    "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
+                )
         if self.profile is not None and self.posterior is not None:
             raise PydanticCustomError("idle", "`posterior` cannot be combined with `profile`")
         return self
@@ -560,19 +553,10 @@ class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     )
 
 
-class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
+class Render(RobotPart, FidelityPart, SupplyPart):
     """One run of the fidelity that pictures are made from."""
 
     model: Literal["track"] = "track"
-
-    @model_validator(mode="after")
-    def _driven(self) -> Self:
-        if self.demands:
-            raise PydanticCustomError(
-                "idle", "`speed_m_s` has an effect only with simulate; give `left_V` and `right_V`"
-            )
-        self.refuse_volts(self.battery)
-        return self
 
 
 class Resonance(RobotPart, FidelityPart, OutputPart):

@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Json, Names, Priors, own_mass
+from calibration.data import Names, Priors, own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
@@ -32,7 +32,6 @@ from calibration.discovery.classes import (
     ammeter_families,
     errors_of_ammeters,
     find_classes,
-    signature_cosines,
 )
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
@@ -447,11 +446,6 @@ class LoopStages:
         return [self.standing is None or self.standing.established(m[0]) for m in self._classes]
 
     @property
-    def noise_factor(self) -> float | None:
-        """Geometric mean over channels of the factor on the sds, None if they are unchanged."""
-        return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
-
-    @property
     def families(self) -> Names:
         """Families of the members of each established class, or of the location of a discrepancy without a name."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
@@ -461,27 +455,6 @@ class LoopStages:
         if self.verdict == "mechanism" and self.mechanism is not None:
             return self.mechanism.families
         return () if self.where is None else (self.where.family,)
-
-    @property
-    def events(self) -> tuple[Json, ...]:
-        """Temporary changes: each with its axis, its window, and the numbers of the rows in it."""
-        return () if self.where is None else self._event_entries(self.where.variable)
-
-    @property
-    def events_alike(self) -> tuple[Json, ...]:
-        """Other temporary changes that explain the data as well, in the form of `events`."""
-        alike = () if self.where is None else self.where.variables_alike
-        return tuple(event for variable in alike for event in self._event_entries(variable))
-
-    def _event_entries(self, variable: str) -> tuple[Json, ...]:
-        happens = bases_room.window_from_name(variable)
-        if happens is None or self.where is None:
-            return ()
-        linear = self.left.linear
-        x, _ = linear.curve_variable(self.where.place, happens.axis)
-        inside = self.screened.base.space.included & linear.of_rows(happens.holds(x))
-        rows = [int(k) + 1 for k in np.flatnonzero(inside)]
-        return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
     def simulated(self) -> dict[Names, np.ndarray]:
@@ -1064,13 +1037,9 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
 def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
-    screened, diagnosis, noise, nameless = (
-        traced.screened,
-        traced.left,
-        traced.sds.noise,
-        traced.verdict in WITHOUT_NAME,
-    )
+    screened, diagnosis, noise = traced.screened, traced.left, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
+    nameless = traced.verdict in WITHOUT_NAME
     decided, shown = (space, best), diagnosis
     if (run := traced.run) is not None:
         best = run.base if best is base else run.best
@@ -1106,7 +1075,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, of_fit = (best, traced.ends if run is None else ends) if written else (base, shown)
+        fit, of_fit = (best, ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
@@ -1116,21 +1085,18 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         simulated = np.where(included[:, None], simulated, np.nan)
         return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
-    ladder = () if traced.searched is None else traced.searched.ladder
-    ladder = ladder if traced.alike is None else traced.alike.ladder
-    cost_there = cost if run is None else decided[1].cost
+    ladder = () if traced.searched is None else (traced.alike or traced.searched).ladder
+    cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
-        named = best if run is None else dataclasses.replace(best, cost=decided[1].cost)
-        base_there = screened.base.candidate
+        named, base_there = dataclasses.replace(best, cost=decided[1].cost), screened.base.candidate
         found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
         if not nameless and run is None:
             ask = observe.menu and not observe.long
             concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
     scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
-    library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -1169,7 +1135,6 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=scores,
-        cosine=signature_cosines(decided[0], diagnosis.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, shown, ends),
         readings_of_rows=row_readings,
         errors_as_stated=error(row_readings.as_stated),
@@ -1185,7 +1150,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         replicates=len(diagnosis.test.null.single),
     )
     # A temporary change is not uniform.
-    of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    is_event = traced.where is not None and bases_room.window_from_name(traced.where.variable) is not None
+    of_noise = () if is_event and not traced.sds.factors else noise_remarks_before_verdict(traced.sds, remaining)
     if run is not None and run.contradicts:
         of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(

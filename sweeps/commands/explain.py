@@ -166,10 +166,7 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
 
 def _status_lines(name: str, library: Library) -> Iterator[Line]:
     if name in words.STATUSES:
-        about = words.STATUSES[name]
-        yield "means", about.meaning
-        if about.why != about.meaning:
-            yield "in short", about.why
+        yield "means", words.status_meaning(name)
         yield "exit code", "3, since a solver failed" if name == "failed" else "0"
         yield "in files", "column status of runs.csv, counts in result.json"
 

@@ -3,62 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
-
-
-class StatusWords(NamedTuple):
-    """Words for the end of a run: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
-
-    short: str
-    why: str
-    meaning: str
-
 
 #: Phrases for a status that means something else in one model, by both names.
 VERDICTS = {("climb", "converged"): "have a verdict"}
-STATUSES: dict[str, StatusWords] = {
-    "converged": StatusWords("settled", "steady travel", "found a steady operating point"),
-    "stalled": StatusWords(
-        "stands",
-        "friction holds the robot, or the motors cannot turn the load",
-        "the robot does not move: static friction holds it, or the motors cannot turn the load and draw "
-        "their stall current",
-    ),
-    "slides": StatusWords(
-        "slides",
-        "traction demand above the adhesion limit",
-        "slope and rolling resistance demand more traction than the ground can give (demand above μ_s N), so the "
-        "tracks or wheels spin and the robot does not climb",
-    ),
-    "not_settled": StatusWords(
+#: Label and meaning of each end of a run.
+STATUSES: dict[str, tuple[str, str]] = {
+    "converged": ("settled", "found a steady operating point"),
+    "stalled": ("stands", "static friction holds the robot, or the motors cannot turn the load"),
+    "slides": ("slides", "traction demand above the adhesion limit μ_s N, so the tracks or wheels spin"),
+    "not_settled": (
         "not settled",
         "the robot still accelerates at the end of the run (try a longer --duration), or the turn has no steady "
         "state (use --model drive to simulate it over time)",
-        "the robot still accelerates at the end of the simulated time, or no steady state was found for the turn, "
-        "for example because friction falls with sliding speed",
     ),
-    "battery_empty": StatusWords("battery empty", "the battery is empty", "the battery's capacity is used up"),
-    "failed": StatusWords(
-        "failed", "the solver found no solution", "the solver found no solution. Please report the conditions"
-    ),
-    "tips": StatusWords(
+    "battery_empty": ("battery empty", "the battery's capacity is used up"),
+    "failed": ("failed", "the solver found no solution. Please report the conditions"),
+    "tips": (
         "tips over",
         "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
-        "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
     ),
-    "reverses": StatusWords(
-        "reverses", "steady travel backward", "found a steady operating point, travelling backward"
-    ),
-    "rolls_back": StatusWords(
+    "reverses": ("reverses", "found a steady operating point, travelling backward"),
+    "rolls_back": (
         "rolls back",
-        "gravity drives the robot downhill, against its motors or without voltage",
         "gravity drives the robot downhill at a steady speed, against its motors or without voltage",
     ),
-    "cut_off": StatusWords(
-        "cut off",
-        "a cell is below its cut-off voltage, so the battery switches off",
-        "the cells were below their cut-off voltage for longer than permitted, although charge was left",
-    ),
+    "cut_off": ("cut off", "the cells were below their cut-off voltage for longer than permitted"),
 }
 
 #: Files of a run folder other than its page.
@@ -72,7 +41,6 @@ FILES = {
     "feed_forward.csv": "voltage, current and losses by speed and torque",
     "feed_forward.h": "the same tables for C",
     "draws.npz": "samples from the posterior, for NumPy",
-    "draws.json": "the same samples as JSON",
     "LAW.md": "description of the drive law for readers who do not know mmrjax",
     "robot.toml": "the robot, for --robot of every command",
     "runs.csv": "every run, one row each",
@@ -218,17 +186,17 @@ NO_TURN = (
 
 def reason_without_value(outcome: str) -> str:
     """Reason why a quantity has no value, in one line."""
-    return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]
+    return OUTCOMES.get(outcome) or status_meaning(outcome)
 
 
 def short_status(status: str) -> str:
     """A status as figures show it."""
-    return STATUSES[status].short if status in STATUSES else status
+    return STATUSES.get(status, (status, ""))[0]
 
 
 def status_meaning(status: str) -> str:
     """A status for the reader of a report."""
-    return STATUSES[status].meaning if status in STATUSES else ""
+    return STATUSES.get(status, (status, ""))[1]
 
 
 _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}

@@ -25,7 +25,7 @@ from mmrjax.model.robot import Robot
 from sweeps.config_campaign import Campaign
 from sweeps.options import parse_axis
 from sweeps.points import imposed
-from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, JointDistribution, Samples, in_blocks
+from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, Samples, in_blocks
 from sweeps.points.tasks import task_of_configuration
 
 CONFIGURATION, SURFACE = "configuration", "surface"
@@ -298,7 +298,7 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     return Samples(design, number, seed, marginals, joint)
 
 
-def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> JointDistribution:
+def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Any:
     from calibration.data import posterior_file
 
     if not isinstance(stated, str):

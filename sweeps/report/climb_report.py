@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import Columns, Json, Names, robot_file
-from calibration.data.input_errors import BadConfiguration
+from calibration.data import Columns, Json, Names
 from calibration.data.robot_file import RobotFile
 from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbDerivatives, ClimbInputs, outputs_of_run
 from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, ClimbRuns
@@ -37,14 +32,10 @@ VERDICTS: dict[str, tuple[str, str]] = {
 }
 
 
-#: Columns of `history.csv` with the coordinates, and further columns that a film shows.
-COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
-FILMED = ("time_s", "traction_current_A")
-
-
 def footing_coordinates(table: Columns) -> np.ndarray:
     """Coordinates of `mmrjax.climbing.footing` at every sample of a history, shape (samples, 6)."""
-    x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
+    columns = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
+    x, z, pitch, shaft, front, rear = (table[name] for name in columns)
     angles = np.radians([-pitch, shaft, front, 180 - rear])
     return np.stack([x / 1000, z / 1000, *angles], axis=1)
 
@@ -69,38 +60,6 @@ class Along:
     def rows(self) -> list[tuple[str, str, float, float]]:
         """Name, unit, value and width of each variable."""
         return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
-
-
-@dataclasses.dataclass(frozen=True)
-class Seen:
-    """Drawn part of a `ClimbResult`, read from its run folder."""
-
-    robot: Robot
-    configuration: str
-    obstacle: str
-    terrain: Terrain
-    table: Columns
-
-    @staticmethod
-    def read(folder: Path) -> Seen:
-        """Reads a folder of `mmrjax climb`.
-
-        Raises:
-            BadConfiguration: it is no such folder.
-        """
-        try:
-            content = json.loads((folder / "result.json").read_text("utf-8"))
-            ground = content["terrain"]
-            with (folder / "history.csv").open(newline="", encoding="utf-8") as stream:
-                rows = list(csv.DictReader(stream))
-            table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *FILMED)}
-            lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
-            return Seen(
-                robot_file.find_robot_file(str(folder / "robot.toml")).robot,
-                content["configuration"], content["obstacle"], Terrain(*lengths), table,
-            )  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,22 +224,21 @@ def climb_document(found: ClimbResult, file: RobotFile) -> Document:
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (
         run_tables.note_on_robot(file, more=lead),
+        *[Note(f"{tried}.", terminal=True)] * bool(tried),
         catalogue.figure("climb.silhouettes", found),
         catalogue.figure("climb.course", found),
     )
-    if tried:
-        blocks = (*blocks, catalogue.figure("climb.search", found, finding=tried))
-    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found, tried)))
+    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found)))
 
 
-def _sections(found: ClimbResult, tried: str) -> Iterable[Section]:
+def _sections(found: ClimbResult) -> Iterable[Section]:
     numbers = [
         (name.rpartition("_")[0].replace("_most", ", largest").replace("_least", ", least").replace("_", " "), value,
          name.rpartition("_")[2])
         for name, value in found.numbers().items()
     ]  # fmt: skip
     of_run = catalogue.table("climb.run", numbers)
-    yield Section("The run in numbers", (of_run, *[Note(f"{tried}.", terminal=True)] * bool(tried)), "numbers")
+    yield Section("The run in numbers", (of_run,), "numbers")
     if found.margins:
         rows = [(n.removeprefix("margin_"), 100 * value, OUTPUTS[n][1]) for n, value in found.margins.items()]
         shares = catalogue.table("climb.shares", rows)

@@ -18,7 +18,6 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, blocks
 from calibration.inference.details import TimeStatistics
 from calibration.inference.fit_notes import Determination, remarks_with_codes
-from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from mmrjax.errors import count_noun
@@ -326,7 +325,6 @@ def _sections(
     heading = "Where the missing term acts" if missing else "What each equation lacks"
     yield Section(heading, tuple(_blocks_of_missing_terms(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
-    errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
     fits = {
         when: rms_by_channel
         for when, rms_by_channel in found.rms.items()
@@ -334,12 +332,10 @@ def _sections(
     }
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    error_blocks: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
-    error_blocks += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
-    yield Section("Errors on runs used in the fit, and on held-out runs", tuple(error_blocks))
+    error_blocks: tuple[Block, ...] = held_out_table(found), catalogue.note("loop.fitted_again"), *in_units
+    yield Section("Errors on runs used in the fit, and on held-out runs", error_blocks)
     yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
-    yield Section("", (catalogue.figure("loop.look_alikes", found),), folded="which effects are similar")
     yield from [looked_for] if missing else []
     yield Section("Parameters before and after", (_base(found),))
     first = {"row": table["row"]}
@@ -455,7 +451,6 @@ def _named(values: Mapping[str, float]) -> str:
 
 
 def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
-    yield catalogue.figure("loop.power", found)
     yield catalogue.note("loop.seen-above")
     level, rows = found.before.kinds["single"].threshold, []
     for s in found.scores:

@@ -50,7 +50,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy, linear_replicate
+from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate
 from calibration.inference.optimizers import (
     CORES,
     SAME,
@@ -834,18 +834,18 @@ class Histories(Observer):
         base_arguments = columns, weight, robot, None, ways
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments), *waves)
 
-    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
+    def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> TimeStatistics:
         names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
-        def strongest(diagnosis: Diagnosis, variable: str) -> StrongestWave | None:
+        def strongest(diagnosis: Any, variable: str) -> StrongestWave | None:
             same_variable = [k for k, n in enumerate(names) if n[1] == variable]
             if not same_variable:
                 return None
             k = max(same_variable, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
             return StrongestWave(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
-        def statistics_of_fit(diagnosis: Diagnosis) -> FitOverTime:
+        def statistics_of_fit(diagnosis: Any) -> FitOverTime:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
             test = diagnosis.test
             x = np.asarray(diagnosis.linear.series())
