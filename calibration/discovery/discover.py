@@ -39,7 +39,7 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.log_simulation import LogSimulation, simulate_models
+from calibration.discovery.log_simulation import LogSimulation, refine_by_simulation, simulate_models
 from calibration.discovery.loop_notes import (
     AlternativeValue,
     Mechanism,
@@ -249,6 +249,7 @@ class LoopInput:
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
     equations: CandidateSpace | None = None
+    confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -265,9 +266,11 @@ class LoopInput:
         """
         if (by_windows := self.trace_windows()) is not None:
             return by_windows
-        if self.known is not None and isinstance(self.known.screened.base.space.bare.observe, LinearHistories):
+        of_readings = self.known is not None and self.known.screened.base.space.bare.observe
+        if self.known is not None and self.known.run is not None and isinstance(of_readings, LinearHistories):
             equations = self.known.screened.base.space.with_sd(self.noise.sd)
-            traced = dataclasses.replace(self, equations=equations, known=None).trace()
+            confirm = functools.partial(_smallest_confirmed, self.known.run.space, self.settings)
+            traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
             run = self.known.run
             refuted = run is not None and run.contradicts and traced.verdict != "none"
             return dataclasses.replace(traced, verdict="place") if refuted else traced
@@ -282,6 +285,8 @@ class LoopInput:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
                 word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
+            if self.confirm is not None:
+                searched = self.confirm(screened, diagnosis, searched, sds.noise)
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
 
     def trace_windows(self) -> LoopStages | None:
@@ -769,14 +774,20 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
             return None if ranked else given.keep(name, make)
         return given.keep(f"readings {name}", make)
 
-    table = dataclasses.replace(given, equations=equations, noise=sds.noise, known=None, keep=keep)
+    confirm = functools.partial(_smallest_confirmed, space, settings)
+    table = dataclasses.replace(
+        given, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
+    )  # fmt: skip
     traced = table.trace()
     if not traced.sds.factors:
-        traced = dataclasses.replace(traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks))
+        traced = dataclasses.replace(
+            traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
+        )
     linear = traced.screened.base
     space = space.with_sd(traced.sds.noise.sd).with_weights(linear.space.weight)
     given.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
+    space = space if traced.searched is None else space.with_room(traced.searched.room)
     run = simulate_models(space, linear.candidate, best, settings)
     traced = dataclasses.replace(traced, run=run)
     if traced.searched is None:
@@ -787,6 +798,38 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
         none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
         return LoopStages("none", traced.screened, left, traced.sds, run=none)
     return _lower_if_contradicted(table, traced)
+
+
+def _smallest_confirmed(
+    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
+    noise: Noise,
+) -> SearchResult:  # fmt: skip
+    """The search with the smallest set whose simulation leaves no discrepancy, or the largest set, and the diagnosis
+    of its simulation.
+
+    Readings are linear near the fit of the base only. A large effect therefore leaves residuals that another one
+    would explain.
+
+    Args:
+        space: space of the simulated log.
+        screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
+        noise: noise of the readings.
+    """
+    if searched.best is None or searched.diagnosis is None:
+        return searched
+    if len(searched.best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
+        return searched
+    sets = best_of_each_size(searched)
+    space = space.with_sd(noise.sd).with_weights(screened.base.space.weight)
+    space = space.with_room([name for c in sets for name in c.effects])
+    searched = dataclasses.replace(searched, room=space.room)
+    for c in sets:
+        fitted = refine_by_simulation(space, c, [c.z], settings)
+        diagnosis = diagnose_candidate(space, fitted, screened.bases, left.test.null, settings)
+        searched = dataclasses.replace(searched, best=c, diagnosis=diagnosis)
+        if not diagnosis.test.rejected_with_margin:
+            break
+    return searched
 
 
 def _chosen_fit(traced: LoopStages) -> Candidate:

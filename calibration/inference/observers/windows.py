@@ -303,9 +303,7 @@ def grid_of_effects(effects: tuple[ScoredEffect, ...]) -> tuple[Array, Array]:
     return jnp.asarray(index), jnp.asarray(np.stack([np.concatenate(x) for x in (before, grid, after)]))
 
 
-def problem_of_readings(
-    problem: Problem, z: np.ndarray, effects: tuple[ScoredEffect, ...], width: float
-) -> Problem:
+def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEffect, ...], width: float) -> Problem:
     """Problem of a log whose readings are linear about a fit of its base.
 
     Args:
