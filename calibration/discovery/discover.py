@@ -120,6 +120,8 @@ FAR = 3.0
 LONG = 4000
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
+#: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
+RIVALS = 3
 #: Callback for progress notes.
 Tell = Callable[[Remark | str], None]
 
@@ -815,18 +817,20 @@ def _smallest_confirmed(
         screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
         noise: noise of the readings.
     """
-    if searched.best is None or searched.diagnosis is None:
+    best = searched.best
+    if best is None or searched.diagnosis is None:
         return searched
-    if len(searched.best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
+    if len(best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
         return searched
-    sets = best_of_each_size(searched)
+    alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
+    sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
     space = space.with_sd(noise.sd).with_weights(screened.base.space.weight)
-    space = space.with_room([name for c in sets for name in c.effects])
-    searched = dataclasses.replace(searched, room=space.room)
-    for c in sets:
-        fitted = refine_by_simulation(space, c, [c.z], settings)
-        diagnosis = diagnose_candidate(space, fitted, screened.bases, left.test.null, settings)
-        searched = dataclasses.replace(searched, best=c, diagnosis=diagnosis)
+    space = space.with_room([name for sets in sizes for c in sets for name in c.effects])
+    for sets in filter(None, sizes):
+        fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
+        k = min(range(len(fits)), key=lambda k: fits[k].cost)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings)
+        searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
         if not diagnosis.test.rejected_with_margin:
             break
     return searched
