@@ -66,6 +66,7 @@ from calibration.discovery.result import (
     FoundEffect,
     HeldOutAlternative,
     NoiseVerdict,
+    ParameterShift,
     ReadingsOfRows,
 )
 from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
@@ -88,8 +89,9 @@ from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.windows import LinearHistories, problem_of_readings, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
+from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
-from calibration.inference.weak_form import fit_weak_form
+from calibration.inference.weak_form import TENTH, fit_weak_form
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -104,8 +106,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Size of a delay in its sds from which a note reports it.
-LATE = 4.0
+#: Size of a delay in its sds from which a note reports it, and as a share of the longest that is searched.
+LATE, ENDS = 4.0, 0.95
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
@@ -176,7 +178,9 @@ def discover(
     told, known = dataclasses.replace(ready, progress=tell, keep=keep), ready.noise
     for note in ready.at_first:
         tell(note)
-    traced, notes = keep("verdict", lambda: told.trace(ahead=True)), ready.notes
+    traced = keep("verdict", lambda: told.trace(ahead=True))
+    refuted = remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
+    notes: Notes = tuple(n for n in ready.notes if n not in refuted)
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
@@ -285,7 +289,9 @@ class LoopInput:
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
-                word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
+                # A rigid base that leaves only noise refutes a backlash.
+                loose = self.shows_unmodelled_backlash and diagnosis.test.rejected
+                word = "undescribed" if missed or loose else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
             if self.confirm is not None:
                 searched = self.confirm(screened, diagnosis, searched, sds.noise)
@@ -370,8 +376,11 @@ def prepare_loop(
     for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
-    notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
+    unshown = missing_states_remarks(distinct, ready.robot)
+    at_first = (*ready.foreign, *ready.doubted, *unshown, *remarks_with_codes(ready.checked, "lost_motion"))
+    notes_so_far: Notes = (
+        *notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted, *unshown
+    )  # fmt: skip
     output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
@@ -384,6 +393,13 @@ def prepare_loop(
     return LoopInput(
         distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, notes_so_far, at_first
     )
+
+
+def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
+    """Remark on a log that does not show the states of its equations."""
+    read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
+    plan = state_plan_or_reason(robot, read) if read else None
+    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -865,10 +881,17 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
 
     None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
     gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
-    level.
+    level. No effect is named if the simulation misses a channel.
     """
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+
+    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
+        return LoopStages("undescribed", screened, left, traced.sds, searched, beside=beside, run=traced.run,
+                          predicted=traced.predicted, missed=missed, unused=unused_inputs(given.runs))  # fmt: skip
+
     if given.known is not None:  # only the noise differs
+        if given.known.verdict == "undescribed":
+            return undescribed(given.known.missed)
         refuted = given.known.run is not None and given.known.run.contradicts
         return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
     if searched is None or beside is None or given.shows_unmodelled_backlash:
@@ -880,7 +903,10 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
         return None
-    return _lower_if_contradicted(windows, dataclasses.replace(traced, run=run))
+    traced = dataclasses.replace(traced, run=run)
+    linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
+    refit, fit = (missed_channels(run.space, given.runs, given.noise, x) for x in linear)
+    return undescribed(refit) if fit else _lower_if_contradicted(windows, traced)
 
 
 # --- stages without a module of their own ---------------------------------------------------------------
@@ -998,12 +1024,6 @@ def diagnose_base_by_bootstrap(
     return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 
 
-def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
-    """Number of rows after which a table repeats itself exactly, or all of its rows."""
-    rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
-    return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
-
-
 def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     """Runs without exact copies, their row numbers, and remarks on the copies.
 
@@ -1020,7 +1040,9 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
             (copies if row in seen_columns else keep).append(k)
             seen_columns.add(row)
     else:
-        first_rows = _rows_until_repeat(columns)
+        rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
+        # rows after which the table repeats itself exactly, or all of its rows
+        first_rows = next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
         keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
@@ -1334,8 +1356,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
     delay = found.base_shift.get(priors.DELAY)
-    if delay is not None and priors.DELAY not in found.robot.rig.stated and abs(delay.after) > LATE * delay.sd_after:
-        remarks.append(Remark("late", delay=delay.after, sd=delay.sd_after))
+    remarks += delay_remarks(found.runs, delay, priors.DELAY in found.robot.rig.stated) if delay is not None else []
     if found.remains is not None:
         remarks.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
     names = [e.name for e in found.effects]
@@ -1351,6 +1372,15 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if 1 / (1 + settled) > min(found.settings.shares.values()):
         remarks.append(Remark("too_few_replicates", settled=settled))
     return tuple(remarks)
+
+
+def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remark]:
+    """Remark on a delay that the robot's file does not state, or that is the longest of the search."""
+    limit = TENTH * float(np.median([runs["time_s"][rows].max() for rows in runs.rows_by_run().values()]))
+    ends = abs(delay.after) > ENDS * limit
+    if abs(delay.after) <= LATE * delay.sd_after or (stated and not ends):
+        return []
+    return [Remark("late", delay=delay.after, sd=delay.sd_after, ends=ends)]
 
 
 def _repeat_run_remark(found: DiscoveryResult, test: NameTest) -> Remark:

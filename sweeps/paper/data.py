@@ -224,14 +224,12 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 # --- runs ---------------------------------------------------------------------------------------------
 
 
-def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[StartRun]:
+def simulate_starts(robot: Robot) -> list[StartRun]:
     """Starts from standstill on the flat with `drive`, for each of the paper's configurations."""
     from mmrjax.fidelities.drive import drive_batch
 
-    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    run = drive_batch(
-        robot, batch_conditions(robot, shown_configurations(robot), voltage=voltage), jnp.asarray(times)
-    )
+    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, 1.5, 440)[1:]])
+    run = drive_batch(robot, batch_conditions(robot, shown_configurations(robot), voltage=33.0), jnp.asarray(times))
     return starts_from_standstill(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
 
 

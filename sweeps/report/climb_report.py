@@ -62,6 +62,13 @@ class Along:
         return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
 
 
+#: Columns of a run whose largest size is reported, with their units.
+_LARGEST = (
+    ("traction_current", "A"), ("front_current", "A"), ("rear_current", "A"), ("front_torque", "Nm"),
+    ("rear_torque", "Nm"), ("front_voltage", "V"), ("rear_voltage", "V"),
+)  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True)
 class ClimbResult:
     """Result of `climb`.
@@ -181,13 +188,7 @@ class ClimbResult:
             "pitch_most_deg": float(t["pitch_deg"].max()),
             "pitch_least_deg": float(t["pitch_deg"].min()),
             "margin_least_mm": float(np.fmin.reduce(t["margin_mm"])),
-            "traction_current_most_A": float(np.abs(t["traction_current_A"]).max()),
-            "front_current_most_A": float(np.abs(t["front_current_A"]).max()),
-            "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
-            "front_torque_most_Nm": float(np.abs(t["front_torque_Nm"]).max()),
-            "rear_torque_most_Nm": float(np.abs(t["rear_torque_Nm"]).max()),
-            "front_voltage_most_V": float(np.abs(t["front_voltage_V"]).max()),
-            "rear_voltage_most_V": float(np.abs(t["rear_voltage_V"]).max()),
+            **{f"{name}_most_{unit}": float(np.abs(t[f"{name}_{unit}"]).max()) for name, unit in _LARGEST},
             "energy_levers_J": levers,
             "energy_J": tracks + levers,
         }

@@ -229,11 +229,12 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
             alike = ", ".join(bases.place_in_words(b) for b in e["balances_alike"] if b != e["balance"])
             rows.append((e["name"], kinds, place, plot_words, "-", lowers, e["p_value"], "a curve", alike))
             continue
+        reason = loop_words.tentative_reason(found, effect)
         rows.append(
             (
-                loop_words.effect_called(found, effect), kinds, place, e["equation"] or plot_words,
+                f"{e['name']}\n({reason})" if reason else e["name"], kinds, place, e["equation"] or plot_words,
                 loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
-                loop_words.tentative_reason(found, effect) or e["standing"],
+                reason or e["standing"],
                 loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
             )
         )  # fmt: skip
@@ -337,7 +338,16 @@ def _sections(
     yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     yield from [looked_for] if missing else []
-    yield Section("Parameters before and after", (_base(found),))
+    rows = [
+        (
+            f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
+            fit_tables.shift_cell(p.shift_after),
+            describe(Determination.from_pairs(name, p.held_by_prior, found.together)),
+            p.at_bound or "", p.meaning,
+        )
+        for name, p in found.base_shift.items()
+    ]  # fmt: skip
+    yield Section("Parameters before and after", (catalogue.table("loop.base", rows),))
     first = {"row": table["row"]}
     if isinstance(found.detail, TimeStatistics):
         first |= {"run": table.get("run_id", table["row"]), "t [s]": table["time_s"]}
@@ -465,16 +475,3 @@ def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
     }  # fmt: skip
     texts = (catalogue.text(f"loop.{key}", ", ".join(names)) for key, names in unseen.items() if names)
     yield Note("".join(texts), name="unseen")
-
-
-def _base(found: DiscoveryResult) -> Table:
-    rows = [
-        (
-            f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
-            fit_tables.shift_cell(p.shift_after),
-            describe(Determination.from_pairs(name, p.held_by_prior, found.together)),
-            p.at_bound or "", p.meaning,
-        )
-        for name, p in found.base_shift.items()
-    ]  # fmt: skip
-    return catalogue.table("loop.base", rows)

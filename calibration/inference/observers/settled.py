@@ -399,12 +399,12 @@ def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[st
     fitted = {
         v: np.asarray(x, float) for v, x in zip(unmeasured, _signals(observe, robot, tuple(unmeasured)), strict=True)
     }
-    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all() and _size_varies(np.abs(x))}
-
-
-def _size_varies(x: np.ndarray) -> bool:
-    """True if sizes differ by more than `VARIES` of the largest, unlike a current that only friction needs."""
-    return bool(np.ptp(x) > VARIES * np.max(x))
+    # A current that only friction needs varies less.
+    return {
+        bases_room.VARIABLES[v]: x
+        for v, x in fitted.items()
+        if np.isfinite(x).all() and np.ptp(np.abs(x)) > VARIES * np.max(np.abs(x))
+    }
 
 
 @functools.partial(compiled, options=SELDOM)

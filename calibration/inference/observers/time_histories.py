@@ -459,21 +459,12 @@ class Histories(Observer):
     def free(cls) -> tuple[Names, Names]:
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
-    def response_to_errors(
-        self, robot: Robot, probes: tuple[Effect, ...]
-    ) -> Float[Array, "probes runs knots samples channels"]:
-        """Change of the readings by an error of the balance of each probe [unit of the balance]. A probe has
-        amplitude 1.
-
-        The error is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
-        """
-        return self.changes(robot, probes, ())[0]
-
     def changes(
         self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
-        """Changes of the readings by errors of balances, as in `response_to_errors`, and by each effect at each point
-        of its grid.
+        """Changes of the readings by an error of the balance of each probe [unit of the balance], and by each effect
+        at each point of its grid. A probe has amplitude 1. The error is 1 at a knot of a run and falls linearly to 0
+        at the neighbouring knots.
 
         An effect with one amplitude enters one balance. So it changes a run as an error of that balance would, with
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
