@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -146,17 +146,12 @@ class CandidateSpace:
         equipped: problem of the base and the effects in the slots.
         library: effects that the slots can hold.
         room: names of the effects that the compiled fits of time histories include, see `problem_for_sets`.
-        near: coordinates of earlier fits of the same histories with other sds, by their effects. Fits then start
-            there and take a few steps, and none has effects beyond `room`.
-        begins: start of the first set of effects, from the log's equations in weak form, by its effects.
     """
 
     bare: Problem
     equipped: Problem
     library: ScoredLibrary
     room: Names = ()
-    near: Mapping[Names, np.ndarray] = dataclasses.field(default_factory=dict)
-    begins: Mapping[Names, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def coordinates(self) -> ActiveSet:

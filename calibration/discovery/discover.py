@@ -54,7 +54,6 @@ from calibration.discovery.mechanism import cached_hold_out_score, excess_misfit
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
-    screen_known_rows,
     screen_outliers,
     screen_with_effects,
 )
@@ -70,7 +69,7 @@ from calibration.discovery.result import (
     ReadingsOfRows,
 )
 from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
-from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
+from calibration.discovery.screening import screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import judge_names
@@ -264,8 +263,7 @@ class LoopInput:
         With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
 
         If results with other sds are `known` for the same included rows, their bootstrap replicates are reused: in
-        units of the sds, the statistics hardly depend on the sds. Fits of time histories then take a few Gauss-Newton
-        steps from the known fits. No new sets of effects are compiled and no further row is excluded.
+        units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
 
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
@@ -321,27 +319,21 @@ class LoopInput:
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
-        For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
-        is appended to `ranked`, unless effects would only stand in for a backlash.
+        For logs, the equations in weak form give the start of the fit. Their ranking of the library is appended to
+        `ranked`, unless effects would only stand in for a backlash.
         """
         space = self.equations or _space_of(self, noise)
-        known, at = self.known, functools.partial(bases_at_fit, self.runs)
-        near = None
-        if before is not None:
-            space, near = space.with_room(before.space.room), before.candidate
-        else:
+        at = functools.partial(bases_at_fit, self.runs)
+        near = None if before is None else before.candidate
+        if before is None:
             if (ranking := screen_by_weak_form(space, self.settings)) is not None:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 if not self.shows_unmodelled_backlash:
                     ranked.append(self.keep("ranking", make))
-                near = ranking.base
+                near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
         self.progress(progress_remark("base"))
-        if known is not None and space.bare.observe.long:  # the same rows are included here
-            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            base = fit_base(space, self.settings, self.runs.source, near)
-            return screen_known_rows(base, at, known.screened, self.settings)
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
@@ -480,12 +472,6 @@ class LoopStages:
         return () if self.where is None else (self.where.family,)
 
     @property
-    def simulated(self) -> dict[Names, np.ndarray]:
-        """Coordinates of each fit by simulation, by its effects."""
-        all_candidates = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
-        return {c.active: c.z for c in reversed(all_candidates) if c.simulated and np.isfinite(c.cost)}
-
-    @property
     def best(self) -> Candidate:
         """Proposed candidate: the base fit if no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
@@ -526,10 +512,7 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
         if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
         else known_stages.left.test.null
     )
-    base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
-    screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
-    if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+    if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
         for begin in given.later:
             begin(screened.base)
     return screened, diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
@@ -541,8 +524,7 @@ def _search_effects(
     """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
-    base = dataclasses.replace(base, space=base.space.with_room(searched.room))
-    return dataclasses.replace(screened, base=base), left, searched
+    return screened, left, searched
 
 
 def _search_until_clean(
@@ -564,9 +546,7 @@ def _search_until_clean(
             f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
         )
         after = searched.diagnosis
-        if after is None and (confirmed := _confirm_gains(screened, diagnosis, searched)) is not None:
-            return screened, confirmed, None
-        if after is None or not after.test.rejected_with_margin or screened.base.space.near:
+        if after is None or not after.test.rejected_with_margin:
             break
         more = screen_with_effects(
             screened, after.scores, lambda base: bases_at_fit(given.runs, base), given.runs, settings
@@ -576,23 +556,6 @@ def _search_until_clean(
         progress(progress_remark("alone"))
         screened = more
     return screened, diagnosis, searched
-
-
-def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
-    """Diagnosis of the base fit of a log after simulations of the strongest effects.
-
-    Scores are linear but the contact of a vehicle is not, so a significant score may vanish in a simulation. None if
-    the base is rejected with the simulated gains too.
-    """
-    space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
-    gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}
-    best = {name: abs(float(scores[space.library.best_instance(name, scores)])) for name in space.library.names}
-    promising = {(name,) for name, score in best.items() if score > test.threshold("single")}
-    simulated = bool(promising) and promising <= gains.keys()
-    if not (simulated and space.bare.observe.long) or screened.cluster is not None:
-        return None
-    confirmed = test.confirmed(max(0.0, *gains.values()))
-    return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
 def _reach_verdict(
@@ -690,7 +653,7 @@ def choose_effects(
         predicted: cache of hold-out predictions of fits. This function adds to it.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
+    best, after = searched.best, searched.diagnosis
     if best is None or after is None:
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
@@ -699,13 +662,11 @@ def choose_effects(
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
     )
-    stood = support_of() if adequate or long else None
+    stood = support_of() if adequate else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
-    few = None
-    if not (long and stood is not None and stood.stands):  # refits of histories take long
-        progress(progress_remark("held out"))
-        few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
+    progress(progress_remark("held out"))
+    few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
         proposed = (
@@ -722,8 +683,7 @@ def choose_effects(
     names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    simulated_fits = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
-    fits_of_names = [c for c in simulated_fits if c.key == frozenset(names)]
+    fits_of_names = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
     if not fits_of_names:
         active = fill_slots(names, settings)
         begins = start_of_fit(space, proposed[0], active, settings, left.scores)
@@ -1052,8 +1012,7 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
 def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
     """Verdict and summary at another noise level."""
     adequate = not traced.ends.test.rejected_with_margin
-    near = bool(traced.screened.base.space.near)
-    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
+    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate)
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
