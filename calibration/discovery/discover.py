@@ -282,7 +282,7 @@ class LoopInput:
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
-            if screened.base.space.bare.observe.long and not self.shows_unmodelled_backlash:
+            if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
                 return _trace_readings(self, screened, sds, bool(ranked))
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
