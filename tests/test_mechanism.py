@@ -64,7 +64,7 @@ def found(monkeypatch):
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
     monkeypatch.setattr(room, "cached_hold_out_score", lambda *_: score)
-    monkeypatch.setattr(room, "_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room.prediction, "score_predictions", lambda *_: score)
     monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)

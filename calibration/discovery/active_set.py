@@ -177,10 +177,6 @@ class CandidateSpace:
         """Copy in which some rows (a mask or indices) are ignored."""
         weight = self.weight.copy()
         weight[rows] = 0.0
-        return self.with_weights(weight)
-
-    def with_weights(self, weight: np.ndarray) -> CandidateSpace:
-        """Copy with these weights of the readings, shape (rows, channels)."""
 
         def with_weight(problem: Problem) -> Problem:
             return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=jnp.asarray(weight)))

@@ -701,7 +701,7 @@ def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
     return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
 
 
-def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
+def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states.
 
     Args:
@@ -1306,7 +1306,6 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     undetermined = tuple(name for name in undetermined_names(found.held_by_prior, found.together) if name not in far)
     remarks += [Remark("held_by_prior", names=undetermined)] * bool(undetermined)
     remarks += [Remark("only_together", pairs=found.together)] * bool(found.together)
-    remarks += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
     remarks += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
     after = found.readings_of_rows.after if found.written else found.readings_of_rows.before
     off = np.where(found.included[:, None], after - found.readings_of_rows.measured, np.nan)

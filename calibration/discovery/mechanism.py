@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data import Columns, Names
+from calibration.data import Names
 from calibration.data.runs import Runs
 from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
@@ -250,7 +250,7 @@ def _hold_out_gain_of_curve(
         for kind, blocks_by_name in kinds.items()
     }
     changed = _changed_readings(space, runs, _simulated_reading(space, base), curve.reading)
-    score = _hold_out_score(space, runs, predictions)
+    score = prediction.score_predictions(space, runs, predictions)
     in_seen_range = {
         kind: _within_seen_range(space, beside, list(blocks_by_name.values()))
         for kind, blocks_by_name in kinds.items()
@@ -287,16 +287,10 @@ def cached_hold_out_score(
     """Hold-out scores of a candidate. Its predictions come from `predicted` or are added to it."""
     prediction_before = predicted.get(prediction.candidate_key(candidate))
     if prediction_before is not None:
-        return _hold_out_score(space, runs, prediction_before)
+        return prediction.score_predictions(space, runs, prediction_before)
     score = prediction.score_candidate(space, runs, candidate)
     predicted[prediction.candidate_key(candidate)] = score.reading
     return score
-
-
-def _hold_out_score(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
-    data, rows = space.equipped.data, len(runs)
-    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
-    return prediction.score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
 
 
 def _simulated_reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
