@@ -310,7 +310,7 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen,
     rest = iter(remain)
     monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: diagnosis(next(rest)))
     space = SimpleNamespace(room=())
-    space.with_sd = space.with_weights = space.with_room = lambda *_: space
+    space.with_noise = space.with_room = lambda *_: space
     screened = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(weight=None)), bases=())
     searched = search.SearchResult(tuple(ladder), ladder[2], diagnosis(False))
     noise = SimpleNamespace(sd=None)

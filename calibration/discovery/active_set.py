@@ -177,21 +177,22 @@ class CandidateSpace:
         """Copy in which some rows (a mask or indices) are ignored."""
         weight = self.weight.copy()
         weight[rows] = 0.0
+        return self.with_noise(None, weight)
 
-        def with_weight(problem: Problem) -> Problem:
-            return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=jnp.asarray(weight)))
+    def with_noise(self, sd: np.ndarray | None, weight: np.ndarray) -> CandidateSpace:
+        """Copy with these standard deviations [SI] and weights of the readings, shape (rows, channels).
 
-        return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
+        Args:
+            sd: None to keep those of the problem. Values of missing readings have no meaning.
+        """
 
-    def with_sd(self, sd: np.ndarray) -> CandidateSpace:
-        """Copy with these standard deviations of the readings [SI], shape (rows, channels)."""
+        def with_data(problem: Problem) -> Problem:
+            known = np.asarray(problem.data.sd)
+            new = known if sd is None else np.where(np.isfinite(sd) & (sd > 0), sd, known)
+            data = dataclasses.replace(problem.data, sd=jnp.asarray(new), weight=jnp.asarray(weight))
+            return dataclasses.replace(problem, data=data)
 
-        def problem_with_sd(problem: Problem) -> Problem:
-            present = np.isfinite(sd) & (sd > 0)
-            own = np.where(present, sd, np.asarray(problem.data.sd))
-            return dataclasses.replace(problem, data=dataclasses.replace(problem.data, sd=jnp.asarray(own)))
-
-        return dataclasses.replace(self, bare=problem_with_sd(self.bare), equipped=problem_with_sd(self.equipped))
+        return dataclasses.replace(self, bare=with_data(self.bare), equipped=with_data(self.equipped))
 
     def with_room(self, names: Sequence[str]) -> CandidateSpace:
         """Copy whose compiled fits of time histories include these effects."""

@@ -86,7 +86,7 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import LinearHistories, problem_of_readings, problem_of_windows
+from calibration.inference.observers.windows import problem_of_readings, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -268,16 +268,8 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
-        if (by_windows := self.trace_windows()) is not None:
-            return by_windows
-        of_readings = self.known is not None and self.known.screened.base.space.bare.observe
-        if self.known is not None and self.known.run is not None and isinstance(of_readings, LinearHistories):
-            equations = self.known.screened.base.space.with_sd(self.noise.sd)
-            confirm = functools.partial(_smallest_confirmed, self.known.run.space, self.settings)
-            traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
-            run = self.known.run
-            refuted = run is not None and run.contradicts and traced.verdict != "none"
-            return dataclasses.replace(traced, verdict="place") if refuted else traced
+        if (of_log := self.trace_known_readings() or self.trace_windows()) is not None:
+            return of_log
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
@@ -294,6 +286,18 @@ class LoopInput:
             if self.confirm is not None:
                 searched = self.confirm(screened, diagnosis, searched, sds.noise)
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
+
+    def trace_known_readings(self) -> LoopStages | None:
+        """Stages of the known linear readings of a log with other noise. None for other tables."""
+        known = self.known
+        if known is None or (run := known.run) is None or not known.screened.base.space.bare.observe.reads:
+            return None
+        space = known.screened.base.space
+        equations = space.with_noise(self.noise.sd, space.weight)
+        confirm = functools.partial(_smallest_confirmed, run.space, self.settings)
+        traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
+        refuted = run.contradicts and traced.verdict != "none"
+        return dataclasses.replace(traced, verdict="place") if refuted else traced
 
     def trace_windows(self) -> LoopStages | None:
         """Stages of the windows of a log with a long run. None without a finding, which a simulation may still
@@ -741,7 +745,7 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     space, settings, measured = screened.base.space, given.settings, given.runs.measured()
     weight = space.weight.copy()
     weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
-    problem = space.with_weights(weight).bare
+    problem = space.with_noise(None, weight).bare
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
     equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
@@ -762,7 +766,7 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
             traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
         )
     linear = traced.screened.base
-    space = space.with_sd(traced.sds.noise.sd).with_weights(linear.space.weight)
+    space = space.with_noise(traced.sds.noise.sd, linear.space.weight)
     given.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
     space = space if traced.searched is None else space.with_room(traced.searched.room)
@@ -800,7 +804,7 @@ def _smallest_confirmed(
         return searched
     alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
     sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
-    space = space.with_sd(noise.sd).with_weights(screened.base.space.weight)
+    space = space.with_noise(noise.sd, screened.base.space.weight)
     space = space.with_room([name for sets in sizes for c in sets for name in c.effects])
     for sets in filter(None, sizes):
         fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
