@@ -249,8 +249,7 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
         f"with {' and with '.join(factors)} times the noise, the verdict is {words}"
         for words, factors in same.items()
     ]
-    near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
-    return ", and ".join(answers) + near
+    return ", and ".join(answers)
 
 
 def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
