@@ -338,7 +338,8 @@ class LoopInput:
                 near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
-        self.progress(progress_remark("base"))
+        if self.equations is None or not space.bare.observe.reads:  # linear readings have a fit
+            self.progress(progress_remark("base"))
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
