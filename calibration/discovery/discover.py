@@ -86,7 +86,8 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import problem_of_readings, problem_of_windows
+from calibration.inference.observers.linear_rows import problem_of_readings
+from calibration.inference.observers.windows import problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -337,7 +338,8 @@ class LoopInput:
                 near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
-        self.progress(progress_remark("base"))
+        if self.equations is None or not space.bare.observe.reads:  # linear readings have a fit
+            self.progress(progress_remark("base"))
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
