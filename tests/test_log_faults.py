@@ -92,8 +92,8 @@ def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, ma
 
 
 @pytest.mark.parametrize(("delay", "stated", "words"), [
-    (0.149, True, "the longest delay that is searched"), (-0.149, False, "earlier than its column states, the longest"),
-    (0.1, False, "To start the fit from this delay"), (0.1, True, ""), (0.003, False, ""),
+    (0.149, True, "searched up to a tenth of a run"), (-0.2, False, "earlier than its column states, and the equations"),
+    (0.1, False, "the rig file gives no delay. To start"), (0.1, True, ""), (0.003, False, ""),
 ])  # fmt: skip
 def test_a_delay_at_the_end_of_its_search_is_reported(robot, delay, stated, words):
     runs = Runs("log.csv", motor()).of(robot)
