@@ -1257,7 +1257,6 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
             remarks.append(_repeat_run_remark(found, t))
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
-    remarks += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
     settled, replicates_asked = found.replicates, found.settings.replicates
     if settled < 0.9 * replicates_asked:
         remarks.append(Remark("lost_replicates", settled=settled, asked=replicates_asked))
