@@ -106,8 +106,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Size of a delay in its sds from which a note reports it, and as a share of the longest that is searched.
-LATE, ENDS = 4.0, 0.95
+#: Size of a delay in its sds from which a note reports it, and as a share of the longest in the equations.
+LATE, ENDS = 4.0, 0.9
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
@@ -1336,7 +1336,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
 
 
 def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remark]:
-    """Remark on a delay that the robot's file does not state, or that is the longest of the search."""
+    """Remark on a delay that the robot's file does not state, or that is as long as the search of the equations."""
     limit = TENTH * float(np.median([runs["time_s"][rows].max() for rows in runs.rows_by_run().values()]))
     ends = abs(delay.after) > ENDS * limit
     if abs(delay.after) <= LATE * delay.sd_after or (stated and not ends):
