@@ -77,6 +77,8 @@ def work(task: Task) -> dict:
         return {"skipped": case}
     given, found, line = looped(case, task)
     line["intervals"] = intervals(found, case)
+    line["strongest"] = strongest(found)
+    line["simulated"] = None if found.run is None else [found.run.promised, found.run.gained]
     if not task.brief:
         from calibration.data import robot_file
         from calibration.discovery.discover import assemble_result
@@ -98,6 +100,12 @@ def intervals(found, case: logs.Case) -> list[bool]:
     low, high = (np.asarray(every.value(z + side * 1.96 * sd)) for side in (-1, 1))
     truth = {logs.PUBLIC[name]: x for name, x in case.label["constants"].items()}
     return [bool(a <= truth[n] <= b) for n, a, b in zip(every.names, low, high, strict=True) if n in truth]
+
+
+def strongest(found) -> dict[str, float]:
+    """Largest score of each effect on the base fit [σ]."""
+    library, scores = found.screened.base.space.library, np.abs(np.asarray(found.left.scores.single))
+    return {n: round(float(library.largest(scores)[k]), 2) for k, n in enumerate(library.names)}
 
 
 def held_out(whole, case: logs.Case) -> dict:

@@ -84,7 +84,6 @@ from calibration.inference.fit_notes import Notes, Remark, progress_remark, rema
 from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
-from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.windows import problem_of_windows
@@ -278,12 +277,10 @@ class LoopInput:
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
 
     def trace_windows(self) -> LoopStages | None:
-        """Stages of the windows of a log with a long run. None without a finding, which a simulation may still
-        make.
-        """
+        """Stages of the windows of a log with a long run. None if the log does not show its states."""
         if self.equations is not None or (self.known is not None and self.known.run is None):
             return None
-        if self.shows_unmodelled_backlash or (equations := equations_of_log(self, LONG)) is None:
+        if (equations := equations_of_log(self, LONG)) is None:
             return None
 
         def keep(name: str, make: Callable[[], Any]) -> Any:
@@ -294,9 +291,16 @@ class LoopInput:
         return _confirm_by_simulation(self, equations, equations.trace())
 
     @functools.cached_property
+    def space(self) -> CandidateSpace:
+        """Candidate space of the runs."""
+        return build_candidate_space(
+            self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library
+        )
+
+    @property
     def shows_unmodelled_backlash(self) -> bool:
         """True if the log shows backlash but the robot has none."""
-        return bool(lost_motion_notes(self.runs, self.robot))
+        return bool(remarks_with_codes(self.at_first, "lost_motion"))
 
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
@@ -304,7 +308,8 @@ class LoopInput:
         For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
         is appended to `ranked`, unless effects would only stand in for a backlash.
         """
-        space = self.equations or _space_of(self, noise)
+        same = noise is self.noise
+        space = self.equations or (self if same else dataclasses.replace(self, noise=noise)).space
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         near = None
         if before is not None:
@@ -734,62 +739,65 @@ def choose_effects(
     )
 
 
-def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
-    return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
-
-
 def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states.
+
+    Windows use every row of a log, and only simulations use fewer.
 
     Args:
         fewest: fewest steps of the longest run.
     """
-    space = _space_of(given, given.noise)
+    space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < fewest:
         return None
-    fit = fit_weak_form(space.bare, space.library.scored)
-    if fit is None or not fit.plan.mechanical:
+    bare = space.bare
+    if given.runs.log is not None:
+        sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
+        bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
+        observe = bare.observe
+    fit = fit_weak_form(bare, space.library.scored)
+    if fit is None:
         return None
 
     def columns(rows: np.ndarray) -> dict[str, np.ndarray]:
-        table = {name: x[rows] for name, x in given.runs.columns.items() if x.dtype.kind == "f"}
+        table = {name: x[rows] for name, x in runs.columns.items() if x.dtype.kind == "f"}
         return {**table, "configuration": np.asarray(observe.of_rows.configuration)[rows]}
 
     settings = given.settings
-    posed, rows = problem_of_windows(space.bare, fit, space.library.scored, columns, settings.width)
+    posed, rows = problem_of_windows(bare, fit, space.library.scored, columns, settings.width)
     table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
-    noise = dataclasses.replace(given.noise, sd=given.noise.sd[rows])
+    noise = dataclasses.replace(given.noise, sd=sd[rows])
     shares = settings_for(type(posed.observe), settings.replicates).shares
     return dataclasses.replace(
-        given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table, known=None,
+        given, runs=runs.where(rows), numbers=numbers[rows], noise=noise, equations=table, known=None,
         settings=dataclasses.replace(settings, shares=shares),
     )  # fmt: skip
 
 
-def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
+def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages:
     """Stages of a log's windows after the simulation of the base model and of the chosen one.
 
-    None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
-    gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
-    level.
+    Nothing is missing if the simulated base leaves no more than noise, or if the effects gain no more than chance
+    there. If they gain less than half of what the windows promised, the claim falls by one level.
     """
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
     if given.known is not None:  # only the noise differs
         refuted = given.known.run is not None and given.known.run.contradicts
         return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
-    if searched is None or beside is None or given.shows_unmodelled_backlash:
-        return None
     given.progress(progress_remark("confirm"))
     base, best = screened.base.candidate, traced.best
+    if searched is None or beside is None:
+        return dataclasses.replace(traced, run=simulate_models(given.space, base, base, given.settings))
     if best is base:
         named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
         best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
-    run = simulate_models(_space_of(given, given.noise), base, best, given.settings)
+    run = simulate_models(given.space, base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
-        return None
+        left, run = dataclasses.replace(left, test=confirmed), dataclasses.replace(run, best=run.base)
+        return LoopStages("none", screened, left, traced.sds, unused=traced.unused, run=run)
     traced = dataclasses.replace(traced, run=run)
     if not run.contradicts or traced.verdict == "place":
         return traced

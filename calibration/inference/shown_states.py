@@ -337,6 +337,19 @@ class _LogArrays:
         long = [np.diff(self.time[rows]) for rows in self.each if len(rows) > 1]
         self.step = float(np.median(np.concatenate(long))) if long else 1.0
 
+    def current_shift(self) -> float:
+        """Time by which a reading of the current shows an earlier one, as a share of the time between rows.
+
+        A held voltage changes at a row, whose reading shows the current before. A fast winding follows at once, so
+        this reading is the mean current since the row before. With a slow one it is that of the instant: 0.
+        """
+        robot = self.problem.base
+        if not self.plan.electrical or robot.rig.between_rows == "linear":
+            return 0.0
+        rise = float(robot.motor.inductance / robot.motor.resistance) / self.step
+        fades = np.exp(-1 / max(rise, 1e-9))
+        return float(1 / (1 - fades) - rise) - 0.5
+
     def motion(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Time and speed in some rows of a run, and the noise of the speed (sd). The speed is in the unit of the
         motion channel.
@@ -384,6 +397,11 @@ class _LogArrays:
         block = np.cumsum((place % size == 0) | broken) - 1
         first_row, count = np.unique(block, return_index=True, return_counts=True)[1:]
 
+        readings, shift = self.measured[rows], self.current_shift()
+        if shift and len(rows) > 1:
+            change = np.diff(readings[:, self.plan.current], append=0.0)
+            readings[:, self.plan.current] += shift * np.where(np.r_[broken[1:], True], 0.0, change)
+
         def mean(x: np.ndarray) -> np.ndarray:
             return np.add.reduceat(x, first_row, axis=0) / (count if x.ndim == 1 else count[:, None])
 
@@ -396,7 +414,7 @@ class _LogArrays:
         return {
             "row": rows[first_row + count // 2],
             "time": mean(times),
-            "shown": mean(self.measured[rows]),
+            "shown": mean(readings),
             "sd": np.sqrt(mean(self.sd[rows] ** 2) / count[:, None]),
             "cell": cell,
             "stretch": np.where(count == size, stretch[first_row], -1),
