@@ -78,7 +78,9 @@ def work(task: Task) -> dict:
     given, found, line = looped(case, task)
     line["intervals"] = intervals(found, case)
     line["strongest"] = strongest(found)
-    line["simulated"] = None if found.run is None else [found.run.promised, found.run.gained]
+    if (run := found.run) is not None:
+        misfit, count = 2 * run.base.cost, int(np.sum(run.space.weight > 0))
+        line["simulated"] = {"promised": run.promised, "gained": run.gained, "misfit": misfit, "readings": count}
     if not task.brief:
         from calibration.data import robot_file
         from calibration.discovery.discover import assemble_result
