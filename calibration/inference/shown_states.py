@@ -38,6 +38,8 @@ JUMP, KINK, GAP = 0.05, 0.3, 3.0
 REST_SD, REST = 5.0, 0.01
 #: Noise of the slope of an angle, as a share of its usual size; most rows whose slope it is.
 STEEP, STEEPEST = 0.02, 201
+#: Change of a delay from which its effect is extrapolated, at most [rows].
+REACH = 2.0
 #: Width added to both ends of an interval, so that a single row has one [rows].
 EDGE = 1e-4
 #: Fields of `Conditions` with a mean over an interval; others are those at its middle.
@@ -337,19 +339,6 @@ class _LogArrays:
         long = [np.diff(self.time[rows]) for rows in self.each if len(rows) > 1]
         self.step = float(np.median(np.concatenate(long))) if long else 1.0
 
-    def current_shift(self) -> float:
-        """Time by which a reading of the current shows an earlier one, as a share of the time between rows.
-
-        A held voltage changes at a row, whose reading shows the current before. A fast winding follows at once, so
-        this reading is the mean current since the row before. With a slow one it is that of the instant: 0.
-        """
-        robot = self.problem.base
-        if not self.plan.electrical or robot.rig.between_rows == "linear":
-            return 0.0
-        rise = float(robot.motor.inductance / robot.motor.resistance) / self.step
-        fades = np.exp(-1 / max(rise, 1e-9))
-        return float(1 / (1 - fades) - rise) - 0.5
-
     def motion(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Time and speed in some rows of a run, and the noise of the speed (sd). The speed is in the unit of the
         motion channel.
@@ -397,11 +386,6 @@ class _LogArrays:
         block = np.cumsum((place % size == 0) | broken) - 1
         first_row, count = np.unique(block, return_index=True, return_counts=True)[1:]
 
-        readings, shift = self.measured[rows], self.current_shift()
-        if shift and len(rows) > 1:
-            change = np.diff(readings[:, self.plan.current], append=0.0)
-            readings[:, self.plan.current] += shift * np.where(np.r_[broken[1:], True], 0.0, change)
-
         def mean(x: np.ndarray) -> np.ndarray:
             return np.add.reduceat(x, first_row, axis=0) / (count if x.ndim == 1 else count[:, None])
 
@@ -414,7 +398,7 @@ class _LogArrays:
         return {
             "row": rows[first_row + count // 2],
             "time": mean(times),
-            "shown": mean(readings),
+            "shown": mean(self.measured[rows]),
             "sd": np.sqrt(mean(self.sd[rows] ** 2) / count[:, None]),
             "cell": cell,
             "stretch": np.where(count == size, stretch[first_row], -1),
@@ -486,7 +470,7 @@ def points_and_windows(
     turned_angle = np.cumsum(np.where(time_steps > 0, 0.5 * (speed + np.roll(speed, 1)) * time_steps, 0.0))
     zeros = np.zeros(len(run))
     arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], time_steps, time, joined["row"]
-    late = zeros + delay, zeros + log.step, drift
+    late = zeros + delay, zeros + REACH * log.step, drift
     windows = [
         _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))
         for r in range(len(parts))
