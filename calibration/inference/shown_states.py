@@ -201,10 +201,11 @@ class ImposedCourse:
         and the derivative of the mean with respect to the delay.
         """
         low, high = (edge - delay for edge in self.cell.T)
+        inner = 1e-3 * (high - low)  # an interval may end at a jump
         mean, drift = {}, {}
         for name, x in self.integrals.items():
             mean[name] = (np.interp(high, self.time, x) - np.interp(low, self.time, x)) / (high - low)
-            ends = [self.values[name][np.searchsorted(self.time, t, side="right") - 1] for t in (low, high)]
+            ends = [self.values[name][np.searchsorted(self.time, t, side="right") - 1] for t in (low + inner, high - inner)]
             drift[name] = (ends[0] - ends[1]) / (high - low)
         return mean, drift
 
