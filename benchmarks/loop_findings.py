@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from calibration.inference import bases
+
 #: Further parts that a result may have, in addition to its verdict.
-FURTHER = ("families", "mechanism", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
+FURTHER = ("families", "mechanism", "implausible", "hidden", "stands_for")
 
 
 def plain(x: Any) -> Any:
@@ -30,7 +32,7 @@ def plain(x: Any) -> Any:
 
 def verdict(found) -> dict:
     """The verdict of a `LoopStages`."""
-    base = found.screened.base.candidate
+    base, factors = found.screened.base.candidate, found.sds.factors
     further = {name: plain(getattr(found, name)) for name in FURTHER if getattr(found, name, None) is not None}
     return {
         "verdict": found.verdict,
@@ -42,7 +44,24 @@ def verdict(found) -> dict:
         "chi2": [2 * base.cost, 2 * found.best.cost],
         "readings": int(np.sum(found.screened.base.space.weight > 0)),
         **further,
-    }
+        "events": [] if found.where is None else events(found, found.where.variable),
+        "events_alike": [] if found.where is None else [
+            event for variable in found.where.variables_alike for event in events(found, variable)
+        ],
+        **({"noise_factor": float(np.exp(np.mean(np.log(list(factors.values())))))} if factors else {}),
+    }  # fmt: skip
+
+
+def events(found, variable: str) -> list[dict[str, Any]]:
+    """A temporary change with its axis, its window and the numbers of the rows in it. Empty for other variables."""
+    happens = bases.window_from_name(variable)
+    if happens is None:
+        return []
+    linear = found.left.linear
+    x, _ = linear.curve_variable(found.where.place, happens.axis)
+    inside = found.screened.base.space.included & linear.of_rows(happens.holds(x))
+    rows = [int(k) + 1 for k in np.flatnonzero(inside)]
+    return [{"axis": happens.axis, "window": [happens.low, happens.high], "rows": rows}]
 
 
 def located(found) -> tuple | None:

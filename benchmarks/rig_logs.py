@@ -11,9 +11,9 @@ Logs come from `tests/worlds/logs.py`, which shares no code with the simulator: 
 states. The loop reads only `rig.toml` and `table.csv`. Only the scorer reads the labels. Every log is one line
 of `--out`, and a restarted campaign continues where it ended. With `--brief` there is no
 hold-out. In the stratum `varied` half of the tables have no sds, a quarter of the logs show an angle alone and a
-quarter have coarse instruments, and effects of the library leave 5 σ. Logs of the stratum `long` are such, and have one or two runs
-of 4000 to 25 000 rows at 1 to 5 ms. In the stratum `servo` the goal of a controller
-is imposed and a 12-bit encoder shows the angle at 50 or 100 Hz.
+quarter have coarse instruments, and effects of the library leave 5 σ. The stratum `long` is the same with one or two
+runs of 4100 to 25 000 rows at 1 to 5 ms. In the stratum `servo` the goal of a controller is imposed and a 12-bit
+encoder shows the angle at 50 or 100 Hz.
 """
 
 from __future__ import annotations

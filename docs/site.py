@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parent
-FIGURES = ("before_after", "laws", "errors-figure")
+FIGURES = ("before_after", "laws")
 PACKAGES = ("mmrjax", "calibration", "sweeps")
 #: What the tutorial about the loop was written from, and the parts of `result.json` in it.
 RECORD = DOCS / "start" / "loop.json"
@@ -113,7 +113,7 @@ def statuses() -> str:
     from sweeps.report.climb_report import VERDICTS
 
     parts = {
-        "Statuses": {name: _sentence(status.meaning) for name, status in words.STATUSES.items()},
+        "Statuses": {name: _sentence(meaning) for name, (_, meaning) in words.STATUSES.items()},
         "Flags": {name: _sentence(meaning) for name, meaning in words.FLAGS.items()},
         "Verdicts of the loop": {name: _sentence(meaning) for name, meaning in words.LOOP_VERDICTS.items()},
         "Verdicts of a climb": {name: _sentence(verdict[1]) for name, verdict in VERDICTS.items()},
@@ -384,8 +384,6 @@ errors show how well the robot file predicts conditions that were not measured:
 | rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
 |---|---|---|---|---|---|
 {unseen}
-
-![Errors of runs that the fit has seen and has not seen](figures/errors-figure.svg)
 
 ## What next?
 

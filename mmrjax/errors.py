@@ -23,7 +23,7 @@ def printable(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() or c in _LAYOUT else "�" for c in text)
 
 
-def shorten(message: str, longest: int = LONGEST) -> str:
+def shorten(message: str) -> str:
     """Returns a message with very long words cut and the middle of a very long text left out."""
 
     def cut(word: re.Match[str]) -> str:
@@ -34,7 +34,7 @@ def shorten(message: str, longest: int = LONGEST) -> str:
 
     shortened = re.sub(r"\S+", cut, message)
     return (
-        shortened if len(shortened) <= longest else f"{shortened[: 2 * longest // 3]} … {shortened[-longest // 4 :]}"
+        shortened if len(shortened) <= LONGEST else f"{shortened[: 2 * LONGEST // 3]} … {shortened[-LONGEST // 4 :]}"
     )
 
 

@@ -240,8 +240,7 @@ def reproduce() -> None:
 def render() -> None:
     """Draw a picture or film of the track model.
 
-    The picture shows the robot on its slope, its track and the contact forces. The run starts from standstill. With
-    --left and --right the robot turns and is shown from above. --climb draws a climb that was computed before. The
+    The picture shows the robot on its slope, its track and the contact forces. The run starts from standstill. The
     command works without a display.
     """
 

@@ -100,7 +100,7 @@ class Measured(FolderPart):
     """Measured data of a command."""
 
     data: str = option_field(
-        "measured", "Measured runs or time histories in any format, or measured (packaged runs)", argument=True
+        "measured", "Measured runs or logs in any format, or measured (packaged runs)", argument=True
     )
 
 
@@ -110,9 +110,7 @@ class ComparedRuns(Measured):
     data: str = option_field(
         "measured", "Measured runs in any format, or measured, or simulated_by_paper", argument=True
     )
-    own_mass: bool = option_field(
-        False, "Use the robot's own mass plus the payload instead of the total mass in the table"
-    )
+    own_mass: bool = option_field(False, "Use the robot's own mass and the payload, not the total mass in the table")
 
 
 class SettledLog(FolderPart):
@@ -131,8 +129,8 @@ class DataPart(Part):
 
     columns: str | None = option_field(
         None,
-        f"Names, units and signs of the columns: a preset ({', '.join(presets_file.PACKAGED)}; with the numbers "
-        "that it needs, such as vesc,pole_pairs=7) or a preset file",
+        f"Meaning of the columns: a preset ({', '.join(presets_file.PACKAGED)}; with its numbers, such as "
+        "vesc,pole_pairs=7) or a preset file",
         usual="[columns] of the robot's file",
     )
 
@@ -271,12 +269,8 @@ class OneRun(Part):
         usual="33; for a rig its limit; none with --battery",
         flag="--voltage",
     )
-    motor_speed_rpm: float | None = option_field(
-        None, "Motor speed (rpm), negative in reverse, for rigs with imposed motor speed"
-    )
-    motor_current_A: float | None = option_field(
-        None, "Current per motor (A), negative in reverse, for rigs with imposed motor current"
-    )
+    motor_speed_rpm: float | None = option_field(None, "Imposed motor speed (rpm), negative in reverse")
+    motor_current_A: float | None = option_field(None, "Imposed current per motor (A), negative in reverse")
     payload_kg: float | None = option_field(None, "Additional load mass", usual="0")
     slope_deg: float | None = option_field(None, "Slope, positive uphill", usual="0")
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
@@ -292,7 +286,7 @@ class OneRun(Part):
         None, "Angle of the rear levers, with the same convention", usual="the robot's"
     )
     load_torque_Nm: float | None = option_field(
-        None, "Brake torque at the output of each drive (N·m), against forward rotation, for loads on a shaft",
+        None, "Brake torque at the output of each drive (N·m), for loads on a shaft",
         usual="none"
     )  # fmt: skip
 
@@ -305,7 +299,7 @@ class OneRun(Part):
 class GivenRuns(OneRun, FolderPart):
     """Runs of `simulate`: one run from options, or those in a file."""
 
-    runs: Path | None = option_field(None, "CSV of runs to simulate instead. Condition columns are enough")
+    runs: Path | None = option_field(None, "CSV of runs to simulate instead")
 
     @model_validator(mode="after")
     def _once(self) -> Self:
@@ -326,9 +320,6 @@ class Picture(OneRun):
     )
     end: float | None = option_field(None, "End of the film (s)", usual="begin + 0.1")
     slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
-    climb: Path | None = option_field(
-        None, "Folder of mmrjax climb to draw instead. The default is the whole climb at half speed"
-    )
     force: bool = option_field(False, "Replace an existing file")
 
 
@@ -349,7 +340,7 @@ class AxesPart(Part):
         usual=_values_text(VOLTAGES_V),
     )
     motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
-        None, "Motor speeds (rpm), for rigs with imposed motor speed", usual="thirds of speed_limit"
+        None, "Imposed motor speeds (rpm)", usual="thirds of speed_limit"
     )
     payloads_kg: Several[Payload] | None = option_field(
         None, "Additional load masses (kg), 0 for a rig", usual=_values_text(PAYLOADS_KG)
@@ -363,9 +354,7 @@ class AxesPart(Part):
 class GridPart(AxesPart):
     """Axes of a grid, those of shafts and imposed currents among them."""
 
-    motor_currents_A: Several[MotorCurrent] | None = option_field(
-        None, "Currents per motor (A), for rigs with imposed motor current"
-    )
+    motor_currents_A: Several[MotorCurrent] | None = option_field(None, "Imposed currents per motor (A)")
     load_torques_Nm: Several[LoadTorque] | None = option_field(
         None, "Brake torques at the output of each drive (N·m), for loads on a shaft", usual="none"
     )
@@ -380,11 +369,11 @@ class InferencePart(Part):
     noise: str = option_field(
         "",
         "Standard deviations of current, motor_speed and speed in % or in A, rpm, mm/s: current=2%,speed=5mm/s",
-        usual="from the file's columns. Otherwise calibrate estimates it from the misfit. The loop estimates it from "
-        "series of rows or over time, and assumes 2, 0.5 and 1 % for settled rows without series",
+        usual="from the file's columns. Otherwise estimated. For settled rows without series, the loop assumes 2, "
+        "0.5 and 1 %",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used. Larger data are thinned evenly, logs in time, tables over conditions"
+        ROWS, "Largest number of rows used. Larger data are thinned evenly"
     )
     seed: Seed = option_field(0, "Random seed")
 
@@ -392,9 +381,7 @@ class InferencePart(Part):
 class MembersPart(Part):
     """Folder in which a population keeps its runs. It changes no number."""
 
-    members: Path | None = option_field(
-        None, "File for the runs of the population. The same command resumes from it", solver=True
-    )
+    members: Path | None = option_field(None, "File for the runs of the population, to resume from", solver=True)
 
 
 class FittedRuns(MembersPart, Measured, VerbosePart):
@@ -405,7 +392,7 @@ class LoopBeside(FittedRuns):
     """Options of the loop that change no number."""
 
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
-        "10min", "Wall-clock limit, such as 90s, 5min or 1h. The best result at that time is reported"
+        "10min", "Wall-clock limit, such as 90s, 5min or 1h"
     )
 
     @property
@@ -418,19 +405,15 @@ class LoopBeside(FittedRuns):
 class TurnPart(Part):
     """Separate commands for the left and right sides of the robot. None: both sides get the same command."""
 
-    left_V: Voltage | None = option_field(
-        None, "Voltage of the left motor (V). Together with --right, the robot can turn"
-    )
+    left_V: Voltage | None = option_field(None, "Voltage of the left motor (V), together with --right")
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
-    duty_left: Duty | None = option_field(
-        None, "Duty of the left motor (share of the supply voltage), instead of --left"
-    )
-    duty_right: Duty | None = option_field(None, "Duty of the right motor (share of the supply voltage)")
+    duty_left: Duty | None = option_field(None, "Duty of the left motor (share of the supply voltage)")
+    duty_right: Duty | None = option_field(None, "Duty of the right motor")
     speed_m_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Speed of the settled turn (m/s). Together with --yaw-rate, it determines --left and --right"
+        None, "Speed of the settled turn (m/s), together with --yaw-rate"
     )
     yaw_rate_rad_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Yaw rate of the settled turn (rad/s), positive to the left. Give it together with --speed"
+        None, "Yaw rate of the settled turn (rad/s), positive to the left"
     )
     heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
 
@@ -443,13 +426,6 @@ class TurnPart(Part):
     def turns(self) -> bool:
         """True if the robot is free to turn."""
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
-
-    def refuse_volts(self, battery: bool) -> None:
-        """Reject side voltages on battery power, which sets the voltage."""
-        if battery and self.left_V is not None:
-            raise PydanticCustomError(
-                "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
-            )
 
     @model_validator(mode="after")
     def _of_both_sides(self) -> Self:
@@ -472,7 +448,7 @@ class PosteriorPart(Part):
     """Uncertainty of results from the posterior of a calibrated robot."""
 
     posterior: Annotated[int, Field(ge=10, le=100_000)] | None = option_field(
-        None, "Report results with ±, from this many robots drawn from the posterior.nc of the calibrated --robot"
+        None, "Report results with ±, from this many draws from the posterior.nc of --robot"
     )
 
 
@@ -480,7 +456,7 @@ class OutputPart(Part):
     """Files written in addition to the numbers."""
 
     report: bool = option_field(True, "Write report.html")
-    table: Literal["csv", "parquet"] = option_field("csv", "Format of the tables: CSV only, or Parquet as well")
+    table: Literal["csv", "parquet"] = option_field("csv", "Format of tables: CSV only, or Parquet as well")
 
 
 class ProfilePart(FidelityPart):
@@ -534,7 +510,10 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
             if beside:
                 option = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
                 raise PydanticCustomError("idle", f"`{option}` cannot be combined with `{beside[0]}`")
-            self.refuse_volts(self.battery)
+            if self.battery and self.left_V is not None:
+                raise PydanticCustomError(
+                    "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
+                )
         if self.profile is not None and self.posterior is not None:
             raise PydanticCustomError("idle", "`posterior` cannot be combined with `profile`")
         return self
@@ -560,19 +539,10 @@ class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     )
 
 
-class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
+class Render(RobotPart, FidelityPart, SupplyPart):
     """One run of the fidelity that pictures are made from."""
 
     model: Literal["track"] = "track"
-
-    @model_validator(mode="after")
-    def _driven(self) -> Self:
-        if self.demands:
-            raise PydanticCustomError(
-                "idle", "`speed_m_s` has an effect only with simulate; give `left_V` and `right_V`"
-            )
-        self.refuse_volts(self.battery)
-        return self
 
 
 class Resonance(RobotPart, FidelityPart, OutputPart):
@@ -585,7 +555,7 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
-        "Supply voltages (V), which give the speeds of the map. Give at least 5",
+        "Supply voltages (V), at least 5",
         usual="10:40:1, that is 31",
         minimum=0,
     )
@@ -634,14 +604,12 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     )
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None,
-        "Search for the largest obstacle that the robot gets over, instead of one run. For stairs: largest rise "
-        "at the tread of --stairs",
+        "Search for the largest obstacle that the robot gets over. For stairs: largest rise at the tread of --stairs",
     )
     derivatives: Names = option_field(
         (),
-        "Also compute derivatives of margins, time, energy and currents with respect to these, comma-separated: any "
-        "parameter (motor.resistance, ...), adhesion, payload, voltage (with --battery: discharge), "
-        "levers_front_deg, levers_rear_deg, obstacle_mm",
+        "Also compute derivatives with respect to these, comma-separated: any parameter, adhesion, payload, voltage "
+        "(with --battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
     film: bool = option_field(False, "Write climb.gif")
     duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
@@ -718,7 +686,7 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = option_field(
         None,
-        "Members of each generation of the gradient-free search before a fit with drive or track",
+        "Members of each generation of the gradient-free search",
         usual="256 if the running gear is fitted, else 0",
         solver=True,
     )
@@ -763,7 +731,7 @@ class Export(RobotPart, OutputPart):
         "mujoco", "Format (docs/howto/export.md)"
     )
     data: str | None = option_field(
-        None, "Table of runs, or log, to compare the exported drive with", usual="a grid without readings"
+        None, "Runs or log to compare the exported drive with", usual="a grid without readings"
     )
     configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     joint: str = option_field("drive", "Name of the joint in the simulator's model, for mujoco")
@@ -781,16 +749,15 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "Criterion for the first of several effects that these data cannot distinguish. With held-out, it is the "
-        "error on blocks left out of the fit",
+        "Criterion for the first of several indistinguishable effects: misfit, or error on held-out blocks",
     )
     forbid: Names = option_field(
-        (), "Experiment that you cannot do. May be repeated: stall, lifted, 'one motor', or a configuration"
+        (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', or a configuration"
     )
     resolve: bool = option_field(
         False,
-        "Test with the track model whether a different running gear within its priors explains the remaining "
-        "error in slip, track or ground. Takes tens of minutes on two cores",
+        "Test with the track model whether a different running gear explains the remaining error. Takes tens of "
+        "minutes",
     )
     population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
         None, "Members of each generation of the search for --resolve", usual="128", solver=True
@@ -800,12 +767,9 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     model: Path | None = option_field(
         None,
-        "MuJoCo model with several joints. The loop runs for each joint, with the torque that the model computes as "
-        "its load",
+        "MuJoCo model with several joints. The loop runs for each, with the model's torque as its load",
     )
-    joints: Names = option_field(
-        (), "Joints of --model, comma-separated, or all. Log columns are named JOINT.output_angle_deg"
-    )
+    joints: Names = option_field((), "Joints of --model, comma-separated, or all")
 
     @model_validator(mode="after")
     def _joints_of_a_model(self) -> Self:
@@ -860,8 +824,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
     )
     outputs: Names = option_field(
         (),
-        "Outputs, comma-separated: outputs of a run, steepest_slope, highest_step, best_step, or start for the "
-        "three outputs of a start",
+        "Outputs, comma-separated: of a run, steepest_slope, highest_step, best_step, or start (three outputs)",
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(

@@ -175,7 +175,7 @@ def accepted(*_, **__):
 HEAVY = (
     "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.run_missions", "sweeps.commands.climb.climb_batch",
     "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse_sensitivity",
-    "sweeps.commands.size.search", "sweeps.commands.render._write_completely",
+    "sweeps.commands.size.search", "mmrjax.undercarriage.rendering.render",
 )  # fmt: skip
 
 
@@ -272,7 +272,7 @@ OPTIONS = {
     ("calibrate", "measured"): ["--free", "--fix", "--starts", "--population", "--members"],
     ("sensitivity",): ["--method", "--parameters", "--vary", "--evaluations", "--candidates"],
     ("climb",): ["--step", "--stairs", "--gap", "--terrain", "--sequence", "--find"],
-    ("render", "x.png"): ["--begin", "--end", "--slow", "--climb"],
+    ("render", "x.png"): ["--begin", "--end", "--slow"],
     ("check",): ["--robot", "--set"],
     ("size",): ["--objective", "--pareto", "--motors"],
 }  # fmt: skip

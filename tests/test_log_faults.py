@@ -1,10 +1,12 @@
 """Logs with faults that no reader sees: one sentence each. Sound logs have none."""
 
+import contextlib
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_log_kinds import servo, written
+from test_log_kinds import carriage, servo, written
 from test_weak_form import RIG, motor
 
 from calibration.data import rig_facts, robot_file
@@ -12,6 +14,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
+from calibration.discovery import discover
 from calibration.inference import calibration
 from calibration.inference.conduct import error_after_steps
 
@@ -41,11 +44,7 @@ def constant(volts):
     return np.full_like(volts, 12.0)
 
 
-def jumped(time):
-    return time + np.where(np.arange(len(time)) % 150 > 75, 3.0, 0.0)
-
-
-SPEED, VOLTS, TIME = "motor_speed_rpm", "supply_voltage_V", "time_s"
+SPEED, VOLTS = "motor_speed_rpm", "supply_voltage_V"
 
 
 @pytest.mark.parametrize("column, fault, words", [
@@ -53,7 +52,6 @@ SPEED, VOLTS, TIME = "motor_speed_rpm", "supply_voltage_V", "time_s"
     (SPEED, held, "Empty these cells to use the other rows"),
     (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
     (VOLTS, constant, "12 V in every row"),
-    (TIME, jumped, "row 77, time_s: 3.01 s after the row before it"),
 ])  # fmt: skip
 def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words):
     columns = motor()
@@ -63,14 +61,56 @@ def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words)
     assert words in text and column in text and len(text) <= 400
 
 
-def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path):
-    log = servo(np.random.default_rng(1))
-    log["output_angle_deg"] = log["output_angle_deg"] % 360
-    servos = written(tmp_path, "servo", log)
-    with pytest.raises(
-        BadData, match=r"jumps by -3.* like an angle that wraps; expected an angle that keeps counting"
-    ):
-        records.read_runs(tmp_path / "log.csv", robot=servos)
+@pytest.mark.parametrize(("kind", "make", "column", "length", "words"), [
+    ("servo", servo, "output_angle_deg", 360, "jumps by -3.* like an angle that wraps; expected an angle that keeps"),
+    ("carriage", carriage, "position_mm", 50, "jumps by -4.* like a position that wraps; expected a position that"),
+])  # fmt: skip
+def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path, kind, make, column, length, words):
+    log = make(np.random.default_rng(1))
+    robot = written(tmp_path, kind, log)
+    records.read_runs(tmp_path / "log.csv", robot=robot)
+    written(tmp_path, kind, {**log, column: log[column] % length})
+    with pytest.raises(BadData, match=words):
+        records.read_runs(tmp_path / "log.csv", robot=robot)
+
+
+@pytest.mark.parametrize("step", [7.0, -2.0])
+def test_rows_after_a_jump_of_the_clock_are_a_run_that_begins_at_their_readings(tmp_path, step):
+    log = carriage(np.random.default_rng(1))
+    late = np.arange(len(log["time_s"])) >= 700
+    robot = written(tmp_path, "carriage", {**log, "time_s": log["time_s"] + step * late})
+    resting = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, start="rest"))
+    with contextlib.suppress(BadData):  # time goes back
+        runs = records.read_runs(tmp_path / "log.csv", robot=resting)
+        assert set(runs.run_names) == {""} and "s after the row before it" in "".join(runs.notes)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    assert (runs.run_names == "part 2").tolist() == late.tolist()
+    np.testing.assert_allclose(np.diff(runs["time_s"])[701:], np.diff(log["time_s"])[701:], atol=1e-6)
+    assert runs["time_s"][700] == 0 and any("row 701, time_s" in n and "new run" in n for n in runs.notes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "make", "column"), [("servo", servo, "duty"), ("carriage", carriage, "motor_current_A")]
+)
+def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, make, column):
+    log = make(np.random.default_rng(1), **{"levels": (0.9, -0.8, 0.7, -0.9, 0.8, -0.7), "hold": 0.5})
+    runs = records.read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log))
+    assert rig_facts.swapped_sentence(runs) == ""
+    half = len(log[column]) // 2
+    log[column] = np.where(np.arange(len(log[column])) < half, log[column], -log[column])
+    text = rig_facts.swapped_sentence(records.read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log)))
+    assert f"relative to {column}" in text and abs(int(text.split()[2].strip(",")) - half) < 30
+
+
+@pytest.mark.parametrize(("delay", "stated", "words"), [
+    (0.149, True, "the longest delay that is searched"), (-0.149, False, "earlier than its column states, the longest"),
+    (0.1, False, "To start the fit from this delay"), (0.1, True, ""), (0.003, False, ""),
+])  # fmt: skip
+def test_a_delay_at_the_end_of_its_search_is_reported(robot, delay, stated, words):
+    runs = Runs("log.csv", motor()).of(robot)
+    assert runs["time_s"].max() == pytest.approx(1.49)
+    remarks = discover.delay_remarks(runs, SimpleNamespace(after=delay, sd_after=1e-3), stated)
+    assert words in "".join(map(describe, remarks)) and bool(remarks) == bool(words)
 
 
 @pytest.mark.parametrize("late", [0, 1])
@@ -144,3 +184,11 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
     (note,) = error_after_steps(runs, off)
     assert note.code == "shifted" and note.shift == pytest.approx(late, rel=0.1) and note.share > 0.9
     assert f"ms {'late' if late > 0 else 'early'}. To fit this delay, set [rig] delay" in describe(note)
+
+
+def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
+    runs = Runs("log.csv", motor()).of(robot)
+    assert discover.missing_states_remarks(runs, robot) == []
+    silent = Runs("log.csv", {**motor(), SPEED: np.full(600, np.nan)}).of(robot)
+    (note,) = discover.missing_states_remarks(silent, robot)
+    assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)

@@ -10,7 +10,6 @@ from unittest.mock import ANY
 import jsonschema
 import numpy as np
 import pytest
-from matplotlib.text import Text
 from pages import Tables, as_text, drawn, recorded, tokens
 from synthetic import SETTLED, table
 from test_implausible import unnamed
@@ -55,23 +54,6 @@ def happening():
     off = (columns["order"] >= 30) & (columns["order"] <= 44)
     columns["speed_mm_s"] = columns["speed_mm_s"] - 12.0 * off
     return table(columns)
-
-
-def test_the_legend_of_errors_hides_no_title():
-    shown = tuple(
-        channels.find_channel(n) for n in ("motor_current_left", "motor_current_right", "yaw_rate", "output_torque")
-    )
-    rows = {when: {c.name: {"rms_percent": 1.0} for c in shown} for when in (0, 1)}
-    fig = loop_figures.draw_errors(SimpleNamespace(channels=shown, errors=rows, errors_held_out={"slope": rows}))
-    fig.canvas.draw()
-    legend = [*fig.legends, *(a.get_legend() for a in fig.axes if a.get_legend())]
-    assert len(legend) == 1
-    for axes in fig.axes:
-        title = max(
-            (t for t in axes.findobj(Text) if t.get_text() in {c.label for c in shown}),
-            key=lambda t: len(t.get_text()),
-        )
-        assert not legend[0].get_window_extent().overlaps(title.get_window_extent())
 
 
 #: A case → its result. The first two are of 24 runs and share their programs; the command has made the first.
@@ -268,28 +250,6 @@ def test_a_law_that_depends_on_more_has_a_mark_for_each_run():
     assert not any(
         len(x.get_xdata()) > 2 and x.get_linestyle() == "-" for x in drawn_law(table, ANY, jagged)[0].lines
     )
-
-
-def test_the_proposed_set_of_effects_stands_out_in_the_figure_of_gains():
-    gains = [(("a",), SimpleNamespace(mean=0.2, se=0.05)), (("a", "b"), SimpleNamespace(mean=0.5, se=0.1))]
-    with figure_settings():
-        (axes,) = loop_figures.draw_gains(SimpleNamespace(gains=gains)).axes
-    dots = {float(x.get_xdata()[0]): x for x in axes.lines if x.get_marker() == "o"}
-    assert {n: float(dot.get_ydata()[0]) for n, dot in dots.items()} == {1.0: 0.2, 2.0: 0.5}
-    assert dots[2.0].get_markerfacecolor() == loop_figures.BLUE != dots[1.0].get_markerfacecolor()
-    bars = [segment for x in axes.collections for segment in x.get_segments()]
-    assert sorted(float(np.ptp(bar[:, 1])) for bar in bars) == pytest.approx([0.1, 0.2])  # a standard error each way
-
-
-def test_an_effect_of_the_listed_size_is_noticed_in_half_of_the_tables(shown, capsys):
-    """The curve of power and the table of sizes state one threshold."""
-    found = shown("churning", capsys).found
-    with figure_settings():
-        (axes,) = loop_figures.draw_power(found).axes
-    level, scores = found.before.kinds["single"].threshold, {s.name: s for s in found.scores}
-    for line in axes.lines:
-        at = level / scores[line.get_label()].sigmas_per_prior_sd
-        assert abs(np.interp(at, line.get_xdata(), line.get_ydata()) - 50) < 2
 
 
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import re
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -13,15 +12,11 @@ from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
-from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import pages
 from sweeps.pages import figure_style, power_figures, sweep_figures
-from sweeps.paper import data
-from sweeps.paper import run_figures as paper_runs
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
 from sweeps.report.document import Document, Section
-from sweeps.report.resonance_report import ResonanceResult
 
 
 def run_of(robot, **conditions):
@@ -103,32 +98,6 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
             assert (
                 0 < warning < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
             )
-
-
-@pytest.mark.slow
-def test_legend_of_the_energy_split_has_what_is_drawn():
-    used = data.energy_use(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
-    fig = paper_runs.draw_energy(used)
-    shown = {text.get_text() for text in fig.legends[0].get_texts()}
-    drawn = {
-        bars.get_label() for bars in fig.axes[0].containers if max(bar.get_width() for bar in bars.patches) > 0.05
-    }
-    plt.close(fig)
-    assert shown == drawn and {"gearbox", "lift"} <= shown
-
-
-def test_a_point_within_a_range_to_avoid_is_never_a_plain_no():
-    """«Avoid 815-1004» was once above a table that had 979 mm/s as «no»."""
-
-    class Found(ResonanceResult):
-        avoid = ((0.815, 1.004, ()),)
-
-        def shaken(self, row):
-            return row == 0
-
-    table = {"speed_mean_mm_s": np.array([979.0, 979.0, 1100.0])}
-    found = Found("6T2A", 0.0, "", None, None, table, {}, [], [])
-    assert [found.to_avoid(k) for k in range(3)] == ["yes", "at other payloads", "no"]
 
 
 def test_texts_of_a_narrow_figure_are_apart(monkeypatch):

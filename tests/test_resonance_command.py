@@ -122,18 +122,17 @@ def test_command_leaves_result_tables_and_a_page_of_its_own(tracked):
     folder, found = tracked
     result = read_json(folder / "result.json")
     jsonschema.validate(result, SCHEMA)
-    assert result["schema"] == "mmrjax.resonance/1" and result["statement"] == found.statement()
+    assert result["schema"] == "mmrjax.resonance/2" and result["statement"] == found.statement()
     assert result["statement"].startswith("Avoid ")
     assert {(a["mode"], a["order"]) for a in result["avoid"]} == {("bounce", 3), ("pitch", 2)}
     points = rows(folder / "points.csv")
-    assert len(points) == result["runs"] == 18 + 16  # 33 V is no voltage of the grid; 24 V is
-    assert sum(p["table8"] == "True" for p in points) == 18 == len(result["table8"])
+    assert len(points) == result["runs"] == 18
     assert {m["name"] for m in rows(folder / "modes.csv")} == {"bounce", "pitch", "drive"}
     assert len(rows(folder / "peaks.csv")) == len(result["peaks"])
     page = (folder / "report.html").read_text()
     assert "map" in drawn(page) and outside(folder) == []
     tables = Tables(page).tables
-    assert len(tables["points"]) == 2 + 18 and len(tables["frequencies"]) == 1 + 6
+    assert len(tables["frequencies"]) == 1 + 6
     assert {"config.resolved.toml", "robot.toml", "manifest.json"} <= {p.name for p in folder.iterdir()}
     assert not folder.with_name("map.partial").exists()
 
@@ -143,7 +142,9 @@ def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
     """Of every point, from the runs themselves, their drift left in."""
     found = tracked[1]
     again = config.resolve_configuration(config.Resonance, tracked[0] / "config.resolved.toml", {})
-    conditions = run.conditions_of_runs(robot, room._grid_and_table_8(again, robot)[0], again)
+    conditions = run.conditions_of_runs(
+        robot, room.grid_conditions(room._speed_grid(again, again.voltages_V), robot), again
+    )
     runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
     normal = np.asarray(runs.signals.normal)[:, 500:]
     ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)

@@ -267,7 +267,7 @@ def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
         ).reading
 
     expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))[:, 0]
-    found = np.asarray(jax.jit(lambda r: observer.response_to_errors(r, (effect,)))(robot))[0, 0]
+    found = np.asarray(jax.jit(lambda r: observer.changes(r, (effect,), ())[0])(robot))[0, 0]
     assert_allclose(found.sum(0)[:, 0], expected, rtol=1e-7)
     assert_allclose(np.diag(found[:, :, 0]), expected, rtol=1e-7)  # of the knot at each sample alone
     assert (np.abs(expected) > 0.9).all()  # 1 / (16 × 0.05 N·m/A), over or by an efficiency of 0.8

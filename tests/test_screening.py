@@ -10,8 +10,9 @@ from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import candidates, screening, search
+from calibration.discovery import candidates, discover, screening, search
 from calibration.discovery.candidates import Candidate, fill_slots
+from calibration.discovery.loop_notes import MissedChannel
 from calibration.discovery.result import EffectRanking, RankedEffect
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import settings_for
@@ -426,3 +427,32 @@ def test_a_search_from_a_regression_that_does_not_converge_is_repeated_from_the_
     optima_found, _ = candidates._best_starts(space, ANALYST.settings, regression)
     assert [b.tolist() for b in begun] == [[[-2.9, 1.0]]] + [[[0.0, 0.0]]] * (not converged)
     assert np.min(optima_found.cost) == (931.0 if converged else 408.0)
+
+
+@pytest.mark.parametrize("missed", [(), (MissedChannel("position", 0.57, 0.0),)])
+def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channel(monkeypatch, missed):
+    """An encoder that wrapped left 57 % of its rms, and an inertia was said to be missing."""
+    base, best = SimpleNamespace(cost=100.0), SimpleNamespace(cost=10.0)
+    run = SimpleNamespace(
+        space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, contradicts=False,
+        diagnosis=lambda fit, left: SimpleNamespace(linear=fit),
+    )  # fmt: skip
+    monkeypatch.setattr(discover, "simulate_models", lambda *_: run)
+    monkeypatch.setattr(discover, "_space_of", lambda *_: None)
+    monkeypatch.setattr(discover, "excess_misfit", lambda *_: 1e3)
+    monkeypatch.setattr(discover, "unused_inputs", lambda _: ("angle",))
+    missed_by = {id(base): (MissedChannel("position", 0.8, 0.0),), id(best): missed}
+    monkeypatch.setattr(discover, "missed_channels", lambda space, runs, noise, fit: missed_by[id(fit)])
+    given = SimpleNamespace(
+        known=None, shows_unmodelled_backlash=False, progress=lambda _: None, runs=None, noise=None, settings=None
+    )
+    screened = SimpleNamespace(base=SimpleNamespace(candidate=base))
+    left = SimpleNamespace(test=SimpleNamespace(confirmed=lambda _: SimpleNamespace(rejected=True)))
+    traced = discover.LoopStages(
+        "class", screened, left, None, SimpleNamespace(best=best), alike="classes", beside="curve"
+    )
+    found = discover._confirm_by_simulation(given, given, traced)
+    other = discover._confirm_by_simulation(SimpleNamespace(**{**vars(given), "known": found}), given, traced)
+    assert {found.verdict, other.verdict} == {"undescribed" if missed else "class"}
+    assert found.missed == other.missed == (missed_by[id(base)] if missed else ()) and found.run is run
+    assert (found.alike is None) == bool(missed) and found.unused == ("angle",) * bool(missed)

@@ -357,7 +357,7 @@ def test_a_shaft_that_stands_for_long_may_be_quick_for_a_while(moves):
     """Through zero from a small angle to a large one, and by more than half a turn a sample."""
     angle = np.concatenate([np.full(50, float(moves[0])), moves, np.full(50, float(moves[-1]))])
     columns = {"output_angle_deg": angle, "time_s": 0.01 * np.arange(len(angle)), "run_id": np.full(len(angle), "a")}
-    contradictions._check_angle(records.Runs("log.csv", columns))
+    contradictions._check_wraps(records.Runs("log.csv", columns), "output_angle_deg")
 
 
 def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
@@ -643,7 +643,8 @@ def test_gaps_and_a_clock_that_jitters_are_said_with_rows_and_remedy(tmp_path, c
     }[case]
     columns["time_s"] = columns["time_s"] + off - off[0]
     robot = bench(tmp_path, columns)
-    (found,) = rig_facts.log_doubts(records.read_runs(tmp_path / "log.csv", robot=robot), robot) or ("",)
+    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    (found,) = (*runs.notes, *rig_facts.log_doubts(runs, robot)) or ("",)
     assert re.search(said, found) and bool(found) == bool(said)
 
 

@@ -14,7 +14,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.masses import masses_of_parts
 from mmrjax.model.signals import CONVERGED, GRAVITY, State
 from mmrjax.turning.two_sides import SIDES, ContactLaw
-from mmrjax.undercarriage import both_sides, half_robot, mjcf, rendering_from_above
+from mmrjax.undercarriage import both_sides, half_robot, mjcf
 from mmrjax.undercarriage.half_robot import build_system
 
 STEP, STEPS = 1e-4, 3000
@@ -248,28 +248,6 @@ def test_friction_rises_as_differences_say_and_never_falls_along_its_sliding(rob
             u = np.asarray(speeds[0])
             assert u @ differences @ u < 0
             assert_allclose(found @ u, 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("contacts", [24, 2])
-def test_a_turn_is_seen_from_above(contacts):
-    """What bears is drawn on its side, as wide as its load. What slides, with an arrow the way it slides."""
-    load = np.zeros((2, 2, contacts))
-    load[:, 0, :2], load[:, 1, 0] = (10.0, 20.0), 5.0
-    q, v = np.zeros((2, 10)), np.zeros((2, 10))
-    v[:, [0, 3]] = 0.2, 1.0
-    along = np.broadcast_to(np.linspace(0.15, -0.15, contacts), load.shape)
-    time, belt = np.array([0.1, 0.2]), np.array([[0.2 - 0.1215, 0.5]] * 2)
-    view = rendering_from_above.TopViewScene("6T2A", 0.1, 0.3, 0.243, time, q, v, np.ones((2, 2)), belt, along, load)
-    axes = view.sheet(0).axes[0]
-    assert "slope 6°, t = 0.100 s" in axes.get_title()
-    bars = [line for line in axes.lines if line.get_zorder() == 4]
-    assert [line.get_linewidth() for line in bars] == pytest.approx([0.8 + 7 * share for share in (0.5, 1.0, 0.25)])
-    assert [np.mean(line.get_xdata()) for line in bars] == pytest.approx([-0.1215, -0.1215, 0.1215])
-    arrows = [a for a in axes.texts if a.arrow_patch is not None and a.get_zorder() == 6]
-    first, last = arrows[0], arrows[-1]
-    moved = [np.subtract(arrow.xy, arrow.xyann) for arrow in (first, last)]
-    assert_allclose(moved[0], [0.15 * 0.15, 0.0], atol=1e-12)  # rear left: to the right alone
-    assert_allclose(moved[1], [-0.15 * 0.15, 0.15 * (0.2 + 0.1215 - 0.5)], atol=1e-12)
 
 
 @pytest.mark.slow

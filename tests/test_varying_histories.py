@@ -250,7 +250,7 @@ def test_defects_of_all_knots_are_a_constant_defect(observer):
         return observer(dataclasses.replace(robot, effects=put)).reading
 
     derivative = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.zeros(len(effects))))
-    defects = np.asarray(jax.jit(lambda r: observer.response_to_errors(r, effects))(robot))
+    defects = np.asarray(jax.jit(lambda r: observer.changes(r, effects, ())[0])(robot))
     rows = np.asarray(observer.rows_of)
     for k in range(len(effects)):
         found, expected = defects[k].sum(1), derivative[..., k]

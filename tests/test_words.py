@@ -32,6 +32,7 @@ from calibration.inference.fit_notes import AdequacyFinding, Remark, progress_re
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
+from calibration.inference.shown_states import MissingStates
 from calibration.words import experiment_words, fit_words, loop_words, step_words, table_words
 from calibration.words.note_words import NOTES
 from mmrjax.model import channels
@@ -216,6 +217,8 @@ SAMPLES = [
     Remark("phases_differ", free=80.4, held=12.0),
     Remark("still_lacks", place="motor_speed", variable="speed_motor"),
     Remark("late", delay=0.0312, sd=0.0004),
+    Remark("late", delay=-0.2, sd=0.001, ends=True),
+    *(Remark("unshown", source="log.csv", why=why.value) for why in MissingStates),
     Remark(
         "led",
         names=("a", "b"),

@@ -237,26 +237,22 @@ def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassi
     if like is not None:
         return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
-        return _blank_chassis(have.members[0], _movers(movers, where), table, where)
+        pattern = dataclasses.replace(have.members[0], on_tracks=_movers(movers, where))
+        defaults = dict(_parameter_defaults(pattern))
+        missing = [name for name, default in defaults.items() if default is None and not _table_states(table, name)]
+        if missing:
+            raise BadConfiguration(
+                f"{where}: with movers instead of like, the configuration must be described "
+                f"completely; {_list_in_words(missing)} missing"
+            )
+        known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
+        return params.replace(pattern, known_values)
     if name in have:
         return have[name]
     raise BadConfiguration(
         f'{where}: the base has no such configuration; set like = "{have.names[0]}" (one of {", ".join(have)}), '
         'or movers = "tracks" or "wheels" and its parameters'
     )
-
-
-def _blank_chassis(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
-    """Chassis with the default of every field that has one. The table must state all others."""
-    defaults = dict(_parameter_defaults(pattern))
-    missing = [name for name, default in defaults.items() if default is None and not _table_states(table, name)]
-    if missing:
-        raise BadConfiguration(
-            f"{where}: with movers instead of like, the configuration must be described "
-            f"completely; {_list_in_words(missing)} missing"
-        )
-    known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
-    return params.replace(dataclasses.replace(pattern, on_tracks=on_tracks), known_values)
 
 
 def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:

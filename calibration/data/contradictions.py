@@ -52,8 +52,9 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
             _check_voltage(runs, robot, column)
     if runs.sampled:
         _check_time_order(runs)
-    if runs.sampled and runs.has("output_angle_deg"):
-        _check_angle(runs)
+        for column in ("output_angle_deg", "position_mm"):
+            if runs.has(column):
+                _check_wraps(runs, column)
 
 
 def reason_without_stance(robot: Robot) -> str | None:
@@ -82,7 +83,7 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
         return None
     if why := reason_without_stance(robot):
         return 0, lever_columns[0], why
-    on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
+    on_tracks = robot.configurations.tracked[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))
         return row, lever_columns[0], reason_without_levers(robot, runs["configuration"][row])
@@ -175,36 +176,45 @@ def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
     return np.nanmedian([padded[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 
 
-def _check_angle(runs: Runs) -> None:
-    angle = runs["output_angle_deg"]
+def _check_wraps(runs: Runs, column: str) -> None:
+    """Rejects an angle or a position that wraps, and an angle in two units. A position wraps at any length, so it
+    also has to jump against its motion.
+    """
+    readings, is_angle, unit = runs[column], column == "output_angle_deg", column.rpartition("_")[2]
+    one = "an angle" if is_angle else "a position"
     for name in np.unique(runs.run_names):
         run_rows = runs.in_order(name)
-        run_rows = run_rows[np.isfinite(angle[run_rows])]
-        step = np.diff(angle[run_rows])
+        run_rows = run_rows[np.isfinite(readings[run_rows])]
+        angle = readings[run_rows]
+        step = np.diff(angle)
         if step.size < 2:
             continue
         usual = np.maximum(np.median(np.abs(step)), _median_of_neighbours(np.abs(step)))
-        jumps = np.flatnonzero(
-            (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
-        )
+        large = np.abs(step) > UNUSUAL * usual
+        if is_angle:
+            large &= (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual)
+        else:
+            large &= (np.abs(step) > np.ptp(angle) / 2) & (step * _median_of_neighbours(step) < 0)
+        jumps = np.flatnonzero(large)
         if jumps.size:
             row, time_steps = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
             gap = time_steps[jumps[0]]
-            why = "like an angle that wraps; expected an angle that keeps counting beyond one turn"
+            why = f"like {one} that wraps; expected {one} that keeps counting"
             if gap > GAP * np.median(time_steps):
                 why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
             raise BadData(
-                f"{runs.source} row {row + 1}, output_angle_deg: jumps by "
-                f"{float(f'{step[jumps[0]]:.4g}'):g} "
-                f"deg from the sample before, {why}"
+                f"{runs.source} row {row + 1}, {column}: jumps by {float(f'{step[jumps[0]]:.4g}'):g} {unit} from the "
+                f"sample before, {why}"
             )
+        if not is_angle:
+            continue
         with np.errstate(divide="ignore", invalid="ignore"):
-            times = np.abs(angle[run_rows][1:] / angle[run_rows][:-1])
+            times = np.abs(angle[1:] / angle[:-1])
         other = np.abs(np.abs(np.log(np.where(times > 0, times, 1.0))) / np.log(RADIAN) - 1) < ALIKE / np.log(RADIAN)
         mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
         if mixed.size:
             row, k = int(run_rows[mixed[0] + 1]), mixed[0]
-            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[run_rows][k : k + 2])
+            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[k : k + 2])
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
                 "if degrees and radians are mixed; write all rows in one unit"

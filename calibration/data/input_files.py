@@ -181,36 +181,38 @@ def toml_text(path: Path, where: str | Path) -> str:
         raise BadConfiguration(f"{where}: not a readable TOML file ({error}); save it in UTF-8") from error
 
 
-def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfiguration) -> Json:
+def toml_content(text: str, where: str | Path) -> Json:
     """Keys and tables of a TOML text.
 
     Args:
         where: beginning of the error message.
-        kind: class of the exception.
 
     Raises:
-        InputError: the text is no TOML, has more than `KEYS` keys, is nested deeper than `DEEPEST` tables, or has a
-            whole number of more than 64 bits.
+        BadConfiguration: the text is no TOML, has more than `KEYS` keys, is nested deeper than `DEEPEST` tables, or
+            has a whole number of more than 64 bits.
     """
+    too_deep = f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels"
     try:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, ValueError) as error:  # more digits than Python converts
-        raise kind(f"{where}: not a readable TOML file ({error})") from error
+        raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
     except RecursionError as error:
-        raise kind(f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels") from error
+        raise BadConfiguration(too_deep) from error
     keys = 0
     pending: list[tuple[Json | list[Any], int]] = [(content, 1)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
-            raise kind(f"{where}: tables or lists are nested too deeply; expected at most {DEEPEST} levels")
+            raise BadConfiguration(too_deep)
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:
-            raise kind(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
+            raise BadConfiguration(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
         for item in inner:
             if isinstance(item, dict | list):
                 pending.append((item, depth + 1))
             elif isinstance(item, int) and not -WHOLE <= item < WHOLE:
-                raise kind(f"{where}: got a whole number beyond 64 bits; expected numbers of at most 18 digits")
+                raise BadConfiguration(
+                    f"{where}: got a whole number beyond 64 bits; expected numbers of at most 18 digits"
+                )
     return content

@@ -130,13 +130,13 @@ class Preset:
                 )
 
 
-def preset_of_table(columns: Mapping[str, Any], where: str = "the stated table") -> Preset:
+def preset_of_table(columns: Mapping[str, Any]) -> Preset:
     """Preset from a table `[columns]`.
 
     Raises:
         BadConfiguration: for the same reasons as `parse_preset`.
     """
-    return _parsed({"columns": dict(columns)}, where, {})
+    return _parsed({"columns": dict(columns)}, "the stated table", {})
 
 
 def find_preset(stated: str | Path) -> Preset:

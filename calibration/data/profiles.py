@@ -182,8 +182,7 @@ class ProfileTable:
         )
         if self.surface is None:
             return made
-        tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])
-        is_tracked = tracks[np.asarray(conditions.configuration)].astype(int)
+        is_tracked = robot.configurations.tracked[np.asarray(conditions.configuration)].astype(int)
 
         def ratio_by_surface(ratio: Callable[[str, bool], float]) -> Array:
             assert self.surface is not None

@@ -8,7 +8,6 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,15 +32,8 @@ LARGEST, LARGEST_V, LARGEST_A = 1e6, 1000.0, 500.0
 POWER = 0.25
 
 
-class Meaning(NamedTuple):
-    """A quantity, and the usual names of its signals."""
-
-    quantity: str
-    pattern: re.Pattern[str]
-
-
-#: The first match wins.
-MEANINGS = tuple(Meaning(quantity, re.compile(pattern)) for quantity, pattern in (
+#: Quantities and the usual names of their signals. The first match wins.
+MEANINGS = tuple((quantity, re.compile(pattern)) for quantity, pattern in (
     ("duty", r"duty|pwm|throttle|motor_?(cmd|command)$"),
     ("supply_voltage", r"(?<![a-z])(bat|bus|supply|input|pack|dc)[^/]*volt|vbat|vbus|u_?bat|\bvin\b"),
     ("motor_voltage", r"(motor|phase|winding|terminal)[^/]*(volt|_v\b)"),
@@ -172,7 +164,7 @@ def _candidate_of_signal(
     if signal.refused:
         return None
     name = _path_words(signal.path)
-    matches = [m.quantity for m in MEANINGS if m.pattern.search(name)]
+    matches = [quantity for quantity, pattern in MEANINGS if pattern.search(name)]
     fitting = [q for q in matches if unit is None or unit in columns[q].values()]
     if not matches and unit is not None and alone and not SENSOR.search(name):
         fitting = [q for q in BY_UNIT if unit in columns[q].values()]

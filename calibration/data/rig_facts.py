@@ -13,9 +13,8 @@ from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied_drive, changing_columns, intervals_by_run
 from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
-from calibration.data.row_checks import time_constant
+from calibration.data.row_checks import JUMP, time_constant
 from calibration.data.runs import Runs
-from mmrjax.errors import count_noun
 from mmrjax.model import channels, params
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot
@@ -260,35 +259,6 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     )
 
 
-#: Time between rows beyond which rows may be missing, in multiples of the usual time.
-LONG = 100.0
-
-
-def _time_steps_of_runs(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """For each run of a log: its name, its rows in order of time, and the time steps between them [s]."""
-    for name in np.unique(runs.run_names) if runs.sampled else ():
-        rows = runs.in_order(name)
-        yield name, rows, np.diff(runs["time_s"][rows])
-
-
-def gap_sentence(runs: Runs) -> str:
-    """Sentence on the longest time step of a log, if rows may be missing there. Otherwise empty."""
-    worst, sentence = 0.0, ""
-    for _, rows, steps in _time_steps_of_runs(runs):
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        long = steps > LONG * usual
-        if not (usual > 0 and long.any() and steps.max() > worst):
-            continue
-        k, worst = int(np.argmax(steps)), float(steps.max())
-        other_gaps = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
-        sentence = (
-            f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
-            f"{three_digits(usual)} s is usual{other_gaps}. A fit keeps the imposed quantity constant in the gap. If "
-            'rows are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
-        )
-    return sentence
-
-
 #: A clock jitters if the time between rows has at least this relative spread and at most this correlation with the
 #: next. Fewest rows.
 UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
@@ -300,11 +270,12 @@ def jitter_sentence(runs: Runs) -> str:
     With even rows and independent clock errors, successive time steps have a correlation of -1/2. If the rows
     themselves are uneven, time steps are independent.
     """
-    for name, rows, steps in _time_steps_of_runs(runs):
+    for name, rows in runs.rows_by_run().items() if runs.sampled else ():
+        steps = np.diff(runs["time_s"][rows])
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
         deviation = np.clip(steps - usual, -usual, usual)
         spread = float(np.std(deviation))
-        if usual <= 0 or spread <= UNEVEN * usual or (steps > LONG * usual).any():
+        if usual <= 0 or spread <= UNEVEN * usual or (steps > JUMP * usual).any():
             continue
         if float(np.mean(deviation[1:] * deviation[:-1])) < TURNS_BACK * spread**2:
             run = f" of run {name}" if name else ""
@@ -365,11 +336,10 @@ def saturation_sentence(runs: Runs) -> str:
     if limited.sum() < ROWS_INNER or np.std(np.abs(predicted[limited])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(limited)[0])
-    column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
-        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The driver limits "
-        f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
+        f"{runs.source} row {row + 1}, {_drive_heading(runs)}: commands {three_digits(drive[row])} V, but current "
+        f"and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The "
+        f"driver limits the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -450,14 +420,18 @@ def still_sentence(runs: Runs) -> str:
     )
 
 
+def _drive_heading(runs: Runs) -> str:
+    column = "duty" if runs.has("duty") else runs.layout.imposed_column
+    return runs.headings.get(column, column)
+
+
 def held_sentence(runs: Runs) -> str:
     """Sentence on readings that repeat their last value while the imposed quantity changes, empty for others."""
-    imposed = runs.layout.imposed_column
-    if not (runs.sampled and runs.has(imposed)):
+    if not (runs.sampled and runs.has(runs.layout.imposed_column)):
         return ""
-    drive, range_ = runs[imposed], float(np.ptp(np.nan_to_num(runs[imposed])))
-    for name in np.unique(runs.run_names):
-        rows = runs.in_order(name)
+    drive = np.nan_to_num(applied_drive(runs))
+    range_ = float(np.ptp(drive))
+    for rows in runs.rows_by_run().values():
         for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
             begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
             for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
@@ -466,34 +440,36 @@ def held_sentence(runs: Runs) -> str:
                     column, last_row = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
                         f"{runs.source} rows {rows[begin] + 1} to {last_row}, {column}: the same reading while "
-                        f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated. Empty "
+                        f"{_drive_heading(runs)} changes, as if the last value was repeated. Empty "
                         "these cells to use the other rows"
                     )
     return ""
 
 
 def swapped_sentence(runs: Runs) -> str:
-    """Sentence on a speed whose sign changes within a log although the drive does not, empty for others."""
-    imposed = runs.layout.imposed_column
-    if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
+    """Sentence on a motion whose sign changes within a log although the drive does not, empty for others."""
+    if not (runs.sampled and runs.has(runs.layout.imposed_column)):
+        return ""
+    drive, of_runs = np.nan_to_num(applied_drive(runs)), list(runs.rows_by_run().values())
+    if not drive.min() < 0 < drive.max():
         return ""  # a signal that never changes sign may lack it, which other checks report
-    for name in np.unique(runs.run_names):
-        rows = runs.in_order(name)
-        for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
-            power = np.nan_to_num(runs[imposed][rows] * readings)
-            total = np.cumsum(power) / max(float(np.abs(power).sum()), 1e-300)
+    for channel, readings in zip(runs.channels, runs.measured().T, strict=True):
+        power = np.zeros(len(drive))
+        for rows in of_runs if channel.zero_at_rest else ():
+            motion = readings[rows] if channel.settled or len(rows) < 2 else np.gradient(readings[rows])
+            power[rows] = np.nan_to_num(drive[rows] * motion)
+            power[rows] /= max(float(np.abs(power[rows]).mean()), 1e-300)
+        for rows in (*of_runs, np.concatenate(of_runs)) if channel.zero_at_rest else ():
+            total = np.cumsum(power[rows]) / max(float(np.abs(power[rows]).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
-            sum_before, sum_after = total[turn], total[-1] - total[turn]
-            if (
-                channel.zero_at_rest
-                and channel.settled
-                and sum_before * sum_after < 0
-                and min(abs(sum_before), abs(sum_after)) > SWAPPED
-            ):
+            sums, parts = (total[turn], total[-1] - total[turn]), np.split(drive[rows], [turn + 1])
+            # Of an angle, both parts need both directions: a load without friction returns its energy as it brakes.
+            both = channel.settled or all(x.min(initial=0.0) < 0 < x.max(initial=0.0) for x in parts)
+            if both and sums[0] * sums[1] < 0 and min(map(abs, sums)) > SWAPPED:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
-                    f"{runs.headings.get(imposed, imposed)}. Correct the sign in one of the two parts"
+                    f"{_drive_heading(runs)}. Correct the sign in one of the two parts"
                 )
     return ""
 
@@ -501,7 +477,6 @@ def swapped_sentence(runs: Runs) -> str:
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
     doubts = (
-        gap_sentence(runs),
         jitter_sentence(runs),
         saturation_sentence(runs),
         constant_conditions_sentence(runs),

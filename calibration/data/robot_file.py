@@ -19,7 +19,6 @@ from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
 from mmrjax.compile.precision import in_double
-from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.errors import list_some, printable
 from mmrjax.model import paper_robots, params, power
@@ -488,7 +487,11 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
         tables[name] = ['load = "shaft"'] if isinstance(load, Shaft) else [f'movers = "{moves}"']
     for effect in robot.effects:
-        tables[f"effects.{effect.name}"] = _lines_of_effect(effect)
+        table = tables[f"effects.{effect.name}"] = []
+        if effect.configurations or type(effect)().configurations:
+            table.append(f"configurations = {toml_value(effect.configurations)}  # in which it acts")
+        if type(effect).plain is not None:
+            table.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
     for title, line in _lines_of_parameters(robot, base_robot):
         tables.setdefault(title, []).append(line)
     for title, line in _rating_lines(robot, base_robot, {name for name, lines in tables.items() if lines}):
@@ -502,15 +505,6 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
             continue
         lines += ["", f"[{title}]", *table]
     write_text(path, "\n".join(lines) + "\n")
-
-
-def _lines_of_effect(effect: Effect) -> list[str]:
-    """Lines of an effect's table other than its parameters."""
-    configurations = effect.configurations or type(effect)().configurations
-    lines = [f"configurations = {toml_value(effect.configurations)}  # in which it acts"] if configurations else []
-    if type(effect).plain is not None:
-        lines.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
-    return lines
 
 
 def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:

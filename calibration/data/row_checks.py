@@ -34,6 +34,8 @@ APART, FEWEST = 2, 12
 SOONER, REGULAR = 0.02, 0.8
 #: Smallest share of rows that repeat the row before, and smallest ratio of the periods of recordings.
 LEAST, ALIKE = 0.3, 0.8
+#: Step of a clock that begins a run, in usual steps, and most of such steps.
+JUMP, MOST_JUMPS = 100.0, 20
 #: If at least this share of changes are by one smallest step, repeats are attributed to the display.
 STEPS = 0.5
 
@@ -172,6 +174,39 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
         "counted in row numbers"
     )
     return is_distinct, (note,) if again.size else ()
+
+
+def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
+    """Gives the rows after a jump of a log's clock a run of their own. Returns a sentence if it jumps.
+
+    Args:
+        at_rest: True if runs begin at rest. Rows after a jump then stay in their run.
+    """
+    if not set(TIME) <= set(columns):
+        return ()
+    time = columns["time_s"]
+    run = columns.get("run_id", np.full(len(time), ""))
+    steps = np.where(run[1:] == run[:-1], np.diff(time), 0.0)
+    usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
+    jumps = np.flatnonzero((steps if at_rest else np.abs(steps)) > JUMP * usual) + 1
+    if usual == 0 or not 0 < len(jumps) <= MOST_JUMPS:
+        return ()
+    first, rows = steps[jumps[0] - 1], ", ".join(str(k + 1) for k in jumps)
+    sentence = (
+        f"{name} row {rows}, time_s: {three_digits(abs(first))} s {'after' if first > 0 else 'earlier than'} the row "
+        f"before it, where {three_digits(usual)} s is usual. "
+    )
+    if at_rest:
+        return (
+            sentence + "A fit keeps the imposed quantity constant in the gap. If rows are missing, set start = "
+            '"measured" in the rig\'s file, so that a new run begins there',
+        )
+    for part, row in enumerate(jumps):
+        after = (np.arange(len(time)) >= row) & (run == run[row])
+        time = np.where(after, time - time[row], time)
+        run = np.where(after, f"{columns['run_id'][row] if 'run_id' in columns else ''} part {part + 2}".strip(), run)
+    columns |= {"time_s": time, "run_id": run}
+    return (sentence + "A new run begins there",)
 
 
 def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:

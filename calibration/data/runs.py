@@ -39,6 +39,7 @@ from calibration.data.table import Runs
 from calibration.data.unread_rows import without_unread
 from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.rig import STARTS
 from mmrjax.model.robot import NO_BRAKE, Robot
 
 __all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "read_runs", "runs_of_arrays", "single_run"]
@@ -156,7 +157,8 @@ def runs_of_arrays(
     is_kept, copied = row_checks.distinct_rows(name, columns)
     columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
-        notes = (*notes, *copied, *_drop_repeats(name, columns, layout))
+        begins = () if robot is None else row_checks.split_at_jumps(name, columns, robot.rig.start == STARTS[0])
+        notes = (*notes, *copied, *begins, *_drop_repeats(name, columns, layout))
     table_instruments = instruments.infer_instruments(layout.instruments, columns)
     unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in table_instruments})

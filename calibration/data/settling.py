@@ -356,7 +356,10 @@ def _settled_signals_of_log(
             is_glitch = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
             for rows in each:
                 smoothed_values[rows] = np.where(is_glitch[rows], np.nan, runs[angle][rows] * factor)
-                readings[rows] = _recent_rate(runs["time_s"][rows], smoothed_values[rows], half)
+                # rate over the last `2 * half` samples, so that samples after a level do not affect its end
+                time, x, k = runs["time_s"][rows], smoothed_values[rows], np.arange(len(smoothed_values[rows]))
+                first_row, last_row = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
+                readings[rows] = (x[last_row] - x[first_row]) / (time[last_row] - time[first_row])
             signals.append(
                 Signal(
                     channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), is_glitch
@@ -427,13 +430,6 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
     levels = np.unique(shown[np.isfinite(shown)])
     coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()
     return float(np.median(np.diff(levels)[np.diff(levels) < 1.5 * np.diff(levels).min()])) if coarse else 0.0
-
-
-def _recent_rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
-    """Rate over the last `2 * half` samples, so that samples after a level do not affect its end."""
-    k = np.arange(len(x))
-    first_row, last_row = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
-    return (x[last_row] - x[first_row]) / (time[last_row] - time[first_row])
 
 
 def _check_alive(runs: Runs, signal: Signal) -> None:

@@ -265,9 +265,7 @@ class Runs:
         is_undriven = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
-            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[
-                configuration_index
-            ]
+            on_tracks = robot.configurations.tracked[configuration_index]
             scaled = surface_labels.rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)

@@ -192,6 +192,16 @@ class CandidateSpace:
 
         return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
 
+    def with_sd(self, sd: np.ndarray) -> CandidateSpace:
+        """Copy with these standard deviations of the readings [SI], shape (rows, channels)."""
+
+        def problem_with_sd(problem: Problem) -> Problem:
+            present = np.isfinite(sd) & (sd > 0)
+            own = np.where(present, sd, np.asarray(problem.data.sd))
+            return dataclasses.replace(problem, data=dataclasses.replace(problem.data, sd=jnp.asarray(own)))
+
+        return dataclasses.replace(self, bare=problem_with_sd(self.bare), equipped=problem_with_sd(self.equipped))
+
     def with_room(self, names: Sequence[str]) -> CandidateSpace:
         """Copy whose compiled fits of time histories include these effects."""
         return dataclasses.replace(self, room=tuple(n for n in self.library.names if n in names))

@@ -14,7 +14,6 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
 from calibration.discovery.projection import explained_function
-from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import fit_by_regression
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
@@ -153,16 +152,6 @@ class Classes:
         ]
 
 
-def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
-    """Similarity of every two effects: largest |cos| of the angle between their projected signatures, over their
-    shapes. Shape (effects, effects).
-    """
-    cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
-    cosines = np.zeros((count, count))
-    np.maximum.at(cosines, (effect[:, None], effect[None, :]), cosine)
-    return cosines
-
-
 def find_classes(
     space: CandidateSpace,
     base: Candidate,
@@ -181,7 +170,10 @@ def find_classes(
         left: diagnosis of the base fit.
         after: diagnosis of the best fit.
     """
-    cosine, names = signature_cosines(space, left.scores), space.library.names
+    names, effect_of = space.library.names, space.library.of
+    # Largest |cos| between the projected signatures of every two effects, over their shapes.
+    cosine = np.zeros((len(names), len(names)))
+    np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(np.asarray(left.scores.cosine)))
     fewer = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     requests: list[tuple[int, str, Names]] = []

@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Json, Names, Priors, own_mass
+from calibration.data import Names, Priors, own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
@@ -32,7 +32,6 @@ from calibration.discovery.classes import (
     ammeter_families,
     errors_of_ammeters,
     find_classes,
-    signature_cosines,
 )
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
@@ -40,7 +39,7 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.log_simulation import LogSimulation, simulate_models
+from calibration.discovery.log_simulation import LogSimulation, refine_by_simulation, simulate_models
 from calibration.discovery.loop_notes import (
     AlternativeValue,
     Mechanism,
@@ -67,6 +66,7 @@ from calibration.discovery.result import (
     FoundEffect,
     HeldOutAlternative,
     NoiseVerdict,
+    ParameterShift,
     ReadingsOfRows,
 )
 from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
@@ -86,10 +86,11 @@ from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.observers.windows import LinearHistories, Windows, problem_of_readings, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
+from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
-from calibration.inference.weak_form import fit_weak_form
+from calibration.inference.weak_form import TENTH, fit_weak_form
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -104,8 +105,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Size of a delay in its sds from which a note reports it.
-LATE = 4.0
+#: Size of a delay in its sds from which a note reports it, and as a share of the longest that is searched.
+LATE, ENDS = 4.0, 0.95
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
@@ -120,6 +121,8 @@ FAR = 3.0
 LONG = 4000
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
+#: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
+RIVALS = 3
 #: Callback for progress notes.
 Tell = Callable[[Remark | str], None]
 
@@ -174,7 +177,9 @@ def discover(
     told, known = dataclasses.replace(ready, progress=tell, keep=keep), ready.noise
     for note in ready.at_first:
         tell(note)
-    traced, notes = keep("verdict", lambda: told.trace(ahead=True)), ready.notes
+    traced = keep("verdict", lambda: told.trace(ahead=True))
+    refuted = remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
+    notes: Notes = tuple(n for n in ready.notes if n not in refuted)
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
@@ -231,6 +236,7 @@ class LoopInput:
         progress: callback for progress messages.
         keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
         known: results for the same table with other sds.
+        begin: fit of the base of a long log to its windows.
         others: open while later programs are compiled on other cores, see `later`. None if there is nothing to
             compile.
     """
@@ -249,6 +255,8 @@ class LoopInput:
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
     equations: CandidateSpace | None = None
+    confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
+    begin: Candidate | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -263,39 +271,55 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
-        if (by_windows := self.trace_windows()) is not None:
+        by_windows, begin = self.trace_windows()
+        if by_windows is not None:
             return by_windows
+        of_readings = self.known is not None and self.known.screened.base.space.bare.observe
+        if self.known is not None and self.known.run is not None and isinstance(of_readings, LinearHistories):
+            equations = self.known.screened.base.space.with_sd(self.noise.sd)
+            confirm = functools.partial(_smallest_confirmed, self.known.run.space, self.settings)
+            traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
+            run = self.known.run
+            refuted = run is not None and run.contradicts and traced.verdict != "none"
+            return dataclasses.replace(traced, verdict="place") if refuted else traced
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
-            base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
+            base_input = dataclasses.replace(self, others=others if ahead else None, later=[], begin=begin)
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
+            if screened.base.space.bare.observe.long and not self.shows_unmodelled_backlash:
+                return _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
-                word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
+                # A rigid base that leaves only noise refutes a backlash.
+                loose = self.shows_unmodelled_backlash and diagnosis.test.rejected
+                word = "undescribed" if missed or loose else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
+            if self.confirm is not None:
+                searched = self.confirm(screened, diagnosis, searched, sds.noise)
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
 
-    def trace_windows(self) -> LoopStages | None:
-        """Stages of the windows of a log with a long run. None if the log does not show its states."""
-        if self.equations is not None or (self.known is not None and self.known.run is None):
-            return None
-        if (equations := equations_of_log(self, LONG)) is None:
-            return None
+    def trace_windows(self) -> tuple[LoopStages | None, Candidate | None]:
+        """Stages of the windows of a log with a long run, and their fit of its base.
+
+        No stages if the windows find nothing, which readings may still do. Neither if they do not show the states.
+        """
+        other = self.known is not None and not isinstance(self.known.screened.base.space.bare.observe, Windows)
+        if self.equations is not None or other or (equations := equations_of_log(self, LONG)) is None:
+            return None, None
 
         def keep(name: str, make: Callable[[], Any]) -> Any:
             """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
             return self.keep(name if name == "ranking" else f"windows {name}", make)
 
         equations = dataclasses.replace(equations, keep=keep)
-        return _confirm_by_simulation(self, equations, equations.trace())
+        traced = equations.trace()
+        return _confirm_by_simulation(self, equations, traced), traced.screened.base.candidate
 
     @functools.cached_property
     def space(self) -> CandidateSpace:
         """Candidate space of the runs."""
-        return build_candidate_space(
-            self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library
-        )
+        return build_candidate_space(self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library)
 
     @property
     def shows_unmodelled_backlash(self) -> bool:
@@ -315,12 +339,13 @@ class LoopInput:
         if before is not None:
             space, near = space.with_room(before.space.room), before.candidate
         else:
-            if (ranking := screen_by_weak_form(space, self.settings)) is not None:
+            if self.begin is not None:  # as near as a simulated fit, and its effects are ranked
+                near = dataclasses.replace(self.begin, simulated=True)
+            elif (ranking := screen_by_weak_form(space, self.settings)) is not None:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 if not self.shows_unmodelled_backlash:
                     ranked.append(self.keep("ranking", make))
-                begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
-                space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
+                near = ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
         self.progress(progress_remark("base"))
@@ -362,8 +387,11 @@ def prepare_loop(
     for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
-    notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
+    unshown = missing_states_remarks(distinct, ready.robot)
+    at_first = (*ready.foreign, *ready.doubted, *unshown, *remarks_with_codes(ready.checked, "lost_motion"))
+    notes_so_far: Notes = (
+        *notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted, *unshown
+    )  # fmt: skip
     output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
@@ -376,6 +404,13 @@ def prepare_loop(
     return LoopInput(
         distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, notes_so_far, at_first
     )
+
+
+def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
+    """Remark on a log that does not show the states of its equations."""
+    read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
+    plan = state_plan_or_reason(robot, read) if read else None
+    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -445,11 +480,6 @@ class LoopStages:
         return [self.standing is None or self.standing.established(m[0]) for m in self._classes]
 
     @property
-    def noise_factor(self) -> float | None:
-        """Geometric mean over channels of the factor on the sds, None if they are unchanged."""
-        return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
-
-    @property
     def families(self) -> Names:
         """Families of the members of each established class, or of the location of a discrepancy without a name."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
@@ -459,27 +489,6 @@ class LoopStages:
         if self.verdict == "mechanism" and self.mechanism is not None:
             return self.mechanism.families
         return () if self.where is None else (self.where.family,)
-
-    @property
-    def events(self) -> tuple[Json, ...]:
-        """Temporary changes: each with its axis, its window, and the numbers of the rows in it."""
-        return () if self.where is None else self._event_entries(self.where.variable)
-
-    @property
-    def events_alike(self) -> tuple[Json, ...]:
-        """Other temporary changes that explain the data as well, in the form of `events`."""
-        alike = () if self.where is None else self.where.variables_alike
-        return tuple(event for variable in alike for event in self._event_entries(variable))
-
-    def _event_entries(self, variable: str) -> tuple[Json, ...]:
-        happens = bases_room.window_from_name(variable)
-        if happens is None or self.where is None:
-            return ()
-        linear = self.left.linear
-        x, _ = linear.curve_variable(self.where.place, happens.axis)
-        inside = self.screened.base.space.included & linear.of_rows(happens.holds(x))
-        rows = [int(k) + 1 for k in np.flatnonzero(inside)]
-        return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
     def simulated(self) -> dict[Names, np.ndarray]:
@@ -775,40 +784,143 @@ def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
     )  # fmt: skip
 
 
-def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages:
-    """Stages of a log's windows after the simulation of the base model and of the chosen one.
+def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: bool) -> LoopStages:
+    """Stages of a log whose readings are linear about the simulated fit of its base, and the simulation of the model
+    that they choose.
 
-    Nothing is missing if the simulated base leaves no more than noise, or if the effects gain no more than chance
-    there. If they gain less than half of what the windows promised, the claim falls by one level.
+    Args:
+        screened, sds: simulated fit of the base, and its noise.
+        ranked: True if the effects have been ranked.
     """
-    screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
-    if given.known is not None:  # only the noise differs
-        refuted = given.known.run is not None and given.known.run.contradicts
-        return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
+    space, settings, measured = screened.base.space, given.settings, given.runs.measured()
+    weight = space.weight.copy()
+    weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
+    problem = space.with_weights(weight).bare
+    z = screened.base.candidate.z[: space.free]
+    posed = problem_of_readings(problem, z, space.library.scored, settings.width)
+    equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+
+    def keep(name: str, make: Callable[[], Any]) -> Any:
+        """Stores a stage apart from the simulated one of this name."""
+        if name == "ranking":
+            return None if ranked else given.keep(name, make)
+        return given.keep(f"readings {name}", make)
+
+    confirm = functools.partial(_smallest_confirmed, space, settings)
+    table = dataclasses.replace(
+        given, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
+    )  # fmt: skip
+    traced = table.trace()
+    if not traced.sds.factors:
+        traced = dataclasses.replace(
+            traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
+        )
+    linear = traced.screened.base
+    space = space.with_sd(traced.sds.noise.sd).with_weights(linear.space.weight)
     given.progress(progress_remark("confirm"))
-    base, best = screened.base.candidate, traced.best
-    if searched is None or beside is None:
-        return dataclasses.replace(traced, run=simulate_models(given.space, base, base, given.settings))
-    if best is base:
-        named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
-        best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
-    run = simulate_models(given.space, base, best, given.settings)
-    confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
-    noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
-    if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
-        left, run = dataclasses.replace(left, test=confirmed), dataclasses.replace(run, best=run.base)
-        return LoopStages("none", screened, left, traced.sds, unused=traced.unused, run=run)
+    best = _chosen_fit(traced)
+    space = space if traced.searched is None else space.with_room(traced.searched.room)
+    run = simulate_models(space, linear.candidate, best, settings)
     traced = dataclasses.replace(traced, run=run)
-    if not run.contradicts or traced.verdict == "place":
+    if traced.searched is None:
+        return traced
+    confirmed = traced.left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    if not confirmed.rejected and traced.screened.cluster is None:
+        left = dataclasses.replace(traced.left, test=confirmed)
+        none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
+        return LoopStages("none", traced.screened, left, traced.sds, run=none)
+    return _lower_if_contradicted(table, traced)
+
+
+def _smallest_confirmed(
+    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
+    noise: Noise,
+) -> SearchResult:  # fmt: skip
+    """The search with the smallest set whose simulation leaves no discrepancy, or the largest set, and the diagnosis
+    of its simulation.
+
+    Readings are linear near the fit of the base only. A large effect therefore leaves residuals that another one
+    would explain.
+
+    Args:
+        space: space of the simulated log.
+        screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
+        noise: noise of the readings.
+    """
+    best = searched.best
+    if best is None or searched.diagnosis is None:
+        return searched
+    if len(best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
+        return searched
+    alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
+    sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
+    space = space.with_sd(noise.sd).with_weights(screened.base.space.weight)
+    space = space.with_room([name for sets in sizes for c in sets for name in c.effects])
+    for sets in filter(None, sizes):
+        fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
+        k = min(range(len(fits)), key=lambda k: fits[k].cost)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings)
+        searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
+        if not diagnosis.test.rejected_with_margin:
+            break
+    return searched
+
+
+def _chosen_fit(traced: LoopStages) -> Candidate:
+    """Fit of the verdict: the proposal, or else the best set of its mechanism."""
+    base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
+    if searched is None or traced.best is not base:
+        return traced.best
+    named = frozenset(() if mechanism is None else mechanism.effects)
+    return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+
+
+def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
+    """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
+    run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
+    if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
         return traced
     if traced.verdict == "mechanism":
         return dataclasses.replace(traced, verdict="place")
     mechanism = find_mechanism(
-        screened.base.space, windows.runs, base, left, searched.ladder, screened.bases, beside, traced.predicted,
-        windows.settings,
+        screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
+        traced.predicted, windows.settings,
     )  # fmt: skip
     level = "place" if mechanism is None or mechanism.fails else "mechanism"
     return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+
+
+def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
+    """Stages of a log's windows after the simulation of the base model and of the chosen one.
+
+    None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
+    gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
+    level. No effect is named if the simulation misses a channel.
+    """
+    screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+
+    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
+        return LoopStages("undescribed", screened, left, traced.sds, searched, beside=beside, run=traced.run,
+                          predicted=traced.predicted, missed=missed, unused=unused_inputs(given.runs))  # fmt: skip
+
+    if given.known is not None:  # only the noise differs
+        if given.known.verdict == "undescribed":
+            return undescribed(given.known.missed)
+        refuted = given.known.run is not None and given.known.run.contradicts
+        return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
+    if searched is None or beside is None:
+        return None
+    given.progress(progress_remark("confirm"))
+    base, best = screened.base.candidate, _chosen_fit(traced)
+    run = simulate_models(given.space, base, best, given.settings)
+    confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
+    if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
+        return None
+    traced = dataclasses.replace(traced, run=run)
+    linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
+    refit, fit = (missed_channels(run.space, given.runs, given.noise, x) for x in linear)
+    return undescribed(refit) if fit else _lower_if_contradicted(windows, traced)
 
 
 # --- stages without a module of their own ---------------------------------------------------------------
@@ -926,12 +1038,6 @@ def diagnose_base_by_bootstrap(
     return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 
 
-def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
-    """Number of rows after which a table repeats itself exactly, or all of its rows."""
-    rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
-    return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
-
-
 def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     """Runs without exact copies, their row numbers, and remarks on the copies.
 
@@ -948,7 +1054,9 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
             (copies if row in seen_columns else keep).append(k)
             seen_columns.add(row)
     else:
-        first_rows = _rows_until_repeat(columns)
+        rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
+        # rows after which the table repeats itself exactly, or all of its rows
+        first_rows = next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
         keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
@@ -1012,17 +1120,14 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
 def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
-    screened, diagnosis, noise, nameless = (
-        traced.screened,
-        traced.left,
-        traced.sds.noise,
-        traced.verdict in WITHOUT_NAME,
-    )
+    screened, diagnosis, noise = traced.screened, traced.left, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
+    nameless = traced.verdict in WITHOUT_NAME
     decided, shown = (space, best), diagnosis
     if (run := traced.run) is not None:
         best = run.base if best is base else run.best
-        space, base, noise, traced = run.space, run.base, given.noise, dataclasses.replace(traced, predicted={})
+        noise = noise if space.bare.observe.reads else given.noise
+        space, base, traced = run.space, run.base, dataclasses.replace(traced, predicted={})
         shown, ends = run.diagnosis(base, diagnosis), run.diagnosis(best, ends)
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
@@ -1053,7 +1158,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, of_fit = (best, traced.ends if run is None else ends) if written else (base, shown)
+        fit, of_fit = (best, ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
@@ -1063,21 +1168,18 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         simulated = np.where(included[:, None], simulated, np.nan)
         return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
-    ladder = () if traced.searched is None else traced.searched.ladder
-    ladder = ladder if traced.alike is None else traced.alike.ladder
-    cost_there = cost if run is None else decided[1].cost
+    ladder = () if traced.searched is None else (traced.alike or traced.searched).ladder
+    cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
-        named = best if run is None else dataclasses.replace(best, cost=decided[1].cost)
-        base_there = screened.base.candidate
+        named, base_there = dataclasses.replace(best, cost=decided[1].cost), screened.base.candidate
         found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
         if not nameless and run is None:
             ask = observe.menu and not observe.long
             concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
     scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
-    library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -1091,7 +1193,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         runs=runs,
         numbers=numbers,
         included=included,
-        outliers=() if run is not None else tuple(int(numbers[k]) for k in screened.outliers),
+        outliers=tuple(int(numbers[k]) for k in screened.outliers if screened.base.space.bare.observe.reads),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
         unnamed=None
@@ -1116,7 +1218,6 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=scores,
-        cosine=signature_cosines(decided[0], diagnosis.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, shown, ends),
         readings_of_rows=row_readings,
         errors_as_stated=error(row_readings.as_stated),
@@ -1132,7 +1233,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         replicates=len(diagnosis.test.null.single),
     )
     # A temporary change is not uniform.
-    of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    is_event = traced.where is not None and bases_room.window_from_name(traced.where.variable) is not None
+    of_noise = () if is_event and not traced.sds.factors else noise_remarks_before_verdict(traced.sds, remaining)
     if run is not None and run.contradicts:
         of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(
@@ -1268,8 +1370,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
     delay = found.base_shift.get(priors.DELAY)
-    if delay is not None and priors.DELAY not in found.robot.rig.stated and abs(delay.after) > LATE * delay.sd_after:
-        remarks.append(Remark("late", delay=delay.after, sd=delay.sd_after))
+    remarks += delay_remarks(found.runs, delay, priors.DELAY in found.robot.rig.stated) if delay is not None else []
     if found.remains is not None:
         remarks.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
     names = [e.name for e in found.effects]
@@ -1285,6 +1386,15 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if 1 / (1 + settled) > min(found.settings.shares.values()):
         remarks.append(Remark("too_few_replicates", settled=settled))
     return tuple(remarks)
+
+
+def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remark]:
+    """Remark on a delay that the robot's file does not state, or that is the longest of the search."""
+    limit = TENTH * float(np.median([runs["time_s"][rows].max() for rows in runs.rows_by_run().values()]))
+    ends = abs(delay.after) > ENDS * limit
+    if abs(delay.after) <= LATE * delay.sd_after or (stated and not ends):
+        return []
+    return [Remark("late", delay=delay.after, sd=delay.sd_after, ends=ends)]
 
 
 def _repeat_run_remark(found: DiscoveryResult, test: NameTest) -> Remark:

@@ -276,12 +276,14 @@ def fit_discrepancy(
     grid = np.linspace(at_base.low, at_base.high, POINTS)
     shape = at_base.scale * at_base.basis(grid) @ at_base.root
     ordinates = covariance[inner:, inner:]
+    robot = problem.robot(jnp.asarray(z))  # also has the absent effects of the slots
+    names = {e.name for e in space.bare.base.effects} | set(base.effects) | {at_base.effect}
     return Discrepancy(
         balance=balance,
         variable=variable,
         unit=PLACES[balance][0],
         effect=at_base.effect,
-        robot=_without_absent_effects(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
+        robot=dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names)),
         defect=balance_error_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
         curve=shape @ z[inner:],
@@ -346,9 +348,3 @@ def _problem_with_curve(space: CandidateSpace, base: Candidate, curve: SmoothCur
     shaped = CurveCoordinates(problem.coordinates, jnp.asarray(curve.root), names)
     data = dataclasses.replace(problem.data, centre=jnp.zeros(len(shaped)))
     return dataclasses.replace(problem, base=robot, coordinates=shaped, data=data)
-
-
-def _without_absent_effects(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
-    """Robot with only its own effects, those of the fit, and the curve."""
-    names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
-    return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

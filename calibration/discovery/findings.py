@@ -56,13 +56,6 @@ from mmrjax.effects import Effect
 from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
 
-
-def equation_and_source(effect: Effect) -> tuple[str, str]:
-    """Equation and source of an effect, from its docstring."""
-    head, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
-    return " ".join(head.split()), " ".join(source.split())
-
-
 # --- effects --------------------------------------------------------------------------------------------
 
 
@@ -81,7 +74,7 @@ def found_effects(
     effects = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
-        words, source = equation_and_source(effect)
+        equation, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
         effects.append(
             FoundEffect(
                 name=effect.name,
@@ -90,8 +83,8 @@ def found_effects(
                 families=found.families[slot],
                 balance=effect.balance,
                 unit=BALANCES[effect.balance][0],
-                equation=words,
-                source=source,
+                equation=" ".join(equation.split()),
+                source=" ".join(source.split()),
                 parameters=_effect_parameters(space, best, slot, settings),
                 p_value=single_p_value(gains[slot], null),
                 score=float(gains[slot]),

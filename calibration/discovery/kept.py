@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import Any
 
-T = TypeVar("T")
+#: Function that returns the stored result of a stage, or else computes and stores it.
+StoreStage = Callable[[str, Callable[[], Any]], Any]
 #: File of the robot as fitted, without effects that were found; it is written as soon as it is known.
 REFIT_FILE = "fitted.toml"
 
 
-class StoreStage(Protocol):
-    """Type of a function that returns the stored result of a stage, or else computes and stores it."""
-
-    def __call__(self, name: str, make: Callable[[], T]) -> T: ...
-
-
-def compute_without_storing(name: str, make: Callable[[], T]) -> T:
+def compute_without_storing(name: str, make: Callable[[], Any]) -> Any:
     """Computes the result of a stage without storing it."""
     return make()
 

@@ -32,7 +32,8 @@ def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear
     problem = space.bare if size == space.free else space.equipped
     informed = jacobian[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
-    return _posterior_of_coordinates(problem.coordinates, space, active, np.asarray(z)[:size], covariance)
+    parts, kept_places = _coordinate_groups(problem.coordinates, space, active, np.asarray(z)[:size])
+    return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
 
 
 def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
@@ -51,17 +52,6 @@ def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy)
     places = [*kept_places, *range(inner, len(shaped))]
     covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
     return join_posteriors([*base, ordinates], covariance)
-
-
-def _posterior_of_coordinates(
-    coordinates: Coordinates | ActiveSet,
-    space: CandidateSpace,
-    active: Names,
-    z: np.ndarray,
-    covariance: np.ndarray,
-) -> Posterior:
-    parts, kept_places = _coordinate_groups(coordinates, space, active, z)
-    return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
 
 
 def _coordinate_groups(

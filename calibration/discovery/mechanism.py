@@ -90,7 +90,11 @@ def find_mechanism(
         else location_families[:1]
     )
     for leader in (*by_name[:1], *curve, *by_name[1:]):
-        refuted = leader in by_name and _refuted_by_curve(space, base, best[leader], left, bases, settings)
+        # A driver whose form a curve refutes is no better than those that smooth curves cannot separate.
+        refuted = leader in by_name and (
+            evidence_over_curves(space, best[leader], base, best[leader].effects, left.linear, bases, settings)
+            < -BETTER
+        )
         others = (
             [*alike, *location_families] if refuted else alike if leader in by_name else [*alike, *other_families]
         )
@@ -209,16 +213,6 @@ def _same_driver_elsewhere(family: str, where: DiscrepancyLocation) -> Names:
     subject, joint, driver = family.partition(" that ")
     alike = dict.fromkeys(equation for equation, *_ in equations)
     return tuple(f"{other}{joint}{driver}" for other in alike) if subject in alike else ()
-
-
-def _refuted_by_curve(
-    space: CandidateSpace, base: Candidate, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings
-) -> bool:
-    """True if a smooth curve in their equation refutes the form of a family's effects.
-
-    Their driver is then no better than those that smooth curves cannot separate.
-    """
-    return evidence_over_curves(space, best, base, best.effects, left.linear, bases, settings) < -BETTER
 
 
 def _families_of_location(where: DiscrepancyLocation) -> Names:

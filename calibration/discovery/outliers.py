@@ -176,7 +176,10 @@ def compile_ahead(
             bases, (linear, _, _) = _diagnose_base(start, bases_at, settings)
         finally:
             looked.set()
-        bootstrap_statistics(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
+        if not space.bare.observe.long:
+            bootstrap_statistics(
+                space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed
+            )
 
     def compile_fit() -> None:
         if space.bare.observe.long:  # its programs depend on the effects found, which are not known yet

@@ -452,8 +452,6 @@ class DiscoveryResult:
         readings: number of included readings.
         base_shift: each base parameter without and with the proposal.
         scores: scores of the library at the base fit, strongest first.
-        cosine: |cos| between the projected signatures of every two effects, shape (scores, scores), in the order of
-            `scores`.
         detail: further findings for this kind of data: errors of equations by run, or memory, orders and drift.
         readings_of_rows: measured and simulated readings of each row.
         errors_as_stated: rms error of each channel for the robot before any fit.
@@ -502,7 +500,6 @@ class DiscoveryResult:
     readings: int
     base_shift: dict[str, ParameterShift]
     scores: tuple[EffectScore, ...]
-    cosine: np.ndarray
     detail: Detail
     readings_of_rows: ReadingsOfRows
     errors_as_stated: Errors

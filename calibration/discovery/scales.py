@@ -97,7 +97,9 @@ def scale_library(robot: Robot, conditions: Conditions, library: Library, turned
     """
     if robot.rig.inherits:
         return library
-    signals = _operating_signals(robot, _steady_conditions(robot, conditions))
+    # of conditions that vary in time, those in the middle of each run
+    steady = jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
+    signals = _operating_signals(robot, steady)
     nominal, effect_signals = _nominal_signals()
     sized = {}
     for name, kind in library.items():
@@ -149,11 +151,6 @@ def effect_applies(kind: type[Effect], robot: Robot) -> bool:
     if kind.driver == "position" and not set(PLACED) & set(robot.rig.channels):
         return False
     return kind.balance != "sensor" or kind.channel in robot.rig.channels
-
-
-def _steady_conditions(robot: Robot, conditions: Conditions) -> Conditions:
-    """Conditions at one instant in the middle of each run, where they may vary in time."""
-    return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
 
 
 def _operating_signals(robot: Robot, conditions: Conditions) -> Signals:

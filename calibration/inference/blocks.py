@@ -31,11 +31,11 @@ BLOCKS: dict[str, Names] = {
 TURN, PART = "turn", "part"
 
 
-def kind_in_words(by: str, joint: str = " and ") -> str:
-    """Name of a kind of block in words. `joint` is put between two conditions."""
+def kind_in_words(by: str) -> str:
+    """Name of a kind of block in words."""
     for quantity in ("motor_speed", "load_torque"):
         by = by.replace(quantity, quantity.replace("_", " "))
-    return by.replace("_", joint)
+    return by.replace("_", " and ")
 
 
 #: Columns of blocks that are labels rather than conditions.

@@ -383,7 +383,7 @@ def _calibration_result(
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = scans.scans_at_optimum(posed, z)
+    scanned = {k: scans.scan_coordinate(posed, z, posed.data, k) for k in scans.scanned_coordinates(posed)}
     about = scans.with_scanned_sds(about, scanned)
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [

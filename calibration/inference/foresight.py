@@ -78,25 +78,19 @@ class InformationForecast:
     separating: tuple[Names, ...] = ()
 
 
-def predict_identifiability(
-    runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
-) -> InformationForecast:
+def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
     """Predicts which parameters of `robot` the runs can determine, from the linear analysis at the values of its
     file.
 
-    Rows that the robot does not reach with these values are ignored.
-
-    Args:
-        noise: standard deviations, in the format of `noise.parse_noise`. None: from the sd columns of the file, or
-            shares of the readings.
-        rows: largest number of rows. Larger tables are thinned.
+    Rows that the robot does not reach with these values are ignored. The noise is that of the sd columns of the file,
+    or shares of the readings.
 
     Raises:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be fitted.
     """
-    runs = used_rows(runs, robot, rows)
-    ready = prepare_input(runs, robot, noise)
+    runs = used_rows(runs, robot, ROWS)
+    ready = prepare_input(runs, robot)
     observe, robot, table_noise = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.loop_parameter_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)

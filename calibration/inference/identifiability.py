@@ -183,15 +183,12 @@ def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> optimiz
     return jax.vmap(lambda z, pin: optimizers.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
 
 
-def profile_likelihoods(
-    problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None
-) -> ProfileLikelihoods:
+def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifiability) -> ProfileLikelihoods:
     """Profile likelihoods of all parameters. All points of all profiles are refitted in one batch.
 
     Each refit starts where the linear analysis expects the other parameters. The ends of an interval are interpolated
     on the signed square root of the rise, which is straight for a linear model.
     """
-    data = problem.data if data is None else data
     centre, size = np.asarray(z), len(about.names)
     steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
     pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
@@ -199,7 +196,7 @@ def profile_likelihoods(
     starts = centre + direction_of[:, None, :] * (pinned - centre[:, None])[..., None]
     pinned_names = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     pins = Pin(jnp.asarray(pinned_names.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
-    profiles = _profiles(problem, data, pins.at, pins)
+    profiles = _profiles(problem, problem.data, pins.at, pins)
     rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)

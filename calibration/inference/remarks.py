@@ -18,23 +18,34 @@ from mmrjax.model.signals import DONE, STATUSES
 FAR = 3.0
 
 
-def calibration_remarks(found: CalibrationResult) -> list[Remark]:
-    """All remarks."""
-    return [
-        *_noise_remarks(found),
-        *_search_remarks(found),
-        *(Remark("residual_cluster", cluster=c) for c in found.residual_clusters),
-        *_status_remarks(found),
-        *_parameter_remarks(found),
-        *_limit_remarks(found),
-        *_block_remarks(found),
-    ]
-
-
-def _noise_remarks(found: CalibrationResult) -> Iterator[Remark]:
+def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
+    """Remarks on noise, search, rows, parameters, limits and held-out blocks."""
     shares = ((c.name, found.noise[c.name].estimated_percent) for c in found.channels)
     if estimated := tuple((name, percent) for name, percent in shares if percent is not None):
         yield Remark("estimated_noise", percent=estimated)
+    yield from _search_remarks(found)
+    yield from (Remark("residual_cluster", cluster=c) for c in found.residual_clusters)
+    for k, word in enumerate(STATUSES):
+        if k not in DONE and np.any(found.status == word):
+            yield Remark("of_rows", rows=row_numbers(found.status == word), what=word)
+    yield from _parameter_remarks(found)
+    limited = found.adhesion_used > 1 - MARGIN
+    if limited.any():
+        yield Remark("of_rows", rows=row_numbers(limited), what="limited", share=MARGIN)
+    for configuration in found.robot.configurations:
+        friction = f"{configuration}.{priors.GUIDE_FRICTION}"
+        share = f"{configuration}.{priors.GUIDE_SHARE}"
+        if share in found.parameters:
+            yield Remark("product_alone", friction=friction, share=share, free=friction in found.parameters)
+    for kind, block_errors in found.held_out.items():
+        if block_errors.unreachable_rows:
+            yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
+    for kind, similar_kinds in found.held_out_alike.items():
+        if similar_kinds:
+            yield Remark("same_predictions", kind=kind, others=similar_kinds)
+    for kind, block_errors in found.held_out.items():
+        if not all(block.converged for block in block_errors.blocks.values()):
+            yield Remark("block_not_converged", kind=kind)
 
 
 def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
@@ -58,12 +69,6 @@ def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
         yield found.starts.agreement
 
 
-def _status_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    for k, word in enumerate(STATUSES):
-        if k not in DONE and np.any(found.status == word):
-            yield Remark("of_rows", rows=row_numbers(found.status == word), what=word)
-
-
 def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
     far_names = {
         name for name, p in found.parameters.items() if abs(p.shift) > FAR
@@ -81,29 +86,6 @@ def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for name, p in found.parameters.items() if found.searched is not None else ():
         if EDGE < abs(p.shift) <= FAR and not p.at_bound:
             yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="edge")
-
-
-def _limit_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    limited = found.adhesion_used > 1 - MARGIN
-    if limited.any():
-        yield Remark("of_rows", rows=row_numbers(limited), what="limited", share=MARGIN)
-    for configuration in found.robot.configurations:
-        friction = f"{configuration}.{priors.GUIDE_FRICTION}"
-        share = f"{configuration}.{priors.GUIDE_SHARE}"
-        if share in found.parameters:
-            yield Remark("product_alone", friction=friction, share=share, free=friction in found.parameters)
-
-
-def _block_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    for kind, block_errors in found.held_out.items():
-        if block_errors.unreachable_rows:
-            yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
-    for kind, similar_kinds in found.held_out_alike.items():
-        if similar_kinds:
-            yield Remark("same_predictions", kind=kind, others=similar_kinds)
-    for kind, block_errors in found.held_out.items():
-        if not all(block.converged for block in block_errors.blocks.values()):
-            yield Remark("block_not_converged", kind=kind)
 
 
 def row_numbers(which: np.ndarray) -> tuple[int, ...]:

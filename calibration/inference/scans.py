@@ -191,11 +191,6 @@ def search_lower_minima(
     return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
 
 
-def scans_at_optimum(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
-    """Scan of each scanned coordinate at an optimum."""
-    return {k: scan_coordinate(problem, z, problem.data, k) for k in scanned_coordinates(problem)}
-
-
 def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
     """Linear analysis in which the sds of scanned coordinates come from their scans. Correlations are kept."""
     sd = about.sd.copy()

@@ -26,6 +26,7 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CURRENT, VOLTAGE
+from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 
 #: Length of a window in correlation times of the motion and in rows, at least; its points, about; its fewest rows;
@@ -89,14 +90,22 @@ class StatePlan(eqx.Module):
 
 def state_plan(problem: Problem) -> StatePlan | None:
     """State plan of a log. None if the log does not show the states."""
-    plan = state_plan_or_reason(problem)
+    counts = np.asarray(problem.data.weight).sum(0) > 0
+    duty: Any = problem.observe.of_rows.duty  # type: ignore[attr-defined]
+    channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
+    plan = state_plan_or_reason(problem.base, channels_read, bool(np.ptp(np.asarray(duty)) > 0))
     return plan if isinstance(plan, StatePlan) else None
 
 
-def state_plan_or_reason(problem: Problem) -> StatePlan | MissingStates:
-    """State plan of a log, or the reason why it has no plan."""
-    robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
-    channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
+def state_plan_or_reason(
+    robot: Robot, channels_read: Mapping[int, Channel], pulsed: bool = False
+) -> StatePlan | MissingStates:
+    """State plan of a log, or the reason why it has no plan.
+
+    Args:
+        channels_read: channels with readings, by index.
+        pulsed: True if the duty changes.
+    """
     if robot.rig.turns:
         return MissingStates.TURN
     if robot.rig.follows_goal:
@@ -106,7 +115,6 @@ def state_plan_or_reason(problem: Problem) -> StatePlan | MissingStates:
     if {c.name for c in channels_read.values()} & robot.rig.magnitudes:
         return MissingStates.SIGN
     imposed = robot.rig.imposed
-    pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
     current_channel = "total_current"  # proportional to the duty of pulses
     currents = {k: c.name == current_channel for k, c in channels_read.items() if c.rests_on == CURRENT}
     voltages = [k for k, c in channels_read.items() if c.rests_on == VOLTAGE]
@@ -205,7 +213,10 @@ class ImposedCourse:
         mean, drift = {}, {}
         for name, x in self.integrals.items():
             mean[name] = (np.interp(high, self.time, x) - np.interp(low, self.time, x)) / (high - low)
-            ends = [self.values[name][np.searchsorted(self.time, t, side="right") - 1] for t in (low + inner, high - inner)]
+            ends = [
+                self.values[name][np.searchsorted(self.time, t, side="right") - 1]
+                for t in (low + inner, high - inner)
+            ]
             drift[name] = (ends[0] - ends[1]) / (high - low)
         return mean, drift
 

@@ -390,29 +390,6 @@ def memory_by_point(
 # --- a delay --------------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class FittedDelay:
-    """Delay that fits the equations of a log best.
-
-    Attributes:
-        value: delay of the imposed quantity after the time that its column states [s]. Negative if earlier.
-        limit: largest delay that was tried [s].
-        ended: True if the best delay is at that limit.
-    """
-
-    value: float
-    limit: float
-    ended: bool
-
-    def start(self, problem: Problem) -> np.ndarray:
-        """Coordinates of the prior mean with this delay, which windows without jumps may not show."""
-        coordinates, z = problem.coordinates, np.array(problem.data.centre)
-        if DELAY in coordinates.names:
-            k = coordinates.names.index(DELAY)
-            z[k] = (self.value - float(coordinates.value(z)[k])) / float(coordinates.spread[k])
-        return z
-
-
 @functools.partial(compiled, options=SELDOM)
 def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z: Array) -> Array:
     """Terms f and y and their derivatives with respect to z, shape (2, points, equations, 1 + coordinates)."""
@@ -438,8 +415,9 @@ def _with_imposed(rows: LogPoints, given: Columns) -> LogPoints:
     return dataclasses.replace(rows, conditions=conditions, drift={})
 
 
-def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
-    """Fits the delay of a log by a profile of its regression, over a tenth of a run in either direction.
+def fit_delay(problem: Problem, plan: StatePlan) -> float:
+    """Delay of the imposed quantity after the time that its column states [s], negative if earlier: the best of a
+    profile of the regression, over a tenth of a run in either direction.
 
     The terms are nearly affine in the imposed quantities, so a few evaluations serve all delays. The windows contain
     jumps, because jumps show a delay best. If several delays fit equally well, as with a periodic input, the shortest
@@ -447,11 +425,11 @@ def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
     """
     file_delay = float(np.max(np.asarray(problem.base.rig.delay)))
     if DELAY not in problem.coordinates.names:
-        return FittedDelay(file_delay, 0.0, False)
+        return file_delay
     rows, course, cut = points_and_windows(problem, plan, across=True)
     time, since = np.asarray(rows.time), np.asarray(rows.since)
     if not (cut and rows.drift):
-        return FittedDelay(file_delay, 0.0, False)
+        return file_delay
     step = float(np.median(since[since > 0]))
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
@@ -509,7 +487,7 @@ def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
         k = int(np.argmin(np.abs(delays)))
         k = k if cost[k] < SAME else int(np.argmin(np.where(lows, np.abs(delays), np.inf)))
         best, z = float(delays[k]), np.clip(ends[k], -NEAR, NEAR)
-    return FittedDelay(best if abs(best) > RESOLVED * step else 0.0, limit, bool(abs(best) > limit - step))
+    return best if abs(best) > RESOLVED * step else 0.0
 
 
 # --- the regression -------------------------------------------------------------------------------------------
@@ -559,7 +537,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
     if plan is None:
         return None
     late = fit_delay(problem, plan)
-    rows, _, cut = points_and_windows(problem, plan, late.value)
+    rows, _, cut = points_and_windows(problem, plan, late)
     cut = [w.part(k) for w in cut for k in np.array_split(np.arange(len(w.rows)), -(-len(w.rows) // TOGETHER))]
     equations = plan.electrical + plan.mechanical + len(plan.others)
     if equations * sum(len(w.rows) for w in cut) < ENOUGH * len(problem.coordinates):
@@ -614,7 +592,10 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         return at
 
     states: list[Any] = []
-    centre = late.start(problem)
+    coordinates, centre = problem.coordinates, np.array(problem.data.centre)
+    if DELAY in coordinates.names:  # windows without jumps may not show it
+        k = coordinates.names.index(DELAY)
+        centre[k] = (late - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
     z, size = centre, len(centre)
     try:
         for _ in range(ROUNDS):

@@ -240,18 +240,12 @@ def _outputs(
     if source in fidelities.TABLE:
         results = evaluate_points(variation, source, values, conditions, options, names)
     else:
-        results = _derived(variation, source, names, values, conditions)
+        conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
+        compute = derived.compute_function(source)
+        every_result = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
+        results = {name: every_result[name] for name in (*names, STATUS)}
     solved = is_done(results[STATUS])
     return {name: x if name == STATUS else jnp.where(solved, x, jnp.nan) for name, x in results.items()}
-
-
-def _derived(
-    variation: Variation, source: str, names: Names, values: Array, conditions: Conditions
-) -> dict[str, Array]:
-    conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
-    compute = derived.compute_function(source)
-    results = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
-    return {name: results[name] for name in (*names, STATUS)}
 
 
 _values = compiled(_outputs)

@@ -316,7 +316,17 @@ class SensitivityResult:
                 name: {"derivative": study.derivative[:, k], "elasticity": study.elasticity[:, k]}
                 for k, name in enumerate(self.names)
             }
-        return _estimates_by_input(self.names, study.overall)
+        return {
+            name: {
+                key: value
+                for word, e in study.overall.items()
+                for key, value in (
+                    (word, float(e.value[k])),
+                    (f"{word}_interval", [float(e.low[k]), float(e.high[k])]),
+                )
+            }
+            for k, name in enumerate(self.names)
+        }
 
     def tables(self) -> dict[str, Columns]:
         """CSV tables by file name: derivatives and swings at each point, indices over all points and at each
@@ -353,17 +363,6 @@ class SensitivityResult:
             for file, tables in tables_by_file.items()
             if tables
         }
-
-
-def _estimates_by_input(names: Names, estimates: dict[str, IntervalEstimate]) -> Json:
-    return {
-        name: {
-            key: value
-            for word, e in estimates.items()
-            for key, value in ((word, float(e.value[k])), (f"{word}_interval", [float(e.low[k]), float(e.high[k])]))
-        }
-        for k, name in enumerate(names)
-    }
 
 
 def interactions(study: OutputStudy, names: Names) -> list[Interaction]:

@@ -50,13 +50,13 @@ class SobolDesign:
         return (2 * self.inputs if self.second else self.inputs) + 2
 
 
-def base_point_count(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
+def base_point_count(evaluations: float, inputs: int, second: bool) -> int:
     """Number of base points of a replicate for at least this many evaluations: a power of 2."""
     blocks = (2 * inputs if second else inputs) + 2
-    return 2 ** max(math.ceil(math.log2(max(evaluations / (replicates * blocks), FEWEST))), 0)
+    return 2 ** max(math.ceil(math.log2(max(evaluations / (REPLICATES * blocks), FEWEST))), 0)
 
 
-def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> SobolDesign:
+def sobol_design(inputs: int, size: int, seed: int, second: bool = True) -> SobolDesign:
     """Design of independent replicates, each a Sobol sequence with its own scrambling.
 
     Args:
@@ -70,9 +70,9 @@ def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replica
         "names": [str(k) for k in range(inputs)],
         "bounds": [[0.0, 1.0]] * inputs,
     }
-    generators = np.random.default_rng(seed).spawn(replicates)
+    generators = np.random.default_rng(seed).spawn(REPLICATES)
     parts = [sampling.sample(problem, size, calc_second_order=second, seed=rng) for rng in generators]
-    return SobolDesign(np.concatenate(parts), size, second, replicates)
+    return SobolDesign(np.concatenate(parts), size, second, REPLICATES)
 
 
 @dataclasses.dataclass(frozen=True)

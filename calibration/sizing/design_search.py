@@ -402,8 +402,18 @@ class _DesignSearch:
         return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
 
     def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _EvaluatedDesigns:
-        """Refines designs in shrinking boxes around them, see `_refine_designs`."""
-        x, count = _refine_designs(self.problem, self.choice, rows, x, self.kept, weights, free)
+        """Refines designs in shrinking boxes around them. `free`: 1 for continuous numbers that may move."""
+        choice = self.choice
+        axes = [np.linspace(-1, 1, ALONG) if moves else np.zeros(1) for moves in free]
+        box = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        x, width, count = x.copy(), 0.25 if free.sum() == 1 else 0.05, 0
+        for _ in range(ROUNDS):
+            candidates = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
+            n = candidates.shape[1]
+            f, g = evaluate_designs(self.problem, choice, np.repeat(rows, n), candidates.reshape(-1, 3))
+            cost = _cost(f, g, self.kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
+            x = candidates[np.arange(len(rows)), np.argmin(cost, axis=1)]
+            width, count = width * SHRINK, count + len(f)
         self.evaluated += count
         return self.designs(rows, x)
 
@@ -472,33 +482,6 @@ def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
     short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
-
-
-def _refine_designs(
-    problem: SizingTask,
-    choice: ChoiceSpace,
-    rows: np.ndarray,
-    x: np.ndarray,
-    kept: np.ndarray,
-    weights: np.ndarray,
-    free: np.ndarray,
-) -> tuple[np.ndarray, int]:
-    """Refines designs in shrinking boxes around them. Also returns the number of evaluations.
-
-    Args:
-        free: 1 for continuous numbers that may move.
-    """
-    axes = [np.linspace(-1, 1, ALONG) if moves else np.zeros(1) for moves in free]
-    box = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    x, width, count = x.copy(), 0.25 if free.sum() == 1 else 0.05, 0
-    for _ in range(ROUNDS):
-        candidates = np.clip(x[:, None] + width * box, choice.low[rows][:, None], choice.high[rows][:, None])
-        n = candidates.shape[1]
-        f, g = evaluate_designs(problem, choice, np.repeat(rows, n), candidates.reshape(-1, 3))
-        cost = _cost(f, g, kept, np.repeat(weights, n, axis=0)).reshape(-1, n)
-        x = candidates[np.arange(len(rows)), np.argmin(cost, axis=1)]
-        width, count = width * SHRINK, count + len(f)
-    return x, count
 
 
 def _nearest_buildable(

@@ -475,15 +475,12 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
         a, b = (a if k == 0 else finer[k - 1]), finer[k]
     # Rounded to few digits, away from `begin`. Each rounded value is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
-        rounded = _round_outward(b, digits, up=end > begin)
+        up = end > begin
+        step = 10.0 ** (math.floor(math.log10(abs(b))) - digits + 1)
+        rounded = float(f"{(math.ceil if up else math.floor)(b / step - (1e-9 if up else -1e-9)) * step:.{digits}g}")
         if min(begin, end) <= rounded <= max(begin, end) and meets(np.array([rounded]))[0]:
             return rounded
     return float(b)
-
-
-def _round_outward(value: float, digits: int, up: bool) -> float:
-    step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
-    return float(f"{(math.ceil if up else math.floor)(value / step - (1e-9 if up else -1e-9)) * step:.{digits}g}")
 
 
 def count_outcomes(outcomes: Sequence[RequirementOutcome]) -> Mapping[str, int]:

@@ -291,7 +291,7 @@ def verdict_line(stages: LoopStages) -> str:
     return f"at one noise level: {', '.join((stages.verdict, *sure))}"
 
 
-def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> list[str]:
+def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
     method_words = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
@@ -300,7 +300,7 @@ def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> l
             f"{found.p_value:.2g})"
         ]
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
-    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:5]
     if not beyond:
         return [f"{first}. No effect explains more than chance would"]
     if brief:
@@ -613,12 +613,6 @@ def support_sentence(found: DiscoveryResult) -> str:
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
 
-def effect_called(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """The name of an effect, and where it is tentative what speaks against it."""
-    reason = tentative_reason(found, effect)
-    return f"{effect.name}\n({reason})" if reason else effect.name
-
-
 def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
     """In a few words, what speaks against the name of an effect, empty where it is established."""
     if found.support is None or is_established(found, effect):
@@ -811,13 +805,25 @@ def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
-def imposed_delay(delay: float, sd: float) -> str:
-    """Delay of the imposed quantity, and the line for the rig's file."""
+def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
+    """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is the longest of the search."""
     when = "later" if delay > 0 else "earlier"
-    return (
-        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, and "
-        f'the rig file gives no delay. To start the fit from this delay, set [rig] delay = "{delay:.3g} ± {sd:.2g}"'
-    )
+    acts = f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, "
+    if ends:
+        return f"{acts}the longest delay that is searched. Check the clocks of the columns"
+    line = f'"{delay:.3g} ± {sd:.2g}"'
+    return f"{acts}and the rig file gives no delay. To start the fit from this delay, set [rig] delay = {line}"
+
+
+#: Reason why a log does not show the states of its equations → sentence part, and what to log.
+UNSHOWN = {
+    "motion": "no channel reads a speed or an angle. For an answer from its equations, log one",
+    "sign": "an instrument shows only a magnitude. For an answer from its equations, log the sign",
+    "slack": "motor and load move apart",
+    "turn": "the robot turns",
+    "goal": "a controller gives the voltage. For an answer from its equations, log the duty",
+    "follower": "no channel follows the imposed speed. For an answer, log the current",
+}
 
 
 def leader_choice(
@@ -901,6 +907,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
+    "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
     "led": leader_choice,
     "not_predictable": lambda kinds: (
         f"some blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} contain all runs of a "

@@ -286,15 +286,10 @@ def _program_name(function: Callable[..., Any], arguments: Any) -> str:
     if qualified_name[0].partition(".")[0] not in OWN or "<" in qualified_name[1]:
         raise Unnamed
     file = io.BytesIO()
-    _ArgumentPickler(file).dump((qualified_name, _compile_settings(), arguments))
-    return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
-
-
-def _compile_settings() -> tuple[tuple[str, str], ...]:
-    """JAX's settings and environment variables that change compilation."""
     settings = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
     settings |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
-    return tuple(sorted(settings.items()))
+    _ArgumentPickler(file).dump((qualified_name, tuple(sorted(settings.items())), arguments))
+    return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
 
 
 @functools.cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -125,23 +125,9 @@ class RunBatch(eqx.Module):
     history: History | None = None
 
 
-class SimulateBatch(Protocol):
-    """Type of a function that simulates a batch."""
-
-    def __call__(
-        self, robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None, /
-    ) -> RunBatch:
-        """Simulates a batch in one call.
-
-        Args:
-            conditions: shape (runs,), names of configurations resolved.
-            options: all options of the fidelity, from `Facts.resolved`.
-            progress: called by fidelities that take long.
-
-        Raises:
-            ValueError: a run that `Fidelity.check` refuses.
-        """
-        ...
+#: Function that simulates a batch in one call, of a robot, conditions of shape (runs,), all options of the fidelity
+#: from `FidelityFacts.resolved`, and a callback for progress. Raises ValueError if `Fidelity.check` refuses a run.
+SimulateBatch = Callable[..., RunBatch]
 
 
 @dataclasses.dataclass(frozen=True)

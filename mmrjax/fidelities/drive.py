@@ -387,17 +387,14 @@ def _run_batch(
     return RunBatch(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
 
 
-def _history_instants(duration: float) -> np.ndarray:
-    """Times of a history [s] from 0 to `duration`, denser while the current rises to its peak."""
-    early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
-    first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
-    return np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
-
-
 def _run_histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> RunBatch:
-    histories = drive_batch(robot, conditions, jnp.asarray(_history_instants(options["duration"])))
+    duration = options["duration"]  # times are denser while the current rises to its peak
+    early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
+    first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
+    times = np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
+    histories = drive_batch(robot, conditions, jnp.asarray(times))
     return RunBatch(
         histories.result, history=History.of(robot, histories.time, histories.distance, histories.signals)
     )

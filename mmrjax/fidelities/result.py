@@ -101,11 +101,6 @@ def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
-def is_not_forward(status: Array) -> Array:
-    """True if a run travels steadily, but not forward under motor power."""
-    return (status == REVERSES) | (status == ROLLS_BACK)
-
-
 def movers_slip(robot: Robot, signals: Signals) -> Array:
     """True if the movers slide over the ground faster than V_s."""
     return jnp.abs(signals.speed_sliding) > robot.chassis(signals.configuration).speed_grip

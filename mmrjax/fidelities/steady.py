@@ -24,7 +24,7 @@ from mmrjax.fidelities.rest import (
     voltage_at_rest,
     without_diode,
 )
-from mmrjax.fidelities.result import is_not_forward, result_of_signals, travel_status, withhold_numbers
+from mmrjax.fidelities.result import result_of_signals, travel_status, withhold_numbers
 from mmrjax.model import balances, channels, ground, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
@@ -34,6 +34,8 @@ from mmrjax.model.signals import (
     CODES,
     CONVERGED,
     FAILED,
+    REVERSES,
+    ROLLS_BACK,
     SLIDES,
     STALLED,
     Result,
@@ -213,9 +215,9 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         power_ground=jnp.where(parked, 0.0, point.power_ground),
         power_lift=jnp.where(parked, 0.0, point.power_lift),
     )
-    return withhold_numbers(
-        point, (point.status == CONVERGED) | (point.status == STALLED) | is_not_forward(point.status), sound
-    )
+    settles = (point.status == CONVERGED) | (point.status == STALLED)
+    not_forward = (point.status == REVERSES) | (point.status == ROLLS_BACK)
+    return withhold_numbers(point, settles | not_forward, sound)
 
 
 @compiled

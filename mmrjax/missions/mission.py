@@ -153,13 +153,6 @@ class Mission(eqx.Module):
     course: MissionCourse | None
 
 
-def motion_law(conditions: Conditions, profile: Profile) -> MotionLaw:
-    """Equations of motion of a mission: of a robot that is free to turn, if profile or conditions drive the sides
-    differently or state a heading.
-    """
-    return mission_turning if profile.turns or conditions.turns else mission_straight
-
-
 def initial_unknowns(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
     """Unknowns at the start [SI], with the heading of the conditions, uphill by default."""
     ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
@@ -236,7 +229,9 @@ def mission(
         values and times of the profile, through stops and reversals. At a limit that begins to act they are
         one-sided.
     """
-    begin, law = Start() if start is None else start, motion_law(conditions, profile)
+    begin = Start() if start is None else start
+    # free to turn if the profile or the conditions drive the sides differently or state a heading
+    law: MotionLaw = mission_turning if profile.turns or conditions.turns else mission_straight
     no_peaks = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
 
     def run_segment(carry: IntegrationState, k: Array) -> tuple[IntegrationState, _SegmentEnd]:

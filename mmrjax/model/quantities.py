@@ -307,11 +307,6 @@ def _winding_temperature(robot: Any, signals: Any) -> Any:
     return robot.motor.temperature_settled(signals.current)
 
 
-def _rolled_path(robot: Any, signals: Any) -> Any:
-    """Distance that the driven wheel has rolled [m]."""
-    return robot.chassis(signals.configuration).radius * signals.angle
-
-
 #: Loads on which a condition acts.
 GROUND, SHAFT, VEHICLE = "ground", "shaft", "vehicle"
 #: Parameters of the robot that a quantity may depend on: the current at an imposed speed, the voltage at an imposed
@@ -479,8 +474,8 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             sign="", settled=False,
         ),
         Channel(
-            "position", "mm", "position", _PLACES, 1e4, signal=_rolled_path, resolution=2, zero_at_rest=True, sign="",
-            settled=False,
+            "position", "mm", "position", _PLACES, 1e4, resolution=2, zero_at_rest=True, sign="", settled=False,
+            signal=lambda robot, signals: robot.chassis(signals.configuration).radius * signals.angle,
         ),
         _VOLTAGE,
         Channel(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
@@ -74,6 +75,11 @@ class Configurations(eqx.Module):
     def items(self) -> Iterator[tuple[str, Any]]:
         """Names and loads, in order."""
         return zip(self.names, self.members, strict=True)
+
+    @property
+    def tracked(self) -> np.ndarray:
+        """True for each load on tracks, outside of JAX."""
+        return np.array([float(load.on_tracks) > 0.5 for load in self.members])
 
 
 def _configurations(value: Any) -> Any:

@@ -99,15 +99,6 @@ def contact_inputs(path: BeltPath, chassis: Chassis, adhesion: Any) -> dict[str,
     }
 
 
-def _with(path: BeltPath, chassis: Chassis, values: Mapping[str, Any]) -> tuple[BeltPath, Chassis]:
-    gear = dataclasses.replace(path.gear, **{name: values[name] for name in GEAR})
-    ground = chassis.ground
-    friction = dataclasses.replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
-    ground = dataclasses.replace(ground, friction=friction)
-    changed = {name: values[f"chassis_{name}"] for name in CHASSIS}
-    return BeltPath(values["pulley"], gear), dataclasses.replace(chassis, ground=ground, **changed)
-
-
 def contributions_of_contacts(
     path: BeltPath, chassis: Chassis, at: ContactState, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
 ) -> Float[Array, "sums contacts"]:
@@ -192,7 +183,13 @@ def linearize(
     """
 
     def each(values: Mapping[str, Any]) -> Float[Array, "sums contacts"]:
-        path_now, chassis_now = _with(path, chassis, values)
+        gear = dataclasses.replace(path.gear, **{name: values[name] for name in GEAR})
+        ground = chassis.ground
+        friction = dataclasses.replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
+        ground = dataclasses.replace(ground, friction=friction)
+        changed = {name: values[f"chassis_{name}"] for name in CHASSIS}
+        path_now = BeltPath(values["pulley"], gear)
+        chassis_now = dataclasses.replace(chassis, ground=ground, **changed)
         z, pitch, front, rear, *v = (values[name] for name in MOTION)
         touching = compute_contacts(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
         return contributions_of_contacts(path_now, chassis_now, touching, values["slip"], values["adhesion"], gained)

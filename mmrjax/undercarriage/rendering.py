@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from pathlib import Path as File
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -72,29 +72,6 @@ class RunScene(NamedTuple):
         return figure_of_sample(self, k)
 
 
-class RunView(Protocol):
-    """Data of a run that can be drawn: times of its samples [s], and a figure of each sample."""
-
-    @property
-    def time(self) -> np.ndarray:
-        """Times of the samples [s]."""
-        ...
-
-    def sheet(self, k: int) -> Any:
-        """Figure of sample `k`."""
-        ...
-
-
-def check_finite(run: TrackTrajectory) -> None:
-    """Rejects a run that cannot be drawn.
-
-    Raises:
-        ValueError: it holds numbers that are not finite (a failed member).
-    """
-    if not np.isfinite(np.asarray(run.q)).all():
-        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
-
-
 def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> RunScene:
     """Collects the data of one run for drawing (scalar conditions, one member of a batch).
 
@@ -102,7 +79,8 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
         ValueError: the run holds numbers that are not finite (a failed member).
     """
     gear = robot.running_gear
-    check_finite(run)
+    if not np.isfinite(np.asarray(run.q)).all():
+        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
@@ -301,7 +279,7 @@ def frame_times(
 
 
 def render(
-    view: RunView,
+    view: Any,
     file: str | File,
     begin: float = 0.0,
     end: float | None = None,
@@ -311,7 +289,8 @@ def render(
     """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
-        view: view from `scene_of_run`, of this module or of `rendering_from_above`.
+        view: view with `time`, the times of the samples [s], and `sheet`, which returns the figure of a sample. See
+            `scene_of_run`.
         file: its suffix decides the format.
         begin, end: part of the run to film [s]. None: to its end.
         slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.
@@ -331,7 +310,7 @@ def render(
     return file
 
 
-def _write_frames(view: RunView, file: File, frames: list[int], rate: int) -> None:
+def _write_frames(view: Any, file: File, frames: list[int], rate: int) -> None:
     if file.suffix == ".png":
         view.sheet(frames[0]).savefig(file)
         return

@@ -23,7 +23,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import damping_contact, force_contact
 from mmrjax.model.masses import lever_angles
 from mmrjax.model.params import Scalar
-from mmrjax.model.signals import GRAVITY, Signals
+from mmrjax.model.signals import Signals
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.belt import BeltPath, BeltRuns, belt_runs, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
@@ -238,19 +238,6 @@ class GearReactions(eqx.Module):
     def guide(self) -> Float[Array, "..."]:
         """Load on the lower guide [N]."""
         return jnp.sum(self.guided, axis=-1)
-
-    def teeth(self, path: BeltPath) -> tuple[Float[Array, "... 168"], Float[Array, "... 168"]]:
-        """Load R_g of the lower and of the upper guide on each tooth [N].
-
-        A grouser's load on the lower guide spreads evenly over the teeth of its pitch. The upper guide
-        carries the weight of the belt on it.
-        """
-        lower = jnp.repeat(self.guided / TEETH_GROUSER, TEETH_GROUSER, axis=-1)
-        across = (jnp.arange(TEETH_GROUSER) - TEETH_GROUSER // 2) * path.pitch / TEETH_GROUSER
-        place = jnp.mod(self.place[..., None] + across, path.length).reshape(lower.shape)
-        begins = path.gear.wheelbase + jnp.pi * path.radius
-        is_engaged = (place > begins) & (place < begins + path.gear.wheelbase)
-        return lower, jnp.where(is_engaged, path.gear.belt_mass * GRAVITY / TEETH_BELT, 0.0)
 
 
 def inner_loads(path: BeltPath, at: ContactState, pulled: ContactPull) -> GearReactions:

@@ -101,8 +101,7 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
         ValueError: a lever reaches below the ground, or the step is too large for the stiffness. The message
             then suggests a smaller step that divides `sample`.
     """
-    on_tracks = np.array([float(chassis.on_tracks) for chassis in robot.configurations.members])
-    tracked = on_tracks[np.asarray(conditions.configuration, int)] > 0.5
+    tracked = robot.configurations.tracked[np.asarray(conditions.configuration, int)]
     gear = robot.running_gear
     height = float(robot.radius_pulley + gear.grouser_height)  # levers exist only on tracks
     for name, (_, up) in zip(("lever_front", "lever_rear"), lever_tips(gear, conditions), strict=True):

@@ -19,7 +19,7 @@ from mmrjax.errors import similar_words
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
 from mmrjax.model import channels, paper_robots, params, quantities
-from mmrjax.model.params import Parameter, Spec
+from mmrjax.model.params import Spec
 from mmrjax.model.signals import Result
 from sweeps.console import print_output
 from sweeps.pages import words
@@ -166,10 +166,7 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
 
 def _status_lines(name: str, library: Library) -> Iterator[Line]:
     if name in words.STATUSES:
-        about = words.STATUSES[name]
-        yield "means", about.meaning
-        if about.why != about.meaning:
-            yield "in short", about.why
+        yield "means", words.status_meaning(name)
         yield "exit code", "3, since a solver failed" if name == "failed" else "0"
         yield "in files", "column status of runs.csv, counts in result.json"
 
@@ -246,7 +243,9 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
     spec = parameter.spec
     yield "means", f"{spec.meaning} [{spec.unit}]"
     yield "nominal", f"{float(parameter.value):g} {spec.unit}. Source: {spec.source}"
-    yield "prior", _prior_text(parameter)
+    sd = parameter.spec.prior_sd(float(parameter.value))
+    relative = f" ({100 * parameter.spec.relative_sd:g} %)" if parameter.spec.relative_sd else ""
+    yield "prior", f"standard deviation {sd:.3g} {parameter.spec.unit}{relative}"
     yield "bounds", _bounds_text(spec)
     first_part = name.partition(".")[0]
     part: Any = dict(robot.configurations.items()).get(first_part, robot)
@@ -261,13 +260,6 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
     yield (
         "change it",
         f"--set {name}=VALUE, or [{name.rpartition('.')[0]}] {name.rpartition('.')[2]} = VALUE in a file",
-    )
-
-
-def _prior_text(p: Parameter) -> str:
-    sd = p.spec.prior_sd(float(p.value))
-    return f"standard deviation {sd:.3g} {p.spec.unit}" + (
-        f" ({100 * p.spec.relative_sd:g} %)" if p.spec.relative_sd else ""
     )
 
 

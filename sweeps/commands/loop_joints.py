@@ -98,14 +98,6 @@ class Chain:
         return needed
 
 
-def noise_of_angle(readings: np.ndarray) -> float:
-    """Standard deviation of the noise of an angle, by its sixth differences.
-
-    Second differences, as in `estimate_noise`, would contain 0.1 mrad from the curvature of a 200 Hz log.
-    """
-    return float(np.nanmedian(np.abs(np.diff(readings, 6)))) / QUANTILE
-
-
 def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> tuple[np.ndarray, int]:
     """Motion at `times` on a smoothing spline, shape (3, times), and the number of the spline's knots.
 
@@ -113,7 +105,9 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     residuals equal the noise. If most readings repeat others, this noise is at least that of the display's step.
     Knots are dense at jumps of the torque, so that the acceleration jumps within a few samples.
     """
-    noise, steps = noise_of_angle(angle), np.diff(np.unique(np.round(angle, 9)))
+    # Second differences, as in `estimate_noise`, would contain 0.1 mrad from the curvature of a 200 Hz log.
+    noise = float(np.nanmedian(np.abs(np.diff(angle, 6)))) / QUANTILE
+    steps = np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
         noise = max(noise, steps.min() / math.sqrt(12))
     with warnings.catch_warnings():

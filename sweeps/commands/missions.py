@@ -136,8 +136,7 @@ def _conditions_of_runs(
     conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
         return conditions
-    members = robot.configurations.members
-    tracks = [float(members[int(k)].on_tracks) > 0.5 for k in np.asarray(conditions.configuration)]
+    tracks = robot.configurations.tracked[np.asarray(conditions.configuration)]
     lateral = [lateral_ratio(str(s), t) for s, t in zip(runs[profiles.SURFACE], tracks, strict=True)]
     return dataclasses.replace(conditions, adhesion_lateral=jax.numpy.asarray(lateral))
 

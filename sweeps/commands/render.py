@@ -2,42 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import jax
 
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.writing import replacing
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import STATUSES
-from mmrjax.undercarriage import rendering, rendering_from_above
+from mmrjax.undercarriage import rendering
 from sweeps import config as configuration
-from sweeps.commands import turn
 from sweeps.console import print_output, progress_bar
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
-from sweeps.report.climb_report import Seen
 from sweeps.store import DONE, SOLVER_FAILED
 
 
 def execute(config: configuration.Render, picture: configuration.Picture) -> int:
-    """Draws a run from standstill, or the climb in a folder, as a picture or film. Returns the exit code: 0 if the
-    run settles or is still accelerating, otherwise 3.
+    """Draws a run from standstill as a picture or film. Returns the exit code: 0 if the run settles or is still
+    accelerating, otherwise 3.
     """
     file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
-    if picture.climb is not None:
-        if config != configuration.Render() or picture.stated:
-            raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
-        _check_output_file(picture)
-        climb = Seen.read(picture.climb)
-        from sweeps.pages import climb_figures
-
-        _write_completely(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
-        print_output(str(file))
-        return DONE
     is_picture, columns = file.suffix == ".png", picture.stated
     slow = 20.0 if slow is None else slow
     begin = (0.8 if is_picture else 0.0) if begin is None else begin
@@ -47,12 +31,12 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         rendering.frame_times(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
-    _check_output_file(picture)
+    if file.exists() and not picture.force:
+        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
-    if config.turns:
-        turn.check_can_turn(robot, columns.get("configuration") or robot.configurations.names[0])
-        columns = {**columns, **turn.turn_columns(config, columns)}
     conditions = run.conditions_of_runs(robot, one_run(robot, columns, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(1, quiet=False) as advance:
@@ -63,30 +47,13 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         counter(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
-    def draw(aside: Path) -> None:
-        view = (rendering_from_above if config.turns else rendering).scene_of_run(robot, conditions, trajectory)
-        rendering.render(view, aside, begin, end, slow)
-
-    _write_completely(file, draw)
-    status = STATUSES[int(trajectory.result.status)]
-    print_output(f"{status}: {words.STATUSES[status].why}")
-    print_output(str(file))
-    return SOLVER_FAILED if status == "failed" else DONE
-
-
-def _check_output_file(picture: configuration.Picture) -> None:
-    file = picture.file
-    if file.exists() and not picture.force:
-        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
-    if not file.parent.is_dir():
-        raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
-
-
-def _write_completely(file: Path, draw: Callable[[Path], Any]) -> None:
-    """Writes a picture or film completely or not at all."""
     with replacing(file) as temporary, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:
-            draw(temporary)
+            rendering.render(rendering.scene_of_run(robot, conditions, trajectory), temporary, begin, end, slow)
         except ValueError as error:
             raise BadConfiguration(f"render: {error}".replace(temporary.name, file.name)) from error
         advance(1)
+    status = STATUSES[int(trajectory.result.status)]
+    print_output(f"{status}: {words.status_meaning(status)}")
+    print_output(str(file))
+    return SOLVER_FAILED if status == "failed" else DONE

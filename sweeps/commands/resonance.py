@@ -10,11 +10,9 @@ import numpy as np
 
 from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.paper_tables import PAYLOADS_KG, VOLTAGES_V
 from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
@@ -73,13 +71,13 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
             f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, so that "
             "grousers pass"
         )
-    runs, of_table8 = _grid_and_table_8(config, robot)
+    runs = grid_conditions(_speed_grid(config, config.voltages_V), robot)
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
     with open_folder("resonance", config, robot, beside, runs) as folder:
         parts_words = passing_parts(robot, robot.configurations.names.index(name))
         columns = _ripple_columns(folder, robot, conditions, config, parts_words)
-        table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
+        table = {**run.condition_table(robot, runs), **columns}
         result = _modes_and_peaks(config, robot, parts_words, table)
         _write_folder(folder, config, result)
         document = print_report(resonance_report.resonance_document(result, file), file)
@@ -96,32 +94,15 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         )
 
 
-def _speed_grid(
-    config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]
-) -> GridPart:
+def _speed_grid(config: configuration.Resonance, voltages: tuple[float, ...]) -> GridPart:
     assert config.configuration is not None
     return GridPart(
         configurations=(config.configuration,),
         voltages_V=voltages,
-        payloads_kg=payloads,
+        payloads_kg=config.payloads_kg,
         slopes_deg=(config.slope_deg,),
         surface=config.surface,
     )
-
-
-def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
-    """Points of the grid and further points of Table 8, and True for the points of Table 8."""
-    parts = [
-        grid_conditions(_speed_grid(config, v, p), robot)
-        for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
-    ]
-    pairs = [list(zip(part["supply_voltage_V"], part["payload_kg"], strict=True)) for part in parts]
-    new = np.array([pair not in set(pairs[0]) for pair in pairs[1]])
-    columns = {key: np.concatenate([parts[0][key], parts[1][key][new]]) for key in parts[0].columns}
-    runs = Runs(source="the grid and Table 8", columns=columns)
-    paper = set(pairs[1])
-    of_table8 = [pair in paper for pair in zip(runs["supply_voltage_V"], runs["payload_kg"], strict=True)]
-    return runs, np.array(of_table8)
 
 
 def _ripple_columns(
@@ -173,14 +154,13 @@ def _modes_and_peaks(
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
-    middle_runs = _speed_grid(config, (middle,), payloads)
+    middle_runs = _speed_grid(config, (middle,))
     linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_runs, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
     tops: list[RipplePeak] = []
     ends: dict[float, tuple[float, float]] = {}
     for payload, peaks in by_payload.items():
-        gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
-        rows = np.flatnonzero(gridded & (table["status"] == "converged"))
+        rows = np.flatnonzero((table["payload_kg"] == payload) & (table["status"] == "converged"))
         rows = rows[np.argsort(table["speed_mean_mm_s"][rows])]
         if not len(rows):
             continue

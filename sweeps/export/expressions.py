@@ -369,7 +369,7 @@ def number_text(value: Any) -> str:
     return repr(value if isinstance(value, bool) else float(value))
 
 
-def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], indent: str = "    ") -> list[str]:
+def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str]) -> list[str]:
     """Lines of a function body that returns an expression. Repeated subexpressions become local variables.
 
     Args:
@@ -398,12 +398,12 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
         own_rank, written = _operation_text(x, text, dialect)
         if uses[id(x)] > 1:
             local[id(x)] = f"x{len(local) + 1}"
-            lines.append(f"{indent}{local[id(x)]} = {written}")
+            lines.append(f"    {local[id(x)]} = {written}")
             return local[id(x)]
         return f"({written})" if own_rank < outer else written
 
     last_text = text(result)
-    return [*lines, f"{indent}return {last_text}"]
+    return [*lines, f"    return {last_text}"]
 
 
 def _operation_text(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int, str]:

@@ -173,12 +173,6 @@ def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list
     return [*changed, EffectFate("rotor inertia", APPROXIMATED, how), lines]
 
 
-def effects_in_tables(joint: DriveJoint) -> dict[str, str]:
-    """Words for each effect inside the joint. Effects with a memory keep their settled value."""
-    settled = "its settled value, since a table has no state"
-    return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
-
-
 def table_files(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> dict[str, str | bytes]:
     """The tables as CSV and as a C header that reads them."""
     grid = np.meshgrid(found.speed, found.torque, indexing="ij")

@@ -202,7 +202,8 @@ def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: floa
 
 def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive, constants, notes = begun.joint, begun.constants, notes_for_file_head(runs)
-    law, effect_names = jax_actuator.actuator_law_function(runs, constants), jax_actuator.effects_in_actuator(drive)
+    law = jax_actuator.actuator_law_function(runs, constants)
+    effect_names = {e.name: "a function of the law" for e in drive.inside}
     checks: dict[str, float] = {}
     if begun.format == "jax":
         files = jax_actuator.jax_files(drive, constants, notes)
@@ -222,7 +223,9 @@ def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, s
 
 def _export_tables(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
-    law, effect_names = feed_forward.table_law_function(runs, constants), feed_forward.effects_in_tables(drive)
+    law = feed_forward.table_law_function(runs, constants)
+    settled = "its settled value, since a table has no state"
+    effect_names = {e.name: "the tables" if e.memory_size is None else settled for e in drive.inside}
     fates: list[EffectFate] = feed_forward.fates_in_tables(drive, constants)
     compared = comparison.compare_format(runs, law, fates, effect_names, mujoco.approximated_terms)
     files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_for_file_head(runs))

@@ -15,7 +15,7 @@ import numpy as np
 from calibration.data import Json, Names
 from sweeps.export.comparison import DROPPED, HELD, EffectFate
 from sweeps.export.joint import DriveJoint, memory_grows
-from sweeps.export.law_source import LawConstant, constant_values, jax_source, module_from_source
+from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 from sweeps.export.mujoco import CONTROLLER, PLAY, fates_outside_joint
 from sweeps.export.situation import ComparisonRuns
 
@@ -70,7 +70,7 @@ def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any)
 
 def steady_params(joint: DriveJoint, constants: Sequence[LawConstant], amplitudes: Mapping[str, float]) -> Json:
     """Parameters of the actuator in steady travel, without terms that repeat with an angle, whose mean is 0."""
-    params = dict(constant_values(constants))
+    params = {c.name: c.value for c in constants}
     waves = {p.name: 0.0 for p in joint.parts if memory_grows(p)}
     for name, value in {**amplitudes, **waves}.items():
         if f"effects.{name}.amplitude" in params:
@@ -115,11 +115,6 @@ def fates_in_actuator(joint: DriveJoint) -> list[EffectFate]:
     if joint.limit is not None:
         fates.append(EffectFate("current limit of the driver", HELD, "a bound of the current"))
     return [*fates, *fates_outside_joint(joint)]
-
-
-def effects_in_actuator(joint: DriveJoint) -> dict[str, str]:
-    """Words for each effect inside the joint. The law has all of them."""
-    return {e.name: "a function of the law" for e in joint.inside}
 
 
 def jax_files(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str]) -> dict[str, str | bytes]:

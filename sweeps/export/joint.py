@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
@@ -373,16 +372,6 @@ def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
 def memory_grows(part: Part) -> bool:
     """True if a part's memory grows without limit, as a phase does. Instead of a settled value it has the mean 0."""
     return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
-
-
-def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float]:
-    """Mean of signals of the surroundings over runs [SI], by name, 0 if unknown."""
-    means: dict[str, float] = {}
-    for name in names:
-        value = np.asarray(getattr(signals, name.removeprefix("surroundings.")), float)
-        mean = float(np.nanmean(value)) if np.isfinite(value).any() else 0.0
-        means[name] = mean
-    return means
 
 
 def channels_of(joint: DriveJoint) -> tuple[Any, ...]:

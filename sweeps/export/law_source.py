@@ -13,7 +13,7 @@ from types import ModuleType
 
 import numpy as np
 
-from calibration.data import Json, posterior_file
+from calibration.data import posterior_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.posterior_file import Posterior
 from mmrjax import __version__
@@ -24,7 +24,7 @@ from mmrjax.model.params import Parameter
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_in
-from sweeps.export.joint import VARIABLES, DriveJoint, Part, mean_surroundings
+from sweeps.export.joint import VARIABLES, DriveJoint, Part
 
 #: Draws from the posterior for intervals, and quantiles of their ends.
 DRAWS, ENDS = 4000, (0.025, 0.975)
@@ -52,16 +52,20 @@ def law_constants(joint: DriveJoint, signals: Signals, posterior: Posterior | No
     Args:
         signals: signals of the runs.
     """
-    ends = _parameter_intervals(posterior)
-    constants = []
+    ends, constants = {}, []
+    if posterior is not None:
+        quantiles = np.quantile(posterior.draw(DRAWS, 0), ENDS, axis=0)
+        ends = {n: (float(a), float(b)) for n, a, b in zip(posterior.names, *quantiles, strict=True)}
     for name, parameter in joint.parameters().items():
         low, high, kind = _interval_of(joint, name, parameter, ends, posterior is not None)
         spec = parameter.spec
         source = f"fitted; prior: {spec.source}" if kind == OF_POSTERIOR else spec.source
         value = float(parameter.value)
         constants.append(LawConstant(name, value, spec.unit, spec.meaning, source, low, high, kind))
-    for name, mean in mean_surroundings(signals, joint.surroundings()).items():
+    for name in joint.surroundings():
         word = name.removeprefix("surroundings.")
+        over_runs = np.asarray(getattr(signals, word), float)
+        mean = float(np.nanmean(over_runs)) if np.isfinite(over_runs).any() else 0.0
         condition = quantities.CONDITIONS.get(word)
         unit = {"normal": "N", "mass": "kg", "slope": "rad", "payload": "kg"}.get(word, "SI")
         meaning = {"normal": "normal load of one side"}.get(
@@ -72,13 +76,6 @@ def law_constants(joint: DriveJoint, signals: Signals, posterior: Posterior | No
         volts = joint.controller.supply_voltage
         constants.append(LawConstant(SUPPLY, volts, "V", "supply of the driver", "given by the user of the actuator"))
     return tuple(constants)
-
-
-def _parameter_intervals(posterior: Posterior | None) -> dict[str, tuple[float, float]]:
-    if posterior is None:
-        return {}
-    quantiles = np.quantile(posterior.draw(DRAWS, 0), ENDS, axis=0)
-    return {name: (float(a), float(b)) for name, a, b in zip(posterior.names, *quantiles, strict=True)}
 
 
 def _interval_of(
@@ -170,14 +167,10 @@ def _function_text(name: str, symbol: Symbol, document: str, dialect: Dialect) -
         return "memory" if word.startswith("memory.") else f"p[{quoted(word)}]"
 
     head = f"def {name}({', '.join(['p', *function_arguments(symbol)])}):"
-    body = textwrap.indent(_wrap_docstring(document), "    ")
-    return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
-
-
-def _wrap_docstring(document: str) -> str:
     lines = textwrap.wrap(document, 108)
     short = len(lines) == 1 and len(document) < 104
-    return _docstring(document if short else "\n".join(lines) + "\n")
+    body = textwrap.indent(_docstring(document if short else "\n".join(lines) + "\n"), "    ")
+    return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
 
 
 def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
@@ -407,20 +400,14 @@ def _fixed_point_lines(name: str, given: str, parts: Sequence[Part], later: Mapp
     ]
 
 
-def constants_text(constants: Sequence[LawConstant], name: str = "PARAMS") -> str:
+def constants_text(constants: Sequence[LawConstant]) -> str:
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
-    lines = [f"{name} = {{"]
+    lines = ["PARAMS = {"]
     for c in constants:
         comment = f"{c.meaning} [{c.unit}]{f'; {c.interval}' * bool(c.interval)}; {c.source}"
         lines += [f"    # {text}" for text in textwrap.wrap(printable(comment), 106)]
         lines.append(f"    {quoted(c.name)}: {c.value!r},")
     return "\n".join([*lines, "}"])
-
-
-def _module_header(joint: DriveJoint, what: str, notes: Sequence[str]) -> str:
-    head = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
-    body = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
-    return _docstring(f"{head}\n\n{body}\n") + "\n"
 
 
 _DOCUMENT = '''"""One step of the drive: torque at the joint, state after the step, and what happens inside.
@@ -474,8 +461,11 @@ def _module_text(
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
     shape_arguments = "shape=()" if library.dialect is JAX else "shape=(), device=None"
+    title = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
+    wrapped_notes = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
+    header = _docstring(f"{title}\n\n{wrapped_notes}\n")
     return (
-        f"{_module_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
+        f"{header}\n\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
         f"{functions_text(joint, library.dialect)}\n\n\n"
         f"def armature(params):\n"
         f'    """{armature_words}, for the joint\'s own armature [kg·m²]."""\n'
@@ -490,7 +480,7 @@ def _module_text(
     )
 
 
-def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
+def module_from_source(source: str) -> ModuleType:
     """Module of the source of a law.
 
     Raises:
@@ -500,8 +490,8 @@ def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
     tree = ast.parse(source)
     if not _states_a_law(tree):
         raise BadConfiguration("export: the generated source contains more than the drive law, so it is not executed")
-    module = ModuleType(name)
-    exec(compile(tree, f"<{name}>", "exec"), module.__dict__)
+    module = ModuleType("exported_law")
+    exec(compile(tree, "<exported_law>", "exec"), module.__dict__)
     return module
 
 
@@ -525,11 +515,6 @@ def _states_a_law(tree: ast.Module) -> bool:
         else isinstance(f, ast.Attribute) and isinstance(f.value, ast.Name) and f.value.id in ("jnp", "torch")
         for f in called
     )
-
-
-def constant_values(constants: Sequence[LawConstant]) -> Json:
-    """Values of constants by name."""
-    return {c.name: c.value for c in constants}
 
 
 # --- an actuator of mjlab -------------------------------------------------------------------------

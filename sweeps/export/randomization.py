@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -70,12 +69,8 @@ def draw_parameters(
 
 
 def randomization_files(found: Columns) -> dict[str, str | bytes]:
-    """The draws as NumPy's archive and as JSON."""
+    """The draws as NumPy's archive."""
     stream = io.BytesIO()
     arrays: Any = dict(found)
     np.savez(stream, **arrays)
-    nested: dict[str, dict[str, list[float]]] = {}
-    for name, values in found.items():
-        format_, key = name.split("/", 1)
-        nested.setdefault(format_, {})[key] = [float(f"{x:.9g}") for x in values]
-    return {"draws.npz": stream.getvalue(), "draws.json": json.dumps(nested, ensure_ascii=False) + "\n"}
+    return {"draws.npz": stream.getvalue()}

@@ -8,7 +8,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.result import CalibrationResult
@@ -113,29 +112,4 @@ def draw_correlations(found: CalibrationResult) -> Figure:
     right.set_xticks(np.arange(1, len(s) + 1, 2))
     right.set(xlabel="direction", ylabel="prior sd / data sd")
     right.set_title("combinations of parameters")
-    return fig
-
-
-def draw_errors_before_after(found: CalibrationResult) -> Figure:
-    """rms errors by channel: before, fitted, and with each kind of block held out."""
-    lines = {"before": found.errors_before, "fitted": found.errors_after}
-    lines |= {f"held out: {blocks.kind_in_words(k, ' + ')}": found.held_out[k].errors for k in found.held_out_alike}
-    fig, grid = new_figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
-    for axes, channel in zip(grid[0], found.channels, strict=True):
-        most = int(np.isfinite(found.readings[channel.name].measured).sum())
-        for row, (words, errors_by_channel) in enumerate(lines.items()):
-            errors = errors_by_channel[channel.name]
-            colour = FAINT if words == "before" else BLUE if words == "fitted" else ORANGE
-            if errors.rows:
-                axes.barh(row, errors.rms_percent, color=colour, height=0.62)
-                missing = "" if errors.rows == most else f" ({errors.rows} of {most} rows)"
-                axes.text(errors.rms_percent, row, f" {errors.rms_percent:.1f}{missing}", va="center", fontsize=8.5)
-            else:
-                axes.text(0, row, " no row reached" if most else " no readings", va="center", fontsize=8.5)
-        axes.set_title(channel.label)
-        axes.set_xlabel("rms error [%]")
-        axes.margins(x=0.55)
-        axes.grid(axis="y", visible=False)
-    grid[0, 0].set_yticks(range(len(lines)), list(lines))
-    grid[0, 0].invert_yaxis()
     return fig

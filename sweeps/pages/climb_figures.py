@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,11 +28,7 @@ from sweeps.pages.figure_style import (
     is_narrow,
     new_figure,
 )
-from sweeps.report.climb_report import FILMED as IN_TITLE
-from sweeps.report.climb_report import ClimbResult, Seen, footing_coordinates
-
-#: File types that can be written.
-Drawable = ClimbResult | Seen
+from sweeps.report.climb_report import ClimbResult, footing_coordinates
 
 _GROUND = "#b8a98f"
 #: Most silhouettes on a page. Frames of a film per second, and slow-motion factor.
@@ -40,7 +37,7 @@ SHOWN, RATE, SLOW = 6, 12, 2.0
 NEAR = (0.03, 0.09)
 
 
-def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _belt_outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Closed outlines of the belts, and tips of their grousers, in the world [m]."""
     robot = found.robot
     chassis = robot.configurations[found.configuration]
@@ -61,7 +58,7 @@ def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.
     return outlines
 
 
-def _draw_ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
+def _draw_ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
     points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
     points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
     bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
@@ -70,7 +67,7 @@ def _draw_ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
     axes.plot(*points.T, color=INK, lw=1.2)
 
 
-def _draw_robot(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None:
+def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
     outlines = _belt_outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
@@ -87,7 +84,7 @@ def _draw_robot(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -
             axes.plot(*tips.T, ".", color=INK, ms=2.5)
 
 
-def decisive_instants(found: Drawable) -> list[tuple[str, int]]:
+def decisive_instants(found: ClimbResult) -> list[tuple[str, int]]:
     """Decisive samples of the run in order of time: label and index."""
     t = found.table
     picked = {
@@ -155,55 +152,21 @@ def draw_climb_course(found: ClimbResult) -> Figure:
     return fig
 
 
-def draw_size_search(found: ClimbResult) -> Figure:
-    """Outcome of each size tried."""
-    sizes, verdicts = np.array([s for s, _ in found.tried]), [v for _, v in found.tried]
-    kinds = list(dict.fromkeys(verdicts))
-    fig, axes = new_figure(1, 1, 1.0 + 0.4 * len(kinds))
-    ax = axes[0, 0]
-    for k, kind in enumerate(kinds):
-        sizes_of_kind = sizes[[v == kind for v in verdicts]]
-        ax.plot(
-            sizes_of_kind, np.full(len(sizes_of_kind), k), "o", color=GREEN if kind == "over" else VERMILION, ms=5
-        )
-    ax.set_yticks(range(len(kinds)), kinds)
-    ax.set_ylim(-0.6, len(kinds) - 0.4)
-    ax.set_xlabel(f"{found.sought} [mm]")
-    return fig
+def render_climb(found: ClimbResult, file: Path) -> Path:
+    """Writes the run as a film in slow motion."""
+    time, q = found.table["time_s"], footing_coordinates(found.table)
 
-
-class ClimbFilm(NamedTuple):
-    """A climb in the form that `mmrjax.undercarriage.rendering` draws."""
-
-    found: Drawable
-
-    @property
-    def time(self) -> np.ndarray:
-        """Times of the samples [s]."""
-        return self.found.table["time_s"]
-
-    def sheet(self, k: int) -> Figure:
-        """The robot at sample `k`."""
-        found, q = self.found, footing_coordinates(self.found.table)
+    def sheet(k: int) -> Figure:
         low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
         with figure_settings():
-            sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
-            ax = sheet.subplots()
+            picture = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
+            ax = picture.subplots()
             _draw_ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
             _draw_robot(ax, found, q[k])
             ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
-            time, current = (found.table[name][k] for name in IN_TITLE)
-            ax.set_title(f"{found.obstacle}, {time:.2f} s, motors {current:.1f} A")
+            current = found.table["traction_current_A"][k]
+            ax.set_title(f"{found.obstacle}, {time[k]:.2f} s, motors {current:.1f} A")
             ax.axis("off")
-        return sheet
+        return picture
 
-
-def render_climb(
-    found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
-) -> Path:
-    """The run as a film (.gif, .mp4), or a picture (.png) at the instant `begin`, by default that of the largest
-    pitch."""
-    view = ClimbFilm(found)
-    if begin is None:
-        begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
-    return rendering.render(view, file, begin, end, SLOW if slow is None else slow, RATE)
+    return rendering.render(SimpleNamespace(time=time, sheet=sheet), file, slow=SLOW, rate=RATE)

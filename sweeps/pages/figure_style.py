@@ -30,7 +30,6 @@ from matplotlib.transforms import Affine2D, Bbox
 
 from calibration.data import Json
 from mmrjax.model.channels import Channel
-from sweeps import pages
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
@@ -140,11 +139,6 @@ def outer_legend(axes: Axes, place: str) -> None:
     handles, labels = axes.get_legend_handles_labels()
     placement: Any = f"outside {place}"
     axes.figure.legend(handles, labels, loc=placement, ncols=legend_columns(labels))
-
-
-def can_stack(fig: Figure) -> bool:
-    """True if phone versions are on and `new_figure` made the figure, so that its panels can be stacked."""
-    return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
 def colour_bar(fig: Any, drawn: ScalarMappable, axes: Any, **keywords: Any) -> Any:
@@ -340,24 +334,19 @@ def _axes_geometry(fig: Figure, axes: Axes) -> Json:
         ("y", axes.yaxis, row, fig.get_supylabel()),
     ):
         labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
-        positions[name] = {**_axis_range(axis), "label": next(filter(None, labels), "").split("\n")[0]}
+        ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
+        axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
+        if _has_names(axis):
+            names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
+            if names and all(name for _, name in names):
+                axis_facts["names"] = names
+        positions[name] = {**axis_facts, "label": next(filter(None, labels), "").split("\n")[0]}
     return {"box": [round(v, 1) for v in axes_box], **positions}
 
 
 def _has_names(axis: Axis) -> bool:
     """True if the ticks of an axis have names, not numbers."""
     return not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter)
-
-
-def _axis_range(axis: Axis) -> Json:
-    """Ends of an axis, True if it is logarithmic, and the names of its ticks if any."""
-    ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
-    axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
-    if _has_names(axis):
-        names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
-        if names and all(name for _, name in names):
-            axis_facts["names"] = names
-    return axis_facts
 
 
 def label_line_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:

@@ -1,24 +1,20 @@
-"""Figures of the loop: residuals before and after, the score ladder, defects, look-alikes, base parameters."""
+"""Figures of the loop: residuals before and after, the score ladder, defects, laws."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import scipy.stats
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from calibration.data import Columns
 from calibration.data.courses import applied_drive
 from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference import blocks
 from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax.effects import BY_NAME
-from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
 from sweeps.pages.figure_style import (
@@ -28,7 +24,6 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
-    colour_bar,
     configuration_looks,
     is_narrow,
     new_figure,
@@ -37,8 +32,8 @@ from sweeps.pages.figure_style import (
 from sweeps.report.fit_tables import Change
 from sweeps.report.run_tables import UNITS, imposed_column
 
-#: Most effects on the ladder and on the map of look-alikes.
-RUNGS, ALIKE = 20, 14
+#: Most effects on the ladder.
+RUNGS = 20
 DEFECT_WORDS = {
     "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
     "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
@@ -190,8 +185,6 @@ def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], ve
 
 #: Most lags of a correlation with the input [samples].
 LAGS = 20
-#: Most curves in the figure of power.
-CURVES = 5
 
 
 def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
@@ -219,43 +212,6 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
     return fig
 
 
-def draw_gains(found: DiscoveryResult) -> Figure:
-    """Hold-out gain over the refit of each set of effects, by their number, with its standard error."""
-    fig, grid = new_figure(1, 1, 2.8)
-    axes, last_index = grid[0, 0], len(found.gains) - 1
-    axes.axhline(0, color=FAINT, lw=0.8)
-    axes.plot(0, 0, "s", ms=5, color=INK, label="refit, nothing added")
-    for k, (names, gain) in enumerate(found.gains):
-        proposed = k == last_index
-        error = gain.se if np.isfinite(gain.se) else 0.0
-        axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
-                      label="proposed, ± standard error" if proposed else None)  # fmt: skip
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="effects added", ylabel="gain in log likelihood per reading")
-    outer_legend(axes, "upper left")
-    return fig
-
-
-def draw_power(found: DiscoveryResult) -> Figure:
-    """Probability that an effect would have been noticed, over its size, for the most visible effect of each
-    equation.
-    """
-    level = found.before.kinds["single"].threshold
-    visible = sorted((s for s in found.scores if s.balance in EQUATION), key=lambda s: s.sigmas_per_prior_sd)
-    strongest = {EQUATION[s.balance]: s for s in visible if s.sigmas_per_prior_sd > 0}
-    shown_effects = {s.name: s for s in visible if s in strongest.values()}
-    fig, grid = new_figure(1, 1, 3.2)
-    axes, size = grid[0, 0], np.geomspace(0.03, 30, 200)
-    for name, (colour, _) in list(configuration_looks(shown_effects).items())[-CURVES:]:
-        shift = size * shown_effects[name].sigmas_per_prior_sd
-        chance = scipy.stats.norm.sf(level - shift) + scipy.stats.norm.cdf(-level - shift)
-        axes.plot(size, 100 * chance, color=colour, label=name)
-    axes.set(xscale="log", xlabel="size [typical sizes]", ylabel="would have been noticed [%]", ylim=(0, 103))
-    axes.set_xticks([0.03, 0.1, 0.3, 1, 3, 10, 30], ["0.03", "0.1", "0.3", "1", "3", "10", "30"])
-    outer_legend(axes, "upper left")
-    return fig
-
-
 def draw_effect_scores(found: DiscoveryResult) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise rarely exceeds."""
     rungs = found.scores[:RUNGS]
@@ -274,28 +230,6 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="score: misfit that the effect alone explains, limited to a plausible size [σ]")
     axes.set_title("blue: found; light blue: indistinguishable from a found effect in these data")
-    return fig
-
-
-def draw_errors(found: DiscoveryResult) -> Figure:
-    """rms error before and after, fitted, and held out by each kind of block."""
-    lines = {"fitted": found.errors}
-    lines |= {f"held out by\n{blocks.kind_in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
-    fig, grid = new_figure(1, len(found.channels), 2.9, sharey=False)
-    for place, channel in enumerate(found.channels):
-        axes = grid[0, place]
-        for k, (colour, when) in enumerate(((ORANGE, "before"), (BLUE, "after"))):
-            values = [v[k][channel.name]["rms_percent"] for v in lines.values()]
-            axes.barh(np.arange(len(lines)) + 0.4 * k - 0.2, values, height=0.38, color=colour, label=when)
-            for row, v in enumerate(values):
-                axes.text(v, row + 0.4 * k - 0.2, f" {v:.2g}", va="center", fontsize=8, color=INK)
-        axes.set_yticks(range(len(lines)), list(lines) if place == 0 or is_narrow() else [""] * len(lines))
-        axes.invert_yaxis()
-        axes.margins(x=0.16)
-        axes.grid(axis="y", visible=False)
-        axes.set_title(channel.label)
-        axes.set_xlabel("rms error [%]")
-    outer_legend(grid[0, 0], "upper right")
     return fig
 
 
@@ -476,25 +410,6 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
                 axes.set_xlabel(label)
                 axes.locator_params(axis="x", nbins=5)
     outer_legend(grid[0, 0], "upper right")
-    return fig
-
-
-def draw_similar_effects(found: DiscoveryResult) -> Figure:
-    """|cos| between the signatures of two effects after projection off the base, for the highest scores."""
-    names = [s.name for s in found.scores if s.score > 0][:ALIKE]
-    cosine = found.cosine[: len(names), : len(names)]
-    fig, grid = new_figure(1, 1, 5.6)
-    axes = grid[0, 0]
-    image = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
-    for i in range(len(names)):
-        for j in range(len(names)):
-            if i != j and cosine[i, j] > 0.5:
-                axes.text(j, i, f"{cosine[i, j]:.2f}", ha="center", va="center", fontsize=7,
-                          color="white" if cosine[i, j] > 0.7 else INK)  # fmt: skip
-    axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
-    axes.set_yticks(range(len(names)), names)
-    axes.grid(visible=False)
-    colour_bar(fig, image, axes, label="|cos| of the signatures", shrink=0.8)
     return fig
 
 

@@ -18,11 +18,10 @@ from calibration.data.writing import write_text
 from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model.robot import Robot
-from sweeps import capabilities
+from sweeps import capabilities, pages
 from sweeps.pages import words
 from sweeps.pages.figure_style import (
     NARROW,
-    can_stack,
     figure_as_svg,
     figure_settings,
     fit_for_phones,
@@ -55,7 +54,7 @@ class FigureAlbum:
                 self.add_overlay(name, figure)
                 return
             text, narrow = figure_as_svg(figure), ""
-        if can_stack(figure):
+        if pages.FOR_PHONES and hasattr(figure, "panels"):  # `new_figure` made it, so its panels can be stacked
             with figure_settings(NARROW):
                 narrow = figure_as_svg(fit_for_phones(draw()))
         write_text(self.folder / f"{name}.svg", printable(text))

@@ -87,17 +87,9 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
         [p.speed / MM for p in hits], [p.frequency for p in hits], s=130, marker="*", color="white",
         edgecolor=INK, lw=0.9, zorder=4, label="ripple peaks at a natural frequency: avoid" if hits else None,
     )  # fmt: skip
-    points = table["table8"] & found.read
-    for voltage in np.unique(table["supply_voltage_V"][points]):
-        speed = float(np.median(table["speed_mean_mm_s"][points & (table["supply_voltage_V"] == voltage)]))
-        axes.axvline(speed, color=INK, lw=0.9, ls=":", zorder=2)
-        axes.annotate(
-            f"{voltage:g} V", (speed, top), xytext=(0, 2), textcoords="offset points", va="bottom", ha="center",
-            fontsize=8.5, color=INK,
-        )  # fmt: skip
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
-    heading = f"{found.configuration}: {parts.name} pass every {parts.travel / MM:.4g} mm of travel; dotted: Table 8"
-    axes.set_title(heading, pad=18)
+    heading = f"{found.configuration}: {parts.name} pass every {parts.travel / MM:.4g} mm of travel"
+    axes.set_title(heading)
     labels = axes.get_legend_handles_labels()[1]
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=legend_columns(labels, 3), handletextpad=0.2,
@@ -157,13 +149,6 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
             place = (p.low / MM, payloads.index(p.payload) - 0.5)
             axes.add_patch(Rectangle(place, (p.high - p.low) / MM, 1.0, fill=False, ec=INK, lw=1.3, zorder=3,
                                      ls="-" if p.mode else ":"))  # fmt: skip
-    points = np.flatnonzero(table["table8"] & found.read)
-    loads = table["payload_kg"][points]
-    inside = (loads >= payloads[0]) & (loads <= payloads[-1])
-    axes.scatter(
-        table["speed_mean_mm_s"][points[inside]], np.interp(loads[inside], payloads, range(len(payloads))), s=22,
-        facecolor="white", edgecolor=INK, lw=0.9, zorder=5,
-    )  # fmt: skip
     axes.set(ylim=(-0.5, len(payloads) - 0.5), ylabel="payload [kg]")
     axes.set_yticks(range(len(payloads)), [f"{p:g}" for p in payloads])
     axes.grid(False)

@@ -16,13 +16,6 @@ SHOWN, TALLEST, PANELS = 8, 10, 4
 _MAP = "Blues"
 
 
-def leading_inputs(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
-    """Indices of the inputs with the largest shares. Negligible inputs are left out unless all are negligible."""
-    order = np.argsort(-share, kind="stable")
-    leading = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
-    return np.array(leading or order[:1], int)
-
-
 def draw_input_shares(found: SensitivityResult) -> Figure:
     """Share of every input in every output, over all operating points together."""
     shares = np.stack([study.overall_share for study in found.outputs.values()], 1)
@@ -83,7 +76,8 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                     right_end = np.nanmax([value[n], *swing[:, n, i]])
                     ax.text(right_end, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
-        ax.set_title(_split_label(found.points.label(panel_points[n])), fontsize=8.5)
+        first, *other_words = found.points.label(panel_points[n]).split(", ")
+        ax.set_title(f"{first}\n{', '.join(other_words)}", fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
         ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # few digits, so that numbers do not touch
         ax.grid(axis="y", visible=False)
@@ -92,15 +86,12 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     return fig
 
 
-def _split_label(label: str) -> str:
-    first, *other_words = label.split(", ")
-    return f"{first}\n{', '.join(other_words)}"
-
-
 def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
     """Indices over all points with their 95 % intervals, and the share of each input at every point."""
     share = study.overall_share
-    top = leading_inputs(share)
+    order = np.argsort(-share, kind="stable")
+    leading = [k for k in order[:SHOWN] if share[k] >= NEGLIGIBLE]
+    top = np.array(leading or order[:1], int)  # all may be negligible
     fig, axes = new_figure(1, 2, 1.0 + 0.3 * max(len(top), 3), width_ratios=(1.0, 1.7))
     left, right = axes[0]
     _draw_index_bars(left, study, found, top)

@@ -86,10 +86,19 @@ def _draw_map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, no
         return
     slopes, at_slope = np.unique(runs["slope_deg"][index], return_inverse=True)
     payloads, at_payload = np.unique(runs["payload_kg"][index], return_inverse=True)
-    if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
-        _draw_scatter(axes, runs, index, channel, norm)
-        return
     cell, has_number = at_payload * slopes.size + at_slope, runs_with_number(runs, channel)[index]
+    if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
+        x, y, values = (runs[column][index] for column in ("slope_deg", "payload_kg", channel.column))
+        colours = values[has_number]
+        axes.scatter(x[has_number], y[has_number], c=colours, cmap="viridis", norm=norm, s=8, rasterized=True)
+        for status in np.unique(runs["status"][index][~has_number]):
+            pick = ~has_number & (runs["status"][index] == status)
+            axes.plot(
+                x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short_status(str(status))
+            )
+        if not has_number.all():
+            axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
+        return
     image = np.full((payloads.size, slopes.size), np.nan)
     has_median, medians = _medians(cell[has_number], runs[channel.column][index][has_number])
     image.flat[has_median] = medians
@@ -161,18 +170,6 @@ def _set_ticks(setter: Any, levels: np.ndarray) -> None:
     values = np.asarray(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high))
     values = values[(values >= low - 1e-9 * (high - low)) & (values <= high + 1e-9 * (high - low))]
     setter(np.interp(values, levels, np.arange(levels.size)), [f"{v:g}" for v in values])
-
-
-def _draw_scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
-    values = runs[channel.column][index]
-    settles = runs_with_number(runs, channel)[index]
-    x, y = runs["slope_deg"][index], runs["payload_kg"][index]
-    axes.scatter(x[settles], y[settles], c=values[settles], cmap="viridis", norm=norm, s=8, rasterized=True)
-    for status in np.unique(runs["status"][index][~settles]):
-        pick = ~settles & (runs["status"][index] == status)
-        axes.plot(x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short_status(str(status)))
-    if not settles.all():
-        axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
 
 
 def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:

@@ -3,77 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
-
-
-class StatusWords(NamedTuple):
-    """Words for the end of a run: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
-
-    short: str
-    why: str
-    meaning: str
-
 
 #: Phrases for a status that means something else in one model, by both names.
 VERDICTS = {("climb", "converged"): "have a verdict"}
-STATUSES: dict[str, StatusWords] = {
-    "converged": StatusWords("settled", "steady travel", "found a steady operating point"),
-    "stalled": StatusWords(
-        "stands",
-        "friction holds the robot, or the motors cannot turn the load",
-        "the robot does not move: static friction holds it, or the motors cannot turn the load and draw "
-        "their stall current",
-    ),
-    "slides": StatusWords(
-        "slides",
-        "traction demand above the adhesion limit",
-        "slope and rolling resistance demand more traction than the ground can give (demand above μ_s N), so the "
-        "tracks or wheels spin and the robot does not climb",
-    ),
-    "not_settled": StatusWords(
+#: Label and meaning of each end of a run.
+STATUSES: dict[str, tuple[str, str]] = {
+    "converged": ("settled", "found a steady operating point"),
+    "stalled": ("stands", "static friction holds the robot, or the motors cannot turn the load"),
+    "slides": ("slides", "traction demand above the adhesion limit μ_s N, so the tracks or wheels spin"),
+    "not_settled": (
         "not settled",
         "the robot still accelerates at the end of the run (try a longer --duration), or the turn has no steady "
         "state (use --model drive to simulate it over time)",
-        "the robot still accelerates at the end of the simulated time, or no steady state was found for the turn, "
-        "for example because friction falls with sliding speed",
     ),
-    "battery_empty": StatusWords("battery empty", "the battery is empty", "the battery's capacity is used up"),
-    "failed": StatusWords(
-        "failed", "the solver found no solution", "the solver found no solution. Please report the conditions"
-    ),
-    "tips": StatusWords(
+    "battery_empty": ("battery empty", "the battery's capacity is used up"),
+    "failed": ("failed", "the solver found no solution. Please report the conditions"),
+    "tips": (
         "tips over",
         "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
-        "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
     ),
-    "reverses": StatusWords(
-        "reverses", "steady travel backward", "found a steady operating point, travelling backward"
-    ),
-    "rolls_back": StatusWords(
+    "reverses": ("reverses", "found a steady operating point, travelling backward"),
+    "rolls_back": (
         "rolls back",
-        "gravity drives the robot downhill, against its motors or without voltage",
         "gravity drives the robot downhill at a steady speed, against its motors or without voltage",
     ),
-    "cut_off": StatusWords(
-        "cut off",
-        "a cell is below its cut-off voltage, so the battery switches off",
-        "the cells were below their cut-off voltage for longer than permitted, although charge was left",
-    ),
+    "cut_off": ("cut off", "the cells were below their cut-off voltage for longer than permitted"),
 }
 
 #: Files of a run folder other than its page.
 FILES = {
-    "drive.xml": "the drive for MuJoCo, to be included in a model",
-    "scene.xml": "a MuJoCo scene that includes drive.xml and can be run",
-    "actuator.py": "the drive law in JAX, without a dependency on mmrjax",
-    "actuator.jaxexport": "the same law as a compiled program, for jax.export.deserialize",
+    "drive.xml": "the drive for MuJoCo",
+    "scene.xml": "a MuJoCo scene with drive.xml",
+    "actuator.py": "the drive law in JAX, without mmrjax",
+    "actuator.jaxexport": "the same law for jax.export.deserialize",
     "actuator.onnx": "the drive law as an ONNX model",
     "mjlab_actuator.py": "the drive law in PyTorch, with a configuration for mjlab",
     "feed_forward.csv": "voltage, current and losses by speed and torque",
     "feed_forward.h": "the same tables for C",
     "draws.npz": "samples from the posterior, for NumPy",
-    "draws.json": "the same samples as JSON",
-    "LAW.md": "description of the drive law for readers who do not know mmrjax",
+    "LAW.md": "description of the drive law",
     "robot.toml": "the robot, for --robot of every command",
     "runs.csv": "every run, one row each",
     "windows.csv": "windows of a log: voltage, velocity, acceleration",
@@ -87,7 +55,7 @@ FILES = {
     "requirements.toml": "the requirements as given",
     "posterior.nc": "posterior distribution of the fitted parameters, for --posterior",
     "points.csv": "outputs at every operating point",
-    "turns.csv": "settled turns, from straight travel to turning on the spot",
+    "turns.csv": "settled turns",
     "posture.csv": "posture: lever angles and contact loads",
     "derivatives.csv": "every derivative, one row each",
     "modes.csv": "natural frequencies of the chassis on its contacts",
@@ -96,7 +64,7 @@ FILES = {
     "settled.csv": "the settled runs, for loop and calibrate",
     "stretches.csv": "every stretch of the log, with the reason if it was left out",
     "results.zarr/": "outputs of every point, as a Zarr store",
-    "identity.json": "settings that the store was created with, needed to resume the sweep",
+    "identity.json": "settings of the store, needed to resume the sweep",
     "result.json": "everything on this page, for programs",
     "config.resolved.toml": "every option of the command",
     "manifest.json": "versions, machine, time, hashes",
@@ -106,18 +74,13 @@ FILES = {
 
 #: What `verdict` in result.json of the loop means, the least first; an alias after its word.
 LOOP_VERDICTS = {
-    "none": "nothing is missing as far as these runs can show: the residuals of the fitted model are consistent with "
-    "noise",
-    "undescribed": "the model does not describe the runs. In one channel, the error of the refitted model exceeds a "
-    "quarter of the measured rms, or the noise is estimated to be that large. No set of effects halves this error on "
-    "unseen runs and brings it below a quarter. No effect is named, and the statement lists what to check first",
-    "place": "a term is missing in one equation, or in one of several that these data cannot distinguish. Nothing "
-    "more is established",
+    "none": "the residuals of the fitted model are consistent with noise",
+    "undescribed": "in one channel, the error of the refitted model or its estimated noise exceeds a quarter of the "
+    "measured rms. No set of effects halves this error on unseen runs and brings it below a quarter",
+    "place": "a term is missing in one equation, or in one of several that these data cannot distinguish",
     "unnamed": "former word for place. Up to schema mmrjax.loop/3 it also meant mechanism",
-    "mechanism": "the equation of the missing term and the variable that it depends on are established. Its "
-    "exact law is not",
-    "class": "an effect is established for each missing term. For at least one term, it is one of several effects "
-    "that these data cannot distinguish",
+    "mechanism": "the equation of the missing term and the variable that it depends on are established",
+    "class": "at least one missing term is one of several effects that these data cannot distinguish",
     "named": "one effect of the library is established for each missing term",
 }
 
@@ -137,53 +100,46 @@ def sink_labels(on_ground: bool) -> dict[str, str]:
 
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
-    "balance": "one equation of the model, for instance the sum of voltages in the motor circuit or of "
-    "torques at the "
-    "driving wheel. Every effect enters one balance",
-    "effect": "a term that the model may lack. `mmrjax explain NAME` prints its equation, its typical size and a "
-    "test for it on a bench",
-    "established": "an effect that is not explained by chance, by a smooth curve, by one run or by one block of runs",
-    "tentative": "an effect that improves predictions and is included in robot.toml, although it failed one "
-    "of the listed tests",
+    "balance": "one equation of the model, such as the sum of torques at the driving wheel. Every effect enters one",
+    "effect": "a term that the model may lack. `mmrjax explain NAME` prints its equation and a bench test for it",
+    "established": "not explained by chance, by a smooth curve, by one run or by one block of runs",
+    "tentative": "improves predictions and is in robot.toml, but failed one of the tests of established effects",
     "class": "effects that these data cannot distinguish",
     "mechanism": "the equation that lacks a term and the variable that the term depends on, but not its exact law. "
     "The term explains at least half of the misfit beyond noise, predicts held-out runs, and is found again when "
     "blocks of runs are left out",
-    "place": "the equation that lacks a term, or several that these data cannot distinguish. No mechanism is "
-    "established",
+    "place": "the equation that lacks a term, or several that these data cannot distinguish",
     "misfit beyond noise": "χ² minus the part that noise explains, which is about one per reading",
     "refit": "the same model with its parameters fitted to the runs, without new effects",
     "seen": "errors on the runs that the fit used",
     "held out": "errors on runs that were left out of the fit, one slope, voltage or configuration at a time",
-    "noise": "standard deviation of an instrument's readings. Give it with --noise or in `_sd` columns, otherwise it "
-    "is estimated",
+    "noise": "standard deviation of an instrument's readings, from --noise, `_sd` columns or an estimate",
     "rms error": "root mean square of simulated minus measured, in percent of the rms of the measured readings",
     "σ": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
-    "χ²": "sum of (simulated minus measured)² / σ² over all readings. Noise alone gives about one per reading",
-    "prior": "value and standard deviation of a parameter from a bench or a data sheet, before any run is used",
+    "χ²": "sum of (simulated minus measured)² / σ² over all readings",
+    "prior": "value and standard deviation of a parameter from a bench or a data sheet",
     "p": "probability that noise alone gives a result as extreme as this one",
     "log likelihood": "logarithm of the probability density of the readings under the model. With 60 readings, a "
     "gain of 0.1 per held-out reading is significant",
-    "reached": "runs in which the simulated robot reaches a steady state. In the others it slides or does not move",
+    "reached": "runs in which the simulated robot reaches a steady state",
     "voltage_limit": "largest voltage that the loop may propose for an experiment, from `[motor]` of the robot file",
 }
 
 FLAGS = {
     "motor_overspeed": "the motor is above its permitted speed",
     "gearbox_overspeed": "the gearbox input is above its permitted speed",
-    "winding_hot": "the winding would be hotter than permitted after long running at this current",
-    "slips": "the tracks or wheels slide faster than V_s on average, although the robot travels steadily",
-    "jumps": "the weight moves between guides and pulleys so abruptly that the robot leaves the ground at times",
-    "overvoltage": "current flows back into the battery: the cells are above their charge voltage, or the "
-    "charging current is too high",
+    "winding_hot": "the winding is too hot after long running at this current",
+    "slips": "the tracks or wheels slide faster than V_s on average",
+    "jumps": "the robot leaves the ground at times",
+    "overvoltage": "the cells are above their charge voltage, or the charging current is too high",
     "cut_off": "a cell is below its cut-off voltage",
     "battery_overcurrent": "the current of a cell is above its limit",
     "current_limited": "the motor driver limits the current",
     "gearbox_overload": "the torque is above the continuous rating of the gearbox",
     "too_hot": "the winding is hotter than permitted",
     "demand_missed": "the robot did not reach the commanded speed",
-    "voltage_rising": "a cell voltage rises during discharge: the parabola of its curve is past its minimum",
-    "current_returned": "current flows back into the external supply, but few bench supplies can absorb it",
+    "voltage_rising": "a cell voltage rises during discharge, past the minimum of its curve",
+    "current_returned": "current flows back into the external supply",
 }
 
 
@@ -210,25 +166,22 @@ OUTCOMES = {
 
 
 #: Reason for a turn without a settled value.
-NO_TURN = (
-    "there is no settled turn, for example because friction falls with sliding speed. With --model drive, simulate "
-    "computes the turn over time"
-)
+NO_TURN = "there is no settled turn. With --model drive, simulate computes the turn over time"
 
 
 def reason_without_value(outcome: str) -> str:
     """Reason why a quantity has no value, in one line."""
-    return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]
+    return OUTCOMES.get(outcome) or status_meaning(outcome)
 
 
 def short_status(status: str) -> str:
     """A status as figures show it."""
-    return STATUSES[status].short if status in STATUSES else status
+    return STATUSES.get(status, (status, ""))[0]
 
 
 def status_meaning(status: str) -> str:
     """A status for the reader of a report."""
-    return STATUSES[status].meaning if status in STATUSES else ""
+    return STATUSES.get(status, (status, ""))[1]
 
 
 _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -224,14 +224,12 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 # --- runs ---------------------------------------------------------------------------------------------
 
 
-def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[StartRun]:
+def simulate_starts(robot: Robot) -> list[StartRun]:
     """Starts from standstill on the flat with `drive`, for each of the paper's configurations."""
     from mmrjax.fidelities.drive import drive_batch
 
-    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    run = drive_batch(
-        robot, batch_conditions(robot, shown_configurations(robot), voltage=voltage), jnp.asarray(times)
-    )
+    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, 1.5, 440)[1:]])
+    run = drive_batch(robot, batch_conditions(robot, shown_configurations(robot), voltage=33.0), jnp.asarray(times))
     return starts_from_standstill(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
 
 
@@ -362,24 +360,10 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     return points, split
 
 
-class EnergyUse(NamedTuple):
-    """Breakdown of the supply's power at operating points.
+def energy_use(robot: Robot, ratio: dict[str, float]) -> list[tuple[Any, ...]]:
+    """Power of the supply and of each item of `SPLIT` [W] at twelve operating points.
 
-    Attributes:
-        labels: labels of the points, with a star if the adhesion is raised because the robot would slide.
-        power: item of `SPLIT`, and `other` → [W].
-        total: power of the supply [W].
-        status: status of each point.
-    """
-
-    labels: list[str]
-    power: Columns
-    total: np.ndarray
-    status: np.ndarray
-
-
-def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
-    """Breakdown of the supply's power at twelve operating points.
+    A star marks a point at which the robot would slide. Its adhesion is raised.
 
     Args:
         ratio: factor by which adhesion is raised if the robot would slide, by configuration.
@@ -395,11 +379,13 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
 
     is_sliding = at(np.ones(len(cases)))[0]["status"] == "slides"
     points, power = at(np.where(is_sliding, [ratio[k] for k in kind], 1.0))
-    labels = [
-        f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(slid)
-        for (c, u, p, s), slid in zip(cases, is_sliding, strict=True)
+    return [
+        (
+            f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(is_sliding[k]),
+            *(watts[k] for watts in (points["power_supply_W"], *(power[item] for item in SPLIT))),
+        )
+        for k, (c, u, p, s) in enumerate(cases)
     ]
-    return EnergyUse(labels, power, points["power_supply_W"], points["status"])
 
 
 def paper_rows_table(rows: PaperRows) -> Columns:

@@ -115,12 +115,9 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
         if gear:
             yield Section("Inside the running gear", tuple(gear_blocks(robot)), "gear")
         ratio = dict.fromkeys(data.shown_configurations(robot), 1.0) if own_rows is None else own_rows.ratio
-        energy_rows = data.energy_use(robot, ratio)
-        yield Section("Where the energy goes", (catalogue.figure("paper.energy_split", energy_rows),), "energy")
-        watts = np.stack([energy_rows.total, *(energy_rows.power[item] for item in data.SPLIT)], 1)
-        watt_rows = [(label, *row) for label, row in zip(energy_rows.labels, watts, strict=True)]
+        watt_rows = data.energy_use(robot, ratio)
         columns = (Column(item, form="{:.1f}") for item in data.SPLIT)
-        yield Section("", (catalogue.table("paper.watts", watt_rows, *columns),), folded="The same in watts")
+        yield Section("Where the energy goes", (catalogue.table("paper.watts", watt_rows, *columns),), "energy")
         figures = (
             catalogue.figure("paper.fig05a_gearbox_efficiency", robots, own_rows),
             *(catalogue.figure(f"paper.{n}", robots) for n in ("fig10_battery", "fig11_motor_friction")),
@@ -191,7 +188,6 @@ def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows]
     certainty = data.slope_certainty(own_rows)
     table = [(*row[:3], f"{row[3]:.3f} ({row[4]})", *row[5:]) for row in certainty]
     blocks: list[Block] = [
-        catalogue.figure("paper.rows", own_rows, name),
         catalogue.figure("paper.fig28_current_over_slope", robots[name], own_rows, certainty),
         catalogue.table("paper.certainty", table),
     ]

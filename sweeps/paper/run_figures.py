@@ -9,27 +9,23 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.inference import simulation_errors
-from mmrjax.model.paper_tables import TRACKED, WHEELED
+from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
-from sweeps.pages import words
 from sweeps.pages.figure_style import (
     BLUE,
     GREEN,
     INK,
-    ORANGE,
     PURPLE,
     SKY,
     VERMILION,
     add_corner_note,
-    axis_label,
     label_line_end,
     legend_columns,
     new_figure,
-    outer_legend,
 )
 from sweeps.pages.words import displayed_robot_name
 from sweeps.paper import data
-from sweeps.paper.components import CONFIGURATION, MODEL
+from sweeps.paper.components import MODEL
 
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 
@@ -122,103 +118,4 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.PaperRows]) -> F
         axes.set_xlabel("slope [°]")
     labels = [str(h.get_label()) for h in handles]
     fig.legend(handles=handles, loc="outside lower center", ncols=legend_columns(labels))
-    return fig
-
-
-_SPLIT_COLOURS = {
-    "winding": VERMILION,
-    "motor friction": ORANGE,
-    "gearbox": PURPLE,
-    "track and guides": BLUE,
-    "slip": INK,
-    "rolling resistance": SKY,
-    "lift": GREEN,
-    "other": "#cccccc",
-}
-
-
-def draw_energy(used: data.EnergyUse) -> Figure:
-    """Breakdown of the supply's power at twelve operating points, in percent, with watts at the end."""
-    fig, grid = new_figure(1, 1, 5.2)
-    axes = grid[0, 0]
-    height = [float(k) + 0.6 * (k // 3) for k in range(len(used.labels))]
-    bar_starts = np.zeros(len(used.labels))
-    for item in (*data.SPLIT, "other"):
-        share = 100 * used.power[item] / used.total
-        share = np.where(np.isfinite(share), share, 0.0)
-        if np.abs(share).max() < 0.05:  # invisible, and not in the legend
-            continue
-        axes.barh(
-            height, share, left=bar_starts, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6
-        )
-        for y, x, width in zip(height, bar_starts, share, strict=True):
-            if width >= 4:
-                dark = item in ("winding", "track and guides", "slip", "gearbox", "lift")
-                axes.text(
-                    x + width / 2,
-                    y,
-                    f"{width:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color="white" if dark else INK,
-                )
-        bar_starts = bar_starts + share
-    for y, total, status in zip(height, used.total, used.status, strict=True):
-        alive = np.isfinite(total)
-        text = f"{total:.0f} W" if alive else words.short_status(str(status))
-        axes.text(101 if alive else 1, y, text, va="center", fontsize=8.5)
-    axes.set_yticks(height, used.labels, fontsize=8.5)
-    axes.invert_yaxis()
-    axes.grid(False)
-    remark = "\n* slides with its own adhesion; shown with raised adhesion" if "*" in "".join(used.labels) else ""
-    axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
-    outer_legend(axes, "upper center")
-    return fig
-
-
-def row_parity(rows: data.PaperRows, name: str) -> Figure:
-    """Simulated over measured readings for every channel, with raised adhesion and both masses for 4W2T."""
-    channels_shown = data.channels_of_paper()
-    fig, grid = new_figure(1, len(channels_shown), 3.7)
-    kind = rows.conditions["configuration"]
-    raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
-    has_other_mass = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
-    is_sliding = rows.plain["status"] == "slides"
-    for k, (axes, channel) in enumerate(zip(grid[0], channels_shown, strict=True)):
-        measured = rows.measured[:, k]
-        span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
-        axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
-        axes.plot(span, span, color="#666666", lw=0.9)
-        for c in rows.ratio:
-            for pick, face, label in (
-                ((kind == c) & ~is_sliding, CONFIGURATION[c], c),
-                ((kind == c) & is_sliding, "white", f"{c}, adhesion raised"),
-            ):
-                axes.plot(
-                    measured[pick],
-                    raised[pick, k],
-                    "o" if c == TRACKED else "s",
-                    color=CONFIGURATION[c],
-                    mfc=face,
-                    ms=6,
-                    ls="",
-                    label=label if pick.any() else None,
-                )
-        if has_other_mass.any():
-            axes.plot(
-                measured[has_other_mass],
-                weighed[has_other_mass, k],
-                "+",
-                color=INK,
-                ms=8,
-                mew=1.4,
-                label="4W2T with the robot's own mass",
-            )
-        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
-        axes.set_xlim(*span)
-        axes.set_ylim(*span)
-        axes.locator_params(nbins=5)
-    add_corner_note(grid[0, 0], f"{displayed_robot_name(name)}; band ±5 %", fontsize=8.5)
-    outer_legend(grid[0, 0], "lower center")
     return fig

@@ -25,7 +25,7 @@ from mmrjax.model.robot import Robot
 from sweeps.config_campaign import Campaign
 from sweeps.options import parse_axis
 from sweeps.points import imposed
-from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, JointDistribution, Samples, in_blocks
+from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, Samples, in_blocks
 from sweeps.points.tasks import task_of_configuration
 
 CONFIGURATION, SURFACE = "configuration", "surface"
@@ -158,7 +158,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
 
 def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
     """Adhesion of each configuration on a surface, relative to that on the bench."""
-    return tuple(adhesion_ratio(surface, float(c.on_tracks) > 0.5) for c in robot.configurations.members)
+    return tuple(adhesion_ratio(surface, tracked) for tracked in robot.configurations.tracked)
 
 
 def _known_axis(name: str, robot: Robot, where: str) -> Axis:
@@ -298,7 +298,7 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     return Samples(design, number, seed, marginals, joint)
 
 
-def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> JointDistribution:
+def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Any:
     from calibration.data import posterior_file
 
     if not isinstance(stated, str):
@@ -346,22 +346,17 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         if not axis.prior_sd or axis.value is None:
             other_names = ", ".join(k for k in DISTRIBUTIONS if k != kind)
             raise BadConfiguration(f"{where}: {name} has no prior; expected one of {other_names}")
-        return _prior(name, robot)
+        from scipy.special import ndtri
+
+        from calibration.inference import priors
+
+        coordinates = priors.parameter_coordinates(robot, [name])
+
+        def quantile(u: np.ndarray) -> np.ndarray:
+            return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
+
+        return quantile
     return _truncate(kind, numbers, axis.bounds, where)
-
-
-def _prior(name: str, robot: Robot) -> Quantile:
-    """Quantile function of a parameter's prior, as in `calibrate` and `sensitivity`."""
-    from scipy.special import ndtri
-
-    from calibration.inference import priors
-
-    coordinates = priors.parameter_coordinates(robot, [name])
-
-    def quantile(u: np.ndarray) -> np.ndarray:
-        return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
-
-    return quantile
 
 
 def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -226,13 +225,9 @@ def _search_all(
         np.full(points, low),
     )
     for k in range(rounds):
-        verdicts = run(sizes, functools.partial(_report_share, told, k, rounds)).verdict
+        verdicts = run(sizes, lambda share, k=k: told((k + share) / rounds)).verdict
         is_over = verdicts == OVER
         climbed, beyond = np.where(is_over, sizes, climbed), np.where(is_over, beyond, sizes)
         verdict = np.where(is_over, verdict, verdicts)
         sizes = (np.maximum(climbed, low) + beyond) / 2
     return {VERDICT: verdict, LARGEST: climbed}
-
-
-def _report_share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
-    told((k + share) / rounds)

@@ -12,7 +12,7 @@ import hashlib
 import math
 import os
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt64
@@ -23,23 +23,6 @@ from calibration.data import Columns, Names
 SAMPLE = "sample"
 #: Axis with the number of a table's run.
 ROW = "run"
-
-
-class JointDistribution(Protocol):
-    """Several quantities that are sampled together, from one independent normal score for each coordinate."""
-
-    @property
-    def names(self) -> Names:
-        """Names of its columns."""
-        ...
-
-    def __len__(self) -> int:
-        """Number of coordinates."""
-        ...
-
-    def values(self, normal_scores: Float[np.ndarray, "points coordinates"]) -> Float[np.ndarray, "points names"]:
-        """Values of the names at each point."""
-        ...
 
 
 #: Number of points that a distribution computes together. JAX compiles a program for each number, and sums over
@@ -66,7 +49,7 @@ class Samples:
     number: int
     seed: int
     marginals: dict[str, Callable[[np.ndarray], np.ndarray]]
-    joint: JointDistribution | None = None
+    joint: Any = None
 
     @property
     def names(self) -> Names:

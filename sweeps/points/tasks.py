@@ -19,11 +19,6 @@ from sweeps.points import climbs
 Attributes = dict[str, Json]
 
 
-def nothing_further(stated: Columns, robot: Robot, where: str) -> dict[str, float]:
-    """Returns no further conditions."""
-    return {}
-
-
 @dataclasses.dataclass(frozen=True)
 class Task:
     """Task of every point of a sweep.
@@ -48,7 +43,7 @@ class Task:
     slow: bool
     at_once: tuple[int, int]
     axes: Mapping[str, Axis] = dataclasses.field(default_factory=dict)
-    further: Callable[[Columns, Robot, str], dict[str, float]] = nothing_further
+    further: Callable[[Columns, Robot, str], dict[str, float]] = lambda stated, robot, where: {}
     run: Callable[..., Json] | None = None
 
 

@@ -114,17 +114,15 @@ def _flat(content: Json, prefix: str) -> dict[str, str]:
     return flat
 
 
-def identity_differences(
-    stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3
-) -> str:
+def identity_differences(stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]]) -> str:
     """Sections in which two identities differ, with the first keys. Empty if they are equal."""
     differences = []
     for section in dict.fromkeys((*now, *stored)):
         old, new = stored.get(section, {}), now.get(section, {})
         keys = [key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key)]
         if keys:
-            changes = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:most]]
-            others_text = f" and {len(keys) - most} more" if len(keys) > most else ""
+            changes = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:3]]
+            others_text = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
             differences.append(f"{section} ({', '.join(changes)}{others_text})")
     return "; ".join(differences)
 

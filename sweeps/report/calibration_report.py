@@ -41,7 +41,6 @@ def calibration_document(
     )
     rms = [fit_tables.rms_table(found.rms, found.channels)] if sized else []
     answer = fit_words.calibration_answer(found)
-    before_after = catalogue.figure("calibration.before_after", found, finding=answer, words=(OF_SIZE,))
     table = found.rows()
     kinds = {"": "measured", "after_": "fitted"}
     return Document(
@@ -61,7 +60,6 @@ def calibration_document(
         ),
         (
             Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
-            Section("Errors before and after, seen and unseen", (before_after,)),
             *_over_rows(found, sized),
             *([feedforward_report.voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),

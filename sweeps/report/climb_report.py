@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data import Columns, Json, Names, robot_file
-from calibration.data.input_errors import BadConfiguration
+from calibration.data import Columns, Json, Names
 from calibration.data.robot_file import RobotFile
 from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbDerivatives, ClimbInputs, outputs_of_run
 from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, ClimbRuns
@@ -37,14 +32,10 @@ VERDICTS: dict[str, tuple[str, str]] = {
 }
 
 
-#: Columns of `history.csv` with the coordinates, and further columns that a film shows.
-COORDINATES = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
-FILMED = ("time_s", "traction_current_A")
-
-
 def footing_coordinates(table: Columns) -> np.ndarray:
     """Coordinates of `mmrjax.climbing.footing` at every sample of a history, shape (samples, 6)."""
-    x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
+    columns = ("x_mm", "z_mm", "pitch_deg", "shaft_deg", "front_deg", "rear_deg")
+    x, z, pitch, shaft, front, rear = (table[name] for name in columns)
     angles = np.radians([-pitch, shaft, front, 180 - rear])
     return np.stack([x / 1000, z / 1000, *angles], axis=1)
 
@@ -71,36 +62,11 @@ class Along:
         return list(zip(self.names, self.units, self.values.tolist(), self.widths.tolist(), strict=True))
 
 
-@dataclasses.dataclass(frozen=True)
-class Seen:
-    """Drawn part of a `ClimbResult`, read from its run folder."""
-
-    robot: Robot
-    configuration: str
-    obstacle: str
-    terrain: Terrain
-    table: Columns
-
-    @staticmethod
-    def read(folder: Path) -> Seen:
-        """Reads a folder of `mmrjax climb`.
-
-        Raises:
-            BadConfiguration: it is no such folder.
-        """
-        try:
-            content = json.loads((folder / "result.json").read_text("utf-8"))
-            ground = content["terrain"]
-            with (folder / "history.csv").open(newline="", encoding="utf-8") as stream:
-                rows = list(csv.DictReader(stream))
-            table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *FILMED)}
-            lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
-            return Seen(
-                robot_file.find_robot_file(str(folder / "robot.toml")).robot,
-                content["configuration"], content["obstacle"], Terrain(*lengths), table,
-            )  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error
+#: Columns of a run whose largest size is reported, with their units.
+_LARGEST = (
+    ("traction_current", "A"), ("front_current", "A"), ("rear_current", "A"), ("front_torque", "Nm"),
+    ("rear_torque", "Nm"), ("front_voltage", "V"), ("rear_voltage", "V"),
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,13 +188,7 @@ class ClimbResult:
             "pitch_most_deg": float(t["pitch_deg"].max()),
             "pitch_least_deg": float(t["pitch_deg"].min()),
             "margin_least_mm": float(np.fmin.reduce(t["margin_mm"])),
-            "traction_current_most_A": float(np.abs(t["traction_current_A"]).max()),
-            "front_current_most_A": float(np.abs(t["front_current_A"]).max()),
-            "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
-            "front_torque_most_Nm": float(np.abs(t["front_torque_Nm"]).max()),
-            "rear_torque_most_Nm": float(np.abs(t["rear_torque_Nm"]).max()),
-            "front_voltage_most_V": float(np.abs(t["front_voltage_V"]).max()),
-            "rear_voltage_most_V": float(np.abs(t["rear_voltage_V"]).max()),
+            **{f"{name}_most_{unit}": float(np.abs(t[f"{name}_{unit}"]).max()) for name, unit in _LARGEST},
             "energy_levers_J": levers,
             "energy_J": tracks + levers,
         }
@@ -265,22 +225,21 @@ def climb_document(found: ClimbResult, file: RobotFile) -> Document:
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (
         run_tables.note_on_robot(file, more=lead),
+        *[Note(f"{tried}.", terminal=True)] * bool(tried),
         catalogue.figure("climb.silhouettes", found),
         catalogue.figure("climb.course", found),
     )
-    if tried:
-        blocks = (*blocks, catalogue.figure("climb.search", found, finding=tried))
-    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found, tried)))
+    return Document("Over an obstacle", found.statement(), blocks, tuple(_sections(found)))
 
 
-def _sections(found: ClimbResult, tried: str) -> Iterable[Section]:
+def _sections(found: ClimbResult) -> Iterable[Section]:
     numbers = [
         (name.rpartition("_")[0].replace("_most", ", largest").replace("_least", ", least").replace("_", " "), value,
          name.rpartition("_")[2])
         for name, value in found.numbers().items()
     ]  # fmt: skip
     of_run = catalogue.table("climb.run", numbers)
-    yield Section("The run in numbers", (of_run, *[Note(f"{tried}.", terminal=True)] * bool(tried)), "numbers")
+    yield Section("The run in numbers", (of_run,), "numbers")
     if found.margins:
         rows = [(n.removeprefix("margin_"), 100 * value, OUTPUTS[n][1]) for n, value in found.margins.items()]
         shares = catalogue.table("climb.shares", rows)

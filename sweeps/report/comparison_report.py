@@ -253,7 +253,8 @@ def _rows(found: Comparison) -> Table:
     heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in formats.values())]
     heads.append(Column("status"))
     cells: list[Any] = [table["configuration"], *(table[c] for c in formats)]
-    cells.append([_status(str(s)) for s in table["status"]])
+    ends = [(s, "" if s in words.SETTLED else "slides") for s in map(str, table["status"])]
+    cells.append([Cell(words.short_status(s), look) for s, look in ends])
     for c in found.channels:
         measured, simulated = table[c.column], table[f"simulated_{c.column}"]
         form = f"{{:.{max(c.resolution - 1, 0)}f}}"
@@ -261,10 +262,6 @@ def _rows(found: Comparison) -> Table:
         heads.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
         cells += [measured, simulated, simulated - measured]
     return Table("rowtable", tuple(heads), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
-
-
-def _status(status: str) -> Cell:
-    return Cell(words.short_status(status), "" if status in words.SETTLED else "slides")
 
 
 def _strongest_trend(found: Comparison) -> str:

@@ -18,7 +18,6 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, blocks
 from calibration.inference.details import TimeStatistics
 from calibration.inference.fit_notes import Determination, remarks_with_codes
-from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
 from mmrjax.errors import count_noun
@@ -230,11 +229,12 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
             alike = ", ".join(bases.place_in_words(b) for b in e["balances_alike"] if b != e["balance"])
             rows.append((e["name"], kinds, place, plot_words, "-", lowers, e["p_value"], "a curve", alike))
             continue
+        reason = loop_words.tentative_reason(found, effect)
         rows.append(
             (
-                loop_words.effect_called(found, effect), kinds, place, e["equation"] or plot_words,
+                f"{e['name']}\n({reason})" if reason else e["name"], kinds, place, e["equation"] or plot_words,
                 loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
-                loop_words.tentative_reason(found, effect) or e["standing"],
+                reason or e["standing"],
                 loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
             )
         )  # fmt: skip
@@ -326,7 +326,6 @@ def _sections(
     heading = "Where the missing term acts" if missing else "What each equation lacks"
     yield Section(heading, tuple(_blocks_of_missing_terms(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
-    errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
     fits = {
         when: rms_by_channel
         for when, rms_by_channel in found.rms.items()
@@ -334,14 +333,21 @@ def _sections(
     }
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    error_blocks: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
-    error_blocks += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
-    yield Section("Errors on runs used in the fit, and on held-out runs", tuple(error_blocks))
+    error_blocks: tuple[Block, ...] = held_out_table(found), catalogue.note("loop.fitted_again"), *in_units
+    yield Section("Errors on runs used in the fit, and on held-out runs", error_blocks)
     yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
-    yield Section("", (catalogue.figure("loop.look_alikes", found),), folded="which effects are similar")
     yield from [looked_for] if missing else []
-    yield Section("Parameters before and after", (_base(found),))
+    rows = [
+        (
+            f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
+            fit_tables.shift_cell(p.shift_after),
+            describe(Determination.from_pairs(name, p.held_by_prior, found.together)),
+            p.at_bound or "", p.meaning,
+        )
+        for name, p in found.base_shift.items()
+    ]  # fmt: skip
+    yield Section("Parameters before and after", (catalogue.table("loop.base", rows),))
     first = {"row": table["row"]}
     if isinstance(found.detail, TimeStatistics):
         first |= {"run": table.get("run_id", table["row"]), "t [s]": table["time_s"]}
@@ -455,7 +461,6 @@ def _named(values: Mapping[str, float]) -> str:
 
 
 def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
-    yield catalogue.figure("loop.power", found)
     yield catalogue.note("loop.seen-above")
     level, rows = found.before.kinds["single"].threshold, []
     for s in found.scores:
@@ -470,16 +475,3 @@ def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
     }  # fmt: skip
     texts = (catalogue.text(f"loop.{key}", ", ".join(names)) for key, names in unseen.items() if names)
     yield Note("".join(texts), name="unseen")
-
-
-def _base(found: DiscoveryResult) -> Table:
-    rows = [
-        (
-            f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
-            fit_tables.shift_cell(p.shift_after),
-            describe(Determination.from_pairs(name, p.held_by_prior, found.together)),
-            p.at_bound or "", p.meaning,
-        )
-        for name, p in found.base_shift.items()
-    ]  # fmt: skip
-    return catalogue.table("loop.base", rows)

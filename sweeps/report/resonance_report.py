@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from mmrjax.undercarriage.ripple_peaks import (
     group_resonances,
     strongest_resonances,
 )
-from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Cell, Document, Section, Table, remarks
 
@@ -46,7 +44,7 @@ class ResonanceResult:
         configuration, slope_deg, surface: configuration, slope and surface of the map.
         passing: source of the excitation.
         robot: robot that was simulated.
-        table: one row for each run, as in `points.csv`: the grid, then further points of Table 8.
+        table: one row for each run, as in `points.csv`.
         modes: modes by payload [kg].
         peaks, crossings: peaks and crossings at every payload.
     """
@@ -175,8 +173,6 @@ class ResonanceResult:
             parts.append(
                 f"Speeds without these problems: {free} mm/s." if free else "No speed is without these problems."
             )
-        if self._table8():
-            parts.append(self._table8())
         if self.passing.name == "teeth":
             parts.append(
                 f"This configuration has no grousers on the ground. The belt's teeth cause its ripple, one every "
@@ -200,39 +196,10 @@ class ResonanceResult:
             for n in names
         ]
 
-    def _table8(self) -> str:
-        """Sentence on the points of Table 8 within ranges to avoid, by payload."""
-        rows = np.flatnonzero(self.table["table8"] & self.read)
-        inside = []
-        for voltage in np.unique(self.table["supply_voltage_V"][rows]):
-            table_rows = rows[self.table["supply_voltage_V"][rows] == voltage]
-            hit = [k for k in table_rows if self.shaken(k)]
-            if hit:
-                loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
-                inside.append(
-                    f"{voltage:g} V with {'every payload' if len(hit) == len(table_rows) else loads + ' kg'}"
-                )
-        return (
-            f"Of Table 8 at {self.slope_deg:g}°, affected at their own payload: {'; '.join(inside)}."
-            if inside
-            else ""
-        )
-
-    def shaken(self, row: int | np.integer[Any]) -> bool:
-        """True if a run is within one of the strongest peaks of its own payload."""
-        speed, payload = self.table["speed_mean_mm_s"][row] * MM, self.table["payload_kg"][row]
-        return any(p.low <= speed <= p.high for p in self.strong if p.payload == payload)
-
-    def to_avoid(self, row: int | np.integer[Any]) -> str:
-        """Verdict on the speed of a run: avoid (`yes`), avoid `at other payloads` than its own, or `no`."""
-        speed = self.table["speed_mean_mm_s"][row] * MM
-        within = any(low <= speed <= high for low, high, _ in self.avoid)
-        return "yes" if self.shaken(row) else "at other payloads" if within else "no"
-
     def to_json(self) -> Json:
         """`result.json`."""
         return {
-            "schema": "mmrjax.resonance/1",
+            "schema": "mmrjax.resonance/2",
             "statement": self.statement(),
             "configuration": self.configuration,
             "slope_deg": self.slope_deg,
@@ -256,17 +223,6 @@ class ResonanceResult:
             ],
             "quiet_m_s": self.quiet,
             "restless_m_s": self.restless,
-            "table8": [
-                {
-                    "supply_voltage_V": self.table["supply_voltage_V"][k].item(),
-                    "payload_kg": self.table["payload_kg"][k].item(),
-                    "speed_mean_mm_s": self.table["speed_mean_mm_s"][k].item(),
-                    "status": str(self.table["status"][k]),
-                    "in_a_peak": self.shaken(k),
-                    "to_avoid": self.to_avoid(k),
-                }
-                for k in np.flatnonzero(self.table["table8"])
-            ],
         }  # fmt: skip
 
 
@@ -347,7 +303,6 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
                 "peaks",
             ),
             Section("", (peaks,), folded=folded),
-            Section("Operating points of Table 8", (_points(found),), "table8"),
             Section("How the runs ended", (end_note, endings), "ended"),
         ),
     )
@@ -364,18 +319,3 @@ def _peaks(found: ResonanceResult) -> Table:
         for p in found.peaks
     ]  # fmt: skip
     return catalogue.table("resonance.peaks_found", rows)
-
-
-def _points(found: ResonanceResult) -> Table:
-    """Table of the operating points of Table 8."""
-    table = found.table
-    rows = [
-        (
-            table["supply_voltage_V"][k], table["payload_kg"][k], table["speed_mean_mm_s"][k],
-            *(table[f"{name}_ripple_percent"][k] for name in SIGNALS), words.short_status(str(table["status"][k])),
-            found.to_avoid(k),
-        )
-        for k in np.flatnonzero(table["table8"])
-    ]  # fmt: skip
-    ripples = (f"ripple > {signal.label} [%] | .3g" for signal in SIGNALS.values())
-    return catalogue.table("resonance.points", rows, *ripples)

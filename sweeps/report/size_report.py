@@ -124,6 +124,8 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
     about = _DESIGNS if best else "No design with these parts meets the requirements."
     tables = _table("best", found, best), requirements_sheet(found.outcomes, terminal=False)
     motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
+    designs = [f"{describe_design(f)} ({objective_text(f, s.objective)})" for f in s.alternatives]
+    next_best = (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
     return Document(
         "Sizing",
         found.statement(),
@@ -133,16 +135,8 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
             *_chart(found),
         ),
-        brief=(lead, *_next_best(found), *_front_in_words(found)),
+        brief=(lead, *next_best, *_front_in_words(found)),
     )
-
-
-def _next_best(found: SizeResult) -> Names:
-    """A line on the best designs with other parts, none without a design."""
-    designs = [
-        f"{describe_design(f)} ({objective_text(f, found.sizing.objective)})" for f in found.sizing.alternatives
-    ]
-    return (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
 
 
 def _chart(found: SizeResult) -> tuple[Section, ...]:

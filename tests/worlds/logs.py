@@ -148,7 +148,12 @@ class Rig:
 
 
 def rig(
-    rng: np.random.Generator, imposed: str, every: float | None = None, *, alone: bool = False, coarse: bool = False,
+    rng: np.random.Generator,
+    imposed: str,
+    every: float | None = None,
+    *,
+    alone: bool = False,
+    coarse: bool = False,
     long: bool = False,
 ) -> Rig:
     """A random rig. Its readings' noise is set by what they show without effects.
@@ -470,7 +475,9 @@ def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence
 def rivals(r: Rig) -> list[Term]:
     """Library effects that a log of a rig may have, each with the shapes of its grid."""
     able = {n: law.at(r.scale) for n, law in LAWS.items() if law.cls and law.needs(r.imposed)}
-    return [Term(n, 0.02 * law.size, shapes, law) for n, law in able.items() for shapes in law.grid(3 if r.long else 9)]
+    return [
+        Term(n, 0.02 * law.size, shapes, law) for n, law in able.items() for shapes in law.grid(3 if r.long else 9)
+    ]
 
 
 def oracle(term: Term, left: np.ndarray, tried: Sequence[Term], units: Sequence[np.ndarray]) -> dict[str, Any]:

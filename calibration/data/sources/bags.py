@@ -69,24 +69,19 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
             for field, words, refused in _message_fields(first_message, ""):
                 if field != _STAMP:
                     field_path = f"{topic}.{field}"
+                    units = UNITS.get(kind, {})
                     signals.append(
                         Signal(
                             field_path,
                             count,
                             _column(read, field),
-                            _field_unit(kind, field),
+                            next((unit for start, unit in units.items() if field.startswith(start)), ""),
                             clock,
                             words,
                             refused,
                         )
                     )
     return tuple(signals)
-
-
-def _field_unit(kind: str, field: str) -> str:
-    """Unit of a field by message type, empty if the type states none."""
-    units = UNITS.get(kind, {})
-    return next((unit for start, unit in units.items() if field.startswith(start)), "")
 
 
 def _opened(path: Path) -> Any:

@@ -73,12 +73,9 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         return "the dict", json_records.signals_of_json_content(source, "the dict")
     if isinstance(source, list | tuple) and source and all(isinstance(item, Mapping) for item in source):
         return "the records", json_records.signals_of_json_content(list(source), "the records")
-    raise BadData(f"the source: got {_called(source)}; expected {EXPECTED}")
-
-
-def _called(source: Any) -> str:
-    kind = type(source)
-    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__.partition('.')[0]} {kind.__name__}"
+    library = type(source).__module__.partition(".")[0]
+    kind = f"{library} {type(source).__name__}".removeprefix("builtins ")
+    raise BadData(f"the source: got {kind}; expected {EXPECTED}")
 
 
 def _of_series(name: str, series: Any, rows: int) -> Signal:

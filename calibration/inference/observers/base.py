@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -44,49 +44,6 @@ class SearchPolicy:
     steps: int = 60
     searches: int = 16
     one_by_one: bool = True
-
-
-class CurveScores(Protocol):
-    """Scores of smooth curves on the residuals: normal deviate, and decrease of χ² [σ²], of each family, shape
-    (families,).
-    """
-
-    @property
-    def curve(self) -> Array: ...
-
-    @property
-    def explained(self) -> Array: ...
-
-
-class Statistics(Protocol):
-    """Strongest statistics of a fit. `white` measures the autocorrelation of its residuals."""
-
-    @property
-    def white(self) -> Any: ...
-
-
-class AdequacyTest(Protocol):
-    """Test of a fit's residuals, for each kind of statistic."""
-
-    @property
-    def found(self) -> Statistics: ...
-
-    def p(self, kind: str) -> float: ...
-
-    def threshold(self, kind: str) -> float: ...
-
-
-class Diagnosis(Protocol):
-    """Parts of a diagnosis that an observer reads, see `discovery.adequacy.Diagnosis`."""
-
-    @property
-    def linear(self) -> Linearization: ...
-
-    @property
-    def scores(self) -> CurveScores: ...
-
-    @property
-    def test(self) -> AdequacyTest: ...
 
 
 class Observer(eqx.Module):
@@ -396,7 +353,7 @@ class Observer(eqx.Module):
         """
 
     @abc.abstractmethod
-    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> Detail:
+    def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> Detail:
         """Further findings for this kind of data.
 
         Args:

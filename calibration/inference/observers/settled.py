@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from calibration.inference.details import EquationErrors
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
-from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
+from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import (
     Numbers,
     Optimum,
@@ -380,7 +380,7 @@ class SettledRuns(Observer):
         base_arguments = columns, weight, robot, None, ways
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
 
-    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationErrors:
+    def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> EquationErrors:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
 
         Residuals are simulated less measured. Sides have defects of their own if they are driven independently.
@@ -399,12 +399,12 @@ def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[st
     fitted = {
         v: np.asarray(x, float) for v, x in zip(unmeasured, _signals(observe, robot, tuple(unmeasured)), strict=True)
     }
-    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all() and _size_varies(np.abs(x))}
-
-
-def _size_varies(x: np.ndarray) -> bool:
-    """True if sizes differ by more than `VARIES` of the largest, unlike a current that only friction needs."""
-    return bool(np.ptp(x) > VARIES * np.max(x))
+    # A current that only friction needs varies less.
+    return {
+        bases_room.VARIABLES[v]: x
+        for v, x in fitted.items()
+        if np.isfinite(x).all() and np.ptp(np.abs(x)) > VARIES * np.max(np.abs(x))
+    }
 
 
 @functools.partial(compiled, options=SELDOM)

@@ -141,7 +141,11 @@ def starts_from_settled_ends(
     optima = search(blunt, _recombine_points(blunt, points)[:searches], STEPS_BLUNT)
     sorted_optima = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombine_points(blunt, sorted_optima)[:1]
-    return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), sorted_optima]))
+    distinct: list[np.ndarray] = []
+    for z in np.concatenate([best, _with_peaked_friction(problem, best[0]), sorted_optima]):
+        if all(np.max(np.abs(z - k)) > APART for k in distinct):
+            distinct.append(z)
+    return np.stack(distinct)
 
 
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
@@ -164,15 +168,6 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
         for k, x in new.items():
             points[-1][k] = parameters[k] = _coordinate_of_value(problem, k, x)
     return np.stack([*points, parameters])
-
-
-def _distinct_points(points: np.ndarray) -> np.ndarray:
-    """Points without those too close to an earlier one."""
-    distinct: list[np.ndarray] = []
-    for z in points:
-        if all(np.max(np.abs(z - k)) > APART for k in distinct):
-            distinct.append(z)
-    return np.stack(distinct)
 
 
 def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:

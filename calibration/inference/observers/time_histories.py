@@ -50,7 +50,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy, linear_replicate
+from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate
 from calibration.inference.optimizers import (
     CORES,
     SAME,
@@ -182,6 +182,10 @@ class HistoriesLinearization(Linearization):
     knots: Int[Array, "runs knots"]
     time: Float[Array, " rows"]
     angle: Float[Array, " rows"]
+
+    def rescaled(self, factor: Array) -> HistoriesLinearization:
+        by_sample = jnp.asarray(factor)[self.rows_of][:, None]
+        return dataclasses.replace(super().rescaled(factor), defects=self.defects * by_sample)
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         changes = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
@@ -455,21 +459,12 @@ class Histories(Observer):
     def free(cls) -> tuple[Names, Names]:
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
-    def response_to_errors(
-        self, robot: Robot, probes: tuple[Effect, ...]
-    ) -> Float[Array, "probes runs knots samples channels"]:
-        """Change of the readings by an error of the balance of each probe [unit of the balance]. A probe has
-        amplitude 1.
-
-        The error is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
-        """
-        return self.changes(robot, probes, ())[0]
-
     def changes(
         self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
-        """Changes of the readings by errors of balances, as in `response_to_errors`, and by each effect at each point
-        of its grid.
+        """Changes of the readings by an error of the balance of each probe [unit of the balance], and by each effect
+        at each point of its grid. A probe has amplitude 1. The error is 1 at a knot of a run and falls linearly to 0
+        at the neighbouring knots.
 
         An effect with one amplitude enters one balance. So it changes a run as an error of that balance would, with
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
@@ -830,18 +825,18 @@ class Histories(Observer):
         base_arguments = columns, weight, robot, None, ways
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments), *waves)
 
-    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
+    def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> TimeStatistics:
         names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
-        def strongest(diagnosis: Diagnosis, variable: str) -> StrongestWave | None:
+        def strongest(diagnosis: Any, variable: str) -> StrongestWave | None:
             same_variable = [k for k, n in enumerate(names) if n[1] == variable]
             if not same_variable:
                 return None
             k = max(same_variable, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
             return StrongestWave(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
-        def statistics_of_fit(diagnosis: Diagnosis) -> FitOverTime:
+        def statistics_of_fit(diagnosis: Any) -> FitOverTime:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
             test = diagnosis.test
             x = np.asarray(diagnosis.linear.series())

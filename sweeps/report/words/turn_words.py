@@ -39,7 +39,7 @@ def turn_under_equal_commands(robot: Robot, found: Result, value: float) -> str:
     rates, speeds = (np.asarray(found.reading[channel]) for channel in ("yaw_rate", "speed"))
     rates_by_configuration = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
     told = [
-        f"{name} {words.STATUSES[STATUSES[int(status)]].short}" if not math.isfinite(rate)
+        f"{name} {words.short_status(STATUSES[int(status)])}" if not math.isfinite(rate)
         else f"{name} turns to the {SIDES[int(rate < 0)]} at {abs(rate):.3g} rad/s and {speed:.3g} m/s"
         for name, rate, speed, status in rates_by_configuration
         if not abs(rate) < NONE
@@ -91,7 +91,7 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
     status = str(row["status"])
     if not has_motion(row):
         unsettled = ended is None and status == STATUSES[NOT_SETTLED]
-        return f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
+        return f"{status}: {words.NO_TURN if unsettled else words.status_meaning(status)}"
     if ended is None:
         return _moves(row)
     return (
