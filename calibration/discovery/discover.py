@@ -119,6 +119,8 @@ LIKELY = 4.0
 FAR = 3.0
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
 LONG = 4000
+#: Difference of a delay from whole rows up to which a simulation begins at these [rows].
+NEAREST = 0.25
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
 #: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
@@ -314,7 +316,8 @@ class LoopInput:
 
         equations = dataclasses.replace(equations, keep=keep)
         traced = equations.trace()
-        return _confirm_by_simulation(self, equations, traced), traced.screened.base.candidate
+        begin = _delayed_by_rows(self, traced.screened.base.candidate)
+        return _confirm_by_simulation(self, equations, traced), begin
 
     @functools.cached_property
     def space(self) -> CandidateSpace:
@@ -875,6 +878,23 @@ def _chosen_fit(traced: LoopStages) -> Candidate:
     return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
 
 
+def _delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
+    """The fit of a log's windows with a delay of whole rows, if that is near.
+
+    A held quantity jumps at its rows. So a fast current jumps too as a function of the delay, and steps from one side
+    do not lead to the other.
+    """
+    coordinates, steps = given.space.coordinates.base, np.diff(given.runs.whole["time_s"])
+    if priors.DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
+        return fit
+    k, step = coordinates.names.index(priors.DELAY), float(np.median(steps[steps > 0]))
+    delay = float(coordinates.value(fit.z[: given.space.free])[k])
+    off = round(delay / step) * step - delay
+    if abs(off) > NEAREST * step:
+        return fit
+    return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
+
+
 def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
     """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
     run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
@@ -911,7 +931,8 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     if searched is None or beside is None:
         return None
     given.progress(progress_remark("confirm"))
-    base, best = screened.base.candidate, _chosen_fit(traced)
+    chosen, base = _chosen_fit(traced), _delayed_by_rows(given, screened.base.candidate)
+    best = base if chosen is screened.base.candidate else _delayed_by_rows(given, chosen)
     run = simulate_models(given.space, base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
