@@ -235,7 +235,7 @@ def reproduce() -> None:
     config.Picture,
     group=MODEL,
     common="robot configuration voltage slope payload begin end slow",
-    example="mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
+    example="mmrjax render start.gif --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
 )
 def render() -> None:
     """Draw a picture or film of the track model.

@@ -314,7 +314,7 @@ class GivenRuns(OneRun, FolderPart):
 class Picture(OneRun):
     """File of `render`, and the run that it shows."""
 
-    file: Path = option_field(..., "Output file, ending in .png, .gif or .mp4", argument=True)
+    file: Path = option_field(..., "Output file, ending in .png or .gif", argument=True)
     begin: float | None = option_field(
         None, "Time of the picture or start of the film (s)", usual="0; for a picture 0.8"
     )

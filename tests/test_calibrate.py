@@ -24,7 +24,6 @@ from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
-from calibration.inference.remarks import calibration_remarks
 from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOutErrors
 from calibration.inference.simulation_errors import relative_error, root_mean_square
 from mmrjax.fidelities.results import Results
@@ -112,9 +111,6 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     kinds = ("voltage_configuration", "slope", "voltage", "payload")
     found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
     assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}
-    assert Remark(
-        "same_predictions", kind="voltage_configuration", others=("voltage", "payload")
-    ) in calibration_remarks(found)
     print_document(calibration_report.calibration_document(found, "nominal"))
     shown = capsys.readouterr().out
     table = [line for line in shown.splitlines() if line.startswith("after, held out")]

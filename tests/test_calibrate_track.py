@@ -87,8 +87,7 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
     assert not found.profiled and not found.held_out  # minutes each, so only when asked for
     assert any("round 1" in t for t in told) and any("start 2 of 2" in t for t in told)
     (product,) = remarks_with_codes(found.remarks, "prior_of_product")
-    (beside,) = remarks_with_codes(found.remarks, "beside_steady")
-    assert f"{product.share:.0%}" == "98%" and (beside.inside, beside.total) == (2, 2)
+    assert f"{product.share:.0%}" == "98%"
 
 
 @pytest.mark.slow

@@ -136,7 +136,6 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
         steps.append(name)
         return (base, rejected) if name == "bootstrap 0" else (base, rejected, SimpleNamespace(diagnosis=None))
 
-    monkeypatch.setattr(discover, "_confirm_gains", lambda *stages: None)
     task = SimpleNamespace(
         settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, shows_unmodelled_backlash=lost
     )
@@ -197,5 +196,6 @@ def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(
     monkeypatch.setattr(discover, "equations_of_log", lambda *_: Windows())
     monkeypatch.setattr(discover, "_confirm_by_simulation", lambda given, windows, traced: traced.names)
     monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
-    given = discover.LoopInput(*[None] * 7, keep=lambda name, make: name)
+    robot = SimpleNamespace(has_ground=False)
+    given = discover.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
     assert given.trace_windows() == (["ranking", "windows base", "windows search 0"], "fit")

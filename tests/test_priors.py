@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.fit_notes import Remark
-from calibration.inference.foreign import inherited_friction_remarks
+from calibration.inference.preparation import inherited_friction_remarks
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
 from tests.commands import read_rig

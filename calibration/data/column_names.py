@@ -46,14 +46,11 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
     ):
         refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
     np.clip(numbers, low, high, out=numbers)
-    return numbers if meaning.as_named else _convert_to_unit(meaning, numbers), refused
-
-
-def _convert_to_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
-    """Numbers of cells, converted to the unit of the column as by `Column.value`."""
+    if meaning.as_named:
+        return numbers, refused
     if meaning.quantity.percent and meaning.unit == quantities.PERCENT:  # not proportional
-        return np.array([meaning.value(x) for x in written.tolist()])
-    return written * meaning.factor * meaning.quantity.units[meaning.unit]
+        return np.array([meaning.value(x) for x in numbers.tolist()]), refused
+    return numbers * meaning.factor * meaning.quantity.units[meaning.unit], refused
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:

@@ -59,12 +59,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     if units:
         body = body[1:]
         notes = (*notes, f"{name}: the row below the header contains units. Row numbers start below it")
-    for k, row in enumerate(body, 1):
-        if len(row) != len(header):
-            raise BadData(
-                f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
-                f"the header has {count_noun(len(header), 'column')}"
-            )
+    check_row_lengths(name, header, body)
     return NamedArrays(
         name,
         tuple(column or f"column {k}" for k, column in enumerate(header, 1)),
@@ -73,6 +68,16 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
         notes=(*encoded, *notes),
         digest=hashlib.sha256(content).hexdigest(),
     )
+
+
+def check_row_lengths(name: str, header: Sequence[str], body: Sequence[Sequence[str]]) -> None:
+    """Rejects rows that have not one cell for each column."""
+    for k, row in enumerate(body, 1):
+        if len(row) != len(header):
+            raise BadData(
+                f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
+                f"the header has {count_noun(len(header), 'column')}"
+            )
 
 
 def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:

@@ -49,7 +49,7 @@ def _effect_that_records_signals(place: str, whose: str, seen: list[Signals]) ->
 
 
 def readable_signals(
-    robot: Robot, conditions: Conditions, state: State, balance: str, channel: str = "", *, settled: bool = False
+    robot: Robot, conditions: Conditions, state: State, balance: str, channel: str, *, settled: bool = False
 ) -> Signals:
     """Signals that an effect of this balance may read, namely those computed before it. Others are `UNSET`.
 
@@ -99,7 +99,7 @@ TURN: Json = {
 }
 
 
-def effect_library(paths: Sequence[Path | str] = ()) -> Library:
+def effect_library(paths: Sequence[Path | str]) -> Library:
     """Packaged effects together with the effects of the files, by name.
 
     Raises:

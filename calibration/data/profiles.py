@@ -21,7 +21,6 @@ from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, is_number
 from calibration.data.named_arrays import column_texts
 from calibration.data.sources import opening, reading
-from mmrjax.errors import count_noun
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import (
     APART,
@@ -233,12 +232,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     if len(body) < 2:
         row_text = "one row" if body else "a header and no rows"
         raise BadData(f"{name}: got {row_text}; expected at least two rows, the last of which ends the mission")
-    for k, row in enumerate(body, 1):
-        if len(row) != len(header):
-            raise BadData(
-                f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
-                f"the header has {count_noun(len(header), 'column')}"
-            )
+    delimited.check_row_lengths(name, header, body)
     cells = _CellReader(
         name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"]
     )

@@ -298,7 +298,7 @@ def _parse_columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...
     return tuple(entries)
 
 
-def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names:
+def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]]) -> Names:
     """Parameters that a robot file without a base must state: those of its drive and, if it turns, of turning.
 
     Args:
@@ -322,7 +322,7 @@ def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Nam
 
 
 def reject_missing(
-    missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
+    missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str]
 ) -> None:
     """Rejects a robot file without a base that does not state all required parameters.
 

@@ -473,7 +473,10 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
     For a robot without a base, parameters that it does not state are left out.
     """
-    inherits, base_robot = robot.rig.inherits, _base_robot(robot)
+    inherits, base_robot = robot.rig.inherits, paper_robots.nominal()
+    if not inherits:
+        defaults = {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()}
+        base_robot = params.replace(paper_robots.blank_robot(robot.configurations), defaults)
     pack = not inherits and robot.battery.cells == base_robot.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
@@ -560,14 +563,6 @@ def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tu
         part, _, key = name.partition(".")
         if value(robot, name) != value(nothing, name):
             yield part, f"{key} = {toml_value(value(robot, name))}  # {meaning}"
-
-
-def _base_robot(robot: Robot) -> Robot:
-    """Base robot of a robot's file."""
-    if robot.rig.inherits:
-        return paper_robots.nominal()
-    base_robot = paper_robots.blank_robot(robot.configurations)
-    return params.replace(base_robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
 
 
 def _flatten(content: Json, prefix: str = "") -> list[tuple[str, Any]]:

@@ -314,7 +314,7 @@ def _reject_supply_voltages(arrays: NamedArrays, voltages: Raw) -> None:
         )
 
 
-def single_run(cells: Json, layout: Layout | None = None) -> Runs:
+def single_run(cells: Json, layout: Layout | None) -> Runs:
     """One run from command options, by column name, each checked like a cell of a file. On a battery it has no
     voltage.
 

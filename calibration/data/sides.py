@@ -21,7 +21,7 @@ FEWEST, MOSTLY = 3, 0.75
 ROUNDED = 0.01
 
 
-def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Supply voltage [V], by default the larger of the sides' voltages, and the duty of each side.
 
     Args:

@@ -19,7 +19,7 @@ FIRST = 5
 ROW = 100_000
 
 
-def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
+def used_rows(runs: Runs, robot: Robot, most: int) -> Runs:
     """Rows of the runs that a fit uses, with the robot's channels.
 
     Raises:

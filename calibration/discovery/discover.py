@@ -54,7 +54,6 @@ from calibration.discovery.mechanism import cached_hold_out_score, excess_misfit
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
-    screen_known_rows,
     screen_outliers,
     screen_with_effects,
 )
@@ -70,7 +69,7 @@ from calibration.discovery.result import (
     ReadingsOfRows,
 )
 from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
-from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
+from calibration.discovery.screening import screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import judge_names
@@ -86,7 +85,7 @@ from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import LinearHistories, Windows, problem_of_readings, problem_of_windows
+from calibration.inference.observers.windows import Windows, problem_of_readings, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -267,28 +266,21 @@ class LoopInput:
         With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
 
         If results with other sds are `known` for the same included rows, their bootstrap replicates are reused: in
-        units of the sds, the statistics hardly depend on the sds. Fits of time histories then take a few Gauss-Newton
-        steps from the known fits. No new sets of effects are compiled and no further row is excluded.
+        units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
 
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
+        if (of_readings := self.trace_known_readings()) is not None:
+            return of_readings
         by_windows, begin = self.trace_windows()
         if by_windows is not None:
             return by_windows
-        of_readings = self.known is not None and self.known.screened.base.space.bare.observe
-        if self.known is not None and self.known.run is not None and isinstance(of_readings, LinearHistories):
-            equations = self.known.screened.base.space.with_sd(self.noise.sd)
-            confirm = functools.partial(_smallest_confirmed, self.known.run.space, self.settings)
-            traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
-            run = self.known.run
-            refuted = run is not None and run.contradicts and traced.verdict != "none"
-            return dataclasses.replace(traced, verdict="place") if refuted else traced
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[], begin=begin)
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
-            if screened.base.space.bare.observe.long and not self.shows_unmodelled_backlash:
+            if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
                 return _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
@@ -300,6 +292,18 @@ class LoopInput:
             if self.confirm is not None:
                 searched = self.confirm(screened, diagnosis, searched, sds.noise)
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
+
+    def trace_known_readings(self) -> LoopStages | None:
+        """Stages of the known linear readings of a log with other noise. None for other tables."""
+        known = self.known
+        if known is None or (run := known.run) is None or not known.screened.base.space.bare.observe.reads:
+            return None
+        space = known.screened.base.space
+        equations = space.with_noise(self.noise.sd, space.weight)
+        confirm = functools.partial(_smallest_confirmed, run.space, self.settings)
+        traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
+        refuted = run.contradicts and traced.verdict != "none"
+        return dataclasses.replace(traced, verdict="place") if refuted else traced
 
     def trace_windows(self) -> tuple[LoopStages | None, Candidate | None]:
         """Stages of the windows of a log with a long run, and their fit of its base.
@@ -316,7 +320,8 @@ class LoopInput:
 
         equations = dataclasses.replace(equations, keep=keep)
         traced = equations.trace()
-        begin = _delayed_by_rows(self, traced.screened.base.candidate)
+        slides = self.robot.has_ground and self.robot.rig.imposed == "voltage"  # which equations do not show
+        begin = None if slides else _delayed_by_rows(self, traced.screened.base.candidate)
         return _confirm_by_simulation(self, equations, traced), begin
 
     @functools.cached_property
@@ -332,30 +337,24 @@ class LoopInput:
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
-        For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
-        is appended to `ranked`, unless effects would only stand in for a backlash.
+        For logs, the equations in weak form give the start of the fit. Their ranking of the library is appended to
+        `ranked`, unless effects would only stand in for a backlash.
         """
         same = noise is self.noise
         space = self.equations or (self if same else dataclasses.replace(self, noise=noise)).space
-        known, at = self.known, functools.partial(bases_at_fit, self.runs)
-        near = None
-        if before is not None:
-            space, near = space.with_room(before.space.room), before.candidate
-        else:
+        at = functools.partial(bases_at_fit, self.runs)
+        near = None if before is None else before.candidate
+        if before is None:
             if self.begin is not None:  # as near as a simulated fit, and its effects are ranked
                 near = dataclasses.replace(self.begin, simulated=True)
             elif (ranking := screen_by_weak_form(space, self.settings)) is not None:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 if not self.shows_unmodelled_backlash:
                     ranked.append(self.keep("ranking", make))
-                near = ranking.base
+                near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
         self.progress(progress_remark("base"))
-        if known is not None and space.bare.observe.long:  # the same rows are included here
-            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            base = fit_base(space, self.settings, self.runs.source, near)
-            return screen_known_rows(base, at, known.screened, self.settings)
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
@@ -494,12 +493,6 @@ class LoopStages:
         return () if self.where is None else (self.where.family,)
 
     @property
-    def simulated(self) -> dict[Names, np.ndarray]:
-        """Coordinates of each fit by simulation, by its effects."""
-        all_candidates = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
-        return {c.active: c.z for c in reversed(all_candidates) if c.simulated and np.isfinite(c.cost)}
-
-    @property
     def best(self) -> Candidate:
         """Proposed candidate: the base fit if no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
@@ -540,10 +533,7 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
         if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
         else known_stages.left.test.null
     )
-    base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
-    screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
-    if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+    if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
         for begin in given.later:
             begin(screened.base)
     return screened, diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
@@ -555,8 +545,7 @@ def _search_effects(
     """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
-    base = dataclasses.replace(base, space=base.space.with_room(searched.room))
-    return dataclasses.replace(screened, base=base), left, searched
+    return screened, left, searched
 
 
 def _search_until_clean(
@@ -578,9 +567,7 @@ def _search_until_clean(
             f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
         )
         after = searched.diagnosis
-        if after is None and (confirmed := _confirm_gains(screened, diagnosis, searched)) is not None:
-            return screened, confirmed, None
-        if after is None or not after.test.rejected_with_margin or screened.base.space.near:
+        if after is None or not after.test.rejected_with_margin:
             break
         more = screen_with_effects(
             screened, after.scores, lambda base: bases_at_fit(given.runs, base), given.runs, settings
@@ -590,23 +577,6 @@ def _search_until_clean(
         progress(progress_remark("alone"))
         screened = more
     return screened, diagnosis, searched
-
-
-def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
-    """Diagnosis of the base fit of a log after simulations of the strongest effects.
-
-    Scores are linear but the contact of a vehicle is not, so a significant score may vanish in a simulation. None if
-    the base is rejected with the simulated gains too.
-    """
-    space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
-    gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}
-    best = {name: abs(float(scores[space.library.best_instance(name, scores)])) for name in space.library.names}
-    promising = {(name,) for name, score in best.items() if score > test.threshold("single")}
-    simulated = bool(promising) and promising <= gains.keys()
-    if not (simulated and space.bare.observe.long) or screened.cluster is not None:
-        return None
-    confirmed = test.confirmed(max(0.0, *gains.values()))
-    return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
 def _reach_verdict(
@@ -704,7 +674,7 @@ def choose_effects(
         predicted: cache of hold-out predictions of fits. This function adds to it.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
+    best, after = searched.best, searched.diagnosis
     if best is None or after is None:
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
@@ -713,13 +683,11 @@ def choose_effects(
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
     )
-    stood = support_of() if adequate or long else None
+    stood = support_of() if adequate else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
-    few = None
-    if not (long and stood is not None and stood.stands):  # refits of histories take long
-        progress(progress_remark("held out"))
-        few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
+    progress(progress_remark("held out"))
+    few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
         proposed = (
@@ -736,8 +704,7 @@ def choose_effects(
     names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    simulated_fits = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
-    fits_of_names = [c for c in simulated_fits if c.key == frozenset(names)]
+    fits_of_names = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
     if not fits_of_names:
         active = fill_slots(names, settings)
         begins = start_of_fit(space, proposed[0], active, settings, left.scores)
@@ -751,7 +718,7 @@ def choose_effects(
     )
 
 
-def equations_of_log(given: LoopInput, fewest: int = 0) -> LoopInput | None:
+def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states.
 
     Windows use every row of a log, and only simulations use fewer.
@@ -798,7 +765,7 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     space, settings, measured = screened.base.space, given.settings, given.runs.measured()
     weight = space.weight.copy()
     weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
-    problem = space.with_weights(weight).bare
+    problem = space.with_noise(None, weight).bare
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
     equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
@@ -819,7 +786,7 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
             traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
         )
     linear = traced.screened.base
-    space = space.with_sd(traced.sds.noise.sd).with_weights(linear.space.weight)
+    space = space.with_noise(traced.sds.noise.sd, linear.space.weight)
     given.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
     space = space if traced.searched is None else space.with_room(traced.searched.room)
@@ -857,7 +824,7 @@ def _smallest_confirmed(
         return searched
     alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
     sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
-    space = space.with_sd(noise.sd).with_weights(screened.base.space.weight)
+    space = space.with_noise(noise.sd, screened.base.space.weight)
     space = space.with_room([name for sets in sizes for c in sets for name in c.effects])
     for sets in filter(None, sizes):
         fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
@@ -1087,8 +1054,7 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
 def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
     """Verdict and summary at another noise level."""
     adequate = not traced.ends.test.rejected_with_margin
-    near = bool(traced.screened.base.space.near)
-    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
+    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate)
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
@@ -1382,7 +1348,6 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     undetermined = tuple(name for name in undetermined_names(found.held_by_prior, found.together) if name not in far)
     remarks += [Remark("held_by_prior", names=undetermined)] * bool(undetermined)
     remarks += [Remark("only_together", pairs=found.together)] * bool(found.together)
-    remarks += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
     remarks += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
     after = found.readings_of_rows.after if found.written else found.readings_of_rows.before
     off = np.where(found.included[:, None], after - found.readings_of_rows.measured, np.nan)

@@ -135,14 +135,19 @@ def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:
 
 def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
     """Hold-out scores of a candidate, which is refitted without each block of each kind."""
-    data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable_blocks(runs, space.bare)
-    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
     reading = {
         kind: predict_unseen(problem, z, list(blocks_by_name.values()), active).reading
-        for kind, blocks_by_name in kinds.items()
+        for kind, blocks_by_name in blocks_room.predictable_blocks(runs, space.bare).items()
     }
-    return score_readings(reading, measured, sd, counts, kinds)
+    return score_predictions(space, runs, reading)
+
+
+def score_predictions(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
+    """Hold-out scores of readings that were predicted for each kind of block."""
+    data, rows = space.equipped.data, len(runs)
+    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
+    return score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
 
 
 def smallest_predictive_set(

@@ -135,7 +135,7 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
     return SmoothCurve(name, variable, low, high, *best[1])
 
 
-def _prior_root(length: float, happening: bool = False) -> np.ndarray:
+def _prior_root(length: float, happening: bool) -> np.ndarray:
     """L of the prior covariance L Lᵀ of the ordinates for one correlation length [spacings of the ordinates]. A
     temporary change is zero at its ends.
     """

@@ -219,7 +219,10 @@ def _compare_with_single_curve(
 ) -> NameSupport:
     """Tests if a single smooth curve fits the data where the effects of a candidate do not."""
     names = bases_room.family_names(bases)
-    for k in _strongest_families(left, names):
+    strongest: dict[str, int] = {}  # family of each place, the most significant place first
+    for index in np.argsort(-np.asarray(left.scores.curve)):
+        strongest.setdefault(names[index][0], int(index))
+    for k in list(strongest.values())[:ALONE]:
         statistics, _ = statistics_with_columns(
             left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]]
         )
@@ -234,15 +237,6 @@ def _compare_with_single_curve(
         if adequate and not beside.diagnosis.test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_of_variable(location.place, location.variable),))
     return NameSupport(True)
-
-
-def _strongest_families(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
-    """Indices of the most significant family of curves in each place, the most significant first, at most `ALONE`."""
-    deviate = np.asarray(left.scores.curve)
-    first: dict[str, int] = {}
-    for k in np.argsort(-deviate):
-        first.setdefault(names[k][0], int(k))
-    return list(first.values())[:ALONE]
 
 
 def _add_curves(
@@ -275,8 +269,8 @@ def judge_each_name(
     bases: Bases,
     after: Diagnosis,
     settings: Settings,
-    blocks: Sequence[np.ndarray] = (),
-    better: Sequence[Candidate] = (),
+    blocks: Sequence[np.ndarray],
+    better: Sequence[Candidate],
 ) -> tuple[NameTest, ...]:
     """Tests each effect on its own, with all other effects fitted.
 

@@ -101,7 +101,7 @@ def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
 
 
 def search_from_starts(
-    posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None = None
+    posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None
 ) -> MultistartResult:
     """Searches from all points in one batch. Unknown noise is estimated and the search repeated until the noise
     settles.
@@ -134,7 +134,7 @@ def search_one_by_one(
     points: np.ndarray,
     shares: np.ndarray,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None = None,
+    solver: optimizers.Solver | None,
 ) -> MultistartResult:
     """Searches from several points as `search_from_starts`, but one after another.
 
@@ -225,7 +225,7 @@ def optimum_of_population(
     shares: np.ndarray,
     searched: PopulationSearch,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None = None,
+    solver: optimizers.Solver | None,
 ) -> MultistartResult:
     """Result of a population, after a further search by gradients from its best member where gradients are
     reliable.
@@ -269,10 +269,23 @@ def _outcome_of_searches(found: optimizers.Optimum, feasible: np.ndarray) -> Sta
 
 
 def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """New estimate of the relative noise at z. None if all noise is known, or if the estimate has settled."""
+    """Noise of each channel relative to its size, estimated from the misfit at z and corrected for degrees of
+    freedom, NaN if known. None if all noise is known, or if the estimate has settled.
+
+    s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit that uses it
+    cannot be tested for adequacy.
+    """
     if not noise.estimated.any():
         return None
-    new = _estimate_shares(posed, noise, z)
+    data = posed.data
+    size = noise.sd / noise_room.START  # the reference of an estimated share
+    weight = np.asarray(data.weight)
+    error = np.asarray(optimizers.observe_at(posed, jnp.asarray(z)).reading - data.measured) / size
+    error = np.where(weight > 0, error, 0.0)
+    leverage = identifiability.analyse_identifiability(posed, jnp.asarray(z)).leverage
+    freedom = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
+    new = np.maximum(np.sqrt(np.sum(error**2, 0) / freedom), series_noise.FLOOR)
+    new = np.where(noise.estimated, new, np.nan)
     return None if np.nanmax(np.abs(new / shares - 1)) < SETTLED_SHARE else new
 
 
@@ -297,21 +310,3 @@ def _search_until_feasible(
         data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
         posed = dataclasses.replace(posed, data=data)
     return posed, optima, ~np.any(unreachable_rows(posed, status_start), axis=1)
-
-
-def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
-    """Noise of each channel relative to its size, estimated from the misfit and corrected for degrees of freedom. NaN
-    if known.
-
-    s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit that uses it
-    cannot be tested for adequacy.
-    """
-    data = posed.data
-    size = noise.sd / noise_room.START  # the reference of an estimated share
-    weight = np.asarray(data.weight)
-    error = np.asarray(optimizers.observe_at(posed, jnp.asarray(z)).reading - data.measured) / size
-    error = np.where(weight > 0, error, 0.0)
-    leverage = identifiability.analyse_identifiability(posed, jnp.asarray(z)).leverage
-    freedom = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
-    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / freedom), series_noise.FLOOR)
-    return np.where(noise.estimated, shares, np.nan)

@@ -47,8 +47,8 @@ LOST = 1e3
 MEMBERS_EACH = 3
 #: Distance from the middle of a prior beyond which a search is at its edge [prior sd].
 EDGE = 2.5
-#: Statuses with which a member loses a row.
-LOST_AS = ("slides", "tips", "failed", "stalled")
+
+
 #: Step of the differences that check derivatives [posterior sd], and largest relative difference between the two.
 STEP, APART = 0.2, 0.25
 
@@ -262,7 +262,7 @@ def run_evolution(
     *,
     size: int,
     seed: int,
-    generations: int = GENERATIONS,
+    generations: int,
     beside: np.ndarray | None = None,
     tell: Callable[[Remark], None] = lambda step: None,
 ) -> Population:
@@ -399,12 +399,8 @@ class PopulationSearch:
         """Number of members with at least one row of each status or flag. Zeros are omitted."""
         status, flags = self.found.status, self.found.flags
         status_counts = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
-        status_counts["jumps"] = int(self._jumps(flags).any(1).sum())
+        status_counts["jumps"] = int((flags >> FLAGS.index("jumps") & 1).any(1).sum())
         return {word: count for word, count in status_counts.items() if count}
-
-    @staticmethod
-    def _jumps(flags: np.ndarray) -> np.ndarray:
-        return (flags >> FLAGS.index("jumps") & 1).astype(bool)
 
     def to_json(self) -> Json:
         """Entries of result.json."""
@@ -425,12 +421,5 @@ class PopulationSearch:
                 settled=self.found.settled,
             )
         ]
-        status_counts = self.outcomes()
-        lost_counts = {status: status_counts[status] for status in LOST_AS if status in status_counts}
-        notes += [Remark("lost_rows", members=lost_counts)] * bool(lost_counts)
-        if "jumps" in status_counts:
-            rows = np.flatnonzero(self._jumps(self.found.flags[self.at]))
-            notes.append(Remark("members_jump", members=status_counts["jumps"], best=tuple(int(k) + 1 for k in rows)))
         notes += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
-        notes += [Remark("read_from_members", names=self.apart, left=self.left)] * bool(self.apart)
         return notes

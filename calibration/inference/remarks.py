@@ -8,7 +8,6 @@ import numpy as np
 
 from calibration.inference import priors
 from calibration.inference.fit_notes import Remark
-from calibration.inference.identifiability import Z95
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
@@ -40,9 +39,6 @@ def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for kind, block_errors in found.held_out.items():
         if block_errors.unreachable_rows:
             yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
-    for kind, similar_kinds in found.held_out_alike.items():
-        if similar_kinds:
-            yield Remark("same_predictions", kind=kind, others=similar_kinds)
     for kind, block_errors in found.held_out.items():
         if not all(block.converged for block in block_errors.blocks.values()):
             yield Remark("block_not_converged", kind=kind)
@@ -51,18 +47,6 @@ def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
 def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
     if not found.converged:
         yield Remark("unsettled", names=found.undetermined)
-    distance_in_sds = {
-        n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None
-    }
-    if distance_in_sds:
-        worst = max(distance_in_sds, key=distance_in_sds.__getitem__)
-        yield Remark(
-            "beside_steady",
-            inside=sum(a < Z95 for a in distance_in_sds.values()),
-            total=len(distance_in_sds),
-            furthest=worst,
-            sds=distance_in_sds[worst],
-        )
     if not found.profiled:
         yield Remark("not_profiled")
     if found.starts.agree < len(found.starts.cost):

@@ -23,7 +23,7 @@ LEAST = 1_000
 
 
 def analyse_sensitivity(
-    study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: CandidateRuns | None = None
+    study: Study, method: str, evaluations: int | None, seed: int = 0, candidates: CandidateRuns | None = None
 ) -> SensitivityResult:
     """Runs a sensitivity study and returns its result.
 

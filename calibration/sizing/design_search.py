@@ -254,9 +254,9 @@ def evaluate_designs(
 def size_robot(
     robot: Robot,
     asked: Requirements,
-    objectives: Names = ("mass",),
+    objectives: Names,
     *,
-    starts: int = 256,
+    starts: int,
     motors: Names = (),
     seed: int = 0,
     tell: Callable[[Remark], None] = lambda note: None,

@@ -54,7 +54,7 @@ class DriveOption(NamedTuple):
         return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
 
 
-def drive_options(names: Names = ()) -> tuple[DriveOption, ...]:
+def drive_options(names: Names) -> tuple[DriveOption, ...]:
     """All motors (or those named) with all gearbox sizes that their maker combines with them."""
     options = []
     for motor in packaged_motors():

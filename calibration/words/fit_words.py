@@ -30,11 +30,6 @@ FAR = {
 }
 #: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "the prior of its product with the guide share in the other fidelities"}
-#: Reasons why a member of a population loses a row.
-LOST_AS = {
-    "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
-    "stalled": "stall",
-}  # fmt: skip
 
 
 def sentence_on_wrong_noise(channel: str, factor: float, source: str) -> str:
@@ -126,21 +121,6 @@ def search_generations(members: int, generations: int, settled: bool) -> str:
     if not settled:
         end = "The last generation still improved the best member, so continue with more --generations"
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
-
-
-def sentence_on_failing_members(members: dict[str, int]) -> str:
-    """Members with a row that is lost."""
-    row_outcomes = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
-    return f"some members fail in at least one row: {row_outcomes}. They rank below the others"
-
-
-def sentence_on_jumping_members(members: int, best: tuple[int, ...]) -> str:
-    """Members whose running gear jumps."""
-    row_words = f"rows {', '.join(map(str, best))}" if best else "none"
-    return (
-        f"{members} members jump in at least one row: the weight moves between guides and pulleys so abruptly that "
-        f"they leave the ground at times. Rows in which the best member does so: {row_words}"
-    )
 
 
 def distance_from_prior(at: fit_notes.ReachedBound) -> str:
@@ -309,8 +289,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     "no_covariance": "the posterior has no finite covariance. The values can be used, but not the intervals",
     "no_grip": "every run slides, so static friction and the slip below its limit are known only from their priors",
     "estimated_noise": estimated_noise,
-    "beside_steady": "{inside} of {total} parameters agree with the optimum of the steady model within their 95 "
-    "% intervals. The largest difference is {sds:.2f} sd ({furthest})",
     "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
@@ -342,10 +320,6 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because the "
         "robot fitted to the other blocks slides in them. The errors exclude these rows"
     ),
-    "same_predictions": lambda kind, others: (
-        f"blocks by {' or by '.join(blocks.kind_in_words(k) for k in others)} are the same as blocks by "
-        f"{blocks.kind_in_words(kind)}, because these runs do not vary them separately. Their errors are shown once"
-    ),
     "block_not_converged": "the search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
@@ -353,13 +327,8 @@ SAID: dict[str, str | Callable[..., str]] = {
     "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Readings at more closely spaced conditions "
     "would show which part is right",
     "generations": search_generations,
-    "lost_rows": sentence_on_failing_members,
-    "members_jump": sentence_on_jumping_members,
     "ended_at_edge": lambda edge: (
         "the search ended at the edge of the allowed range: its best member has "
         + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
     ),
-    "read_from_members": "derivatives of the run with respect to {names} disagree with finite differences, because "
-    "contacts open and close. The combinations that the data determine therefore come from a regression "
-    "over the members near the best one, with residuals of {left:.2g} sd rms",
 }

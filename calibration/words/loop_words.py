@@ -173,18 +173,13 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
 
 
 def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
-    """A mechanism with its evidence."""
+    """A mechanism with its evidence: share of the misfit, gain on held-out runs, and repeatability."""
     names = " or ".join(map(with_article, found.families))
-    return f"{names}{within}, established as a mechanism. It {mechanism_evidence(found)}"
-
-
-def mechanism_evidence(found: loop_notes.Mechanism) -> str:
-    """Evidence for a mechanism: share of the misfit, gain on held-out runs, and repeatability."""
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
-        f"explains {100 * found.share:.0f} % of the misfit beyond noise, raises the log likelihood of held-out runs "
-        f"by {found.gain:.2g} per affected reading{errors}, and is found again in {100 * found.again:.0f} % of the "
-        "fits with one block left out"
+        f"{names}{within}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit beyond "
+        f"noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected reading{errors}, and is "
+        f"found again in {100 * found.again:.0f} % of the fits with one block left out"
     )
 
 
@@ -254,8 +249,7 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
         f"with {' and with '.join(factors)} times the noise, the verdict is {words}"
         for words, factors in same.items()
     ]
-    near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
-    return ", and ".join(answers) + near
+    return ", and ".join(answers)
 
 
 def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
@@ -909,11 +903,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     "late": imposed_delay,
     "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
     "led": leader_choice,
-    "not_predictable": lambda kinds: (
-        f"some blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} contain all runs of a "
-        "configuration with its own parameters. The other runs cannot predict these blocks, so they are neither "
-        "scored nor tested"
-    ),
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted. The thresholds use only these",
     "outstanding": lambda factors, word: (
         f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "

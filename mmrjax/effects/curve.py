@@ -112,7 +112,7 @@ def direction_signal(place: str) -> str:
     return PLACES[place][2]
 
 
-def sign_factor(place: str, way: Callable[[str], Any], magnitudes: Container[str] = ()) -> Any:
+def sign_factor(place: str, way: Callable[[str], Any], magnitudes: Container[str]) -> Any:
     """Sign factor of a discrepancy in a place: a run in mirror image shows it in mirror image.
 
     For instruments that show only magnitudes the factor is 1.

@@ -122,9 +122,7 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
     }
 
 
-def cell_below_cutoff(
-    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
-) -> np.ndarray:
+def cell_below_cutoff(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None) -> np.ndarray:
     """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, otherwise NaN, shape
     (runs,).
 
@@ -166,7 +164,7 @@ def missions_of_runs(
 
 
 def simulate_in_parts(
-    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
+    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None
 ) -> Iterator[Mission]:
     """Simulates missions with recorded courses, in parts whose steps fit into memory.
 
@@ -202,8 +200,8 @@ def simulate_batch(
     robot: Robot,
     conditions: Conditions,
     profile: Profile,
-    start: Start | None = None,
-    keep: int = 0,
+    start: Start | None,
+    keep: int,
     tolerance: Scalar = TOLERANCE,
 ) -> Mission:
     """Simulates the missions of a batch in one compiled call, see `missions_of_runs`.

@@ -432,7 +432,7 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
     return _signals_in_motion(robot, conditions, state, way)
 
 
-def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
+def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
     """All signals of a robot in motion whose load turns rigidly with its wheels.
 
     The load's inertia acts at the driving shaft, and traction is what the inertia and the demand need.

@@ -224,7 +224,7 @@ def _template(double: bool, turns: bool) -> tuple[Any, Any]:
         return mjx.put_model(model), mjx.make_data(model)
 
 
-def model_template(turns: bool = False) -> tuple[Any, Any]:
+def model_template(turns: bool) -> tuple[Any, Any]:
     """The MJX model and data whose structure all members share, of half a robot or one free to turn."""
     return _template(jnp.result_type(float) == jnp.float64, turns)
 

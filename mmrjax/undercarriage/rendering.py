@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import warnings
 from pathlib import Path as File
 from typing import Any, NamedTuple
 
@@ -21,7 +19,7 @@ from mmrjax.undercarriage.belt import BeltPath, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.undercarriage.side_contacts import lever_tips
 
-FORMATS = (".png", ".gif", ".mp4")
+FORMATS = (".png", ".gif")
 FORCE = 1 / 800  # length of an arrow [m/N]
 RATE = 20  # frames per second
 FRAMES = 10_000  # most frames of a film; each takes about a third of a second to draw
@@ -243,14 +241,6 @@ def figure_of_sample(view: RunScene, k: int) -> Any:
     return sheet
 
 
-def _figure_pixels(sheet: Any) -> np.ndarray:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(sheet)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
 def frame_times(
     file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
 ) -> Float[np.ndarray, " frames"]:
@@ -286,7 +276,7 @@ def render(
     slow: float = 10.0,
     rate: int = RATE,
 ) -> File:
-    """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
+    """Writes a picture (.png, at time `begin`) or a film (.gif) of a scene.
 
     Args:
         view: view with `time`, the times of the samples [s], and `sheet`, which returns the figure of a sample. See
@@ -303,34 +293,18 @@ def render(
     times = frame_times(file, begin, end, slow, float(view.time[-1]), rate)
     frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
     import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # a file matplotlibrc of the working folder could run LaTeX
-        _write_frames(view, file, frames, rate)
+        if file.suffix == ".png":
+            view.sheet(frames[0]).savefig(file)
+            return file
+        images = []
+        for k in frames:
+            canvas = FigureCanvasAgg(view.sheet(k))
+            canvas.draw()
+            images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(256))
+    images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
     return file
-
-
-def _write_frames(view: Any, file: File, frames: list[int], rate: int) -> None:
-    if file.suffix == ".png":
-        view.sheet(frames[0]).savefig(file)
-        return
-    if file.suffix == ".gif":
-        from PIL import Image
-
-        images = [Image.fromarray(_figure_pixels(view.sheet(k))).quantize(256) for k in frames]
-        images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
-        return
-    pictures = (_figure_pixels(view.sheet(k)) for k in frames)
-    first_picture = next(pictures)
-    import imageio_ffmpeg
-
-    writer = imageio_ffmpeg.write_frames(
-        str(file), (first_picture.shape[1], first_picture.shape[0]), fps=rate, quality=7
-    )
-    with warnings.catch_warnings():
-        # jax warns of every fork; this one becomes ffmpeg at once and does not use jax's threads
-        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
-        writer.send(None)
-    for picture in itertools.chain([first_picture], pictures):
-        writer.send(picture.tobytes())
-    writer.close()

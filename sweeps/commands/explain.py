@@ -43,7 +43,7 @@ KEYS: dict[str, str] = {
 }
 
 
-def explain_name(name: str | None, files: Names = ()) -> int:
+def explain_name(name: str | None, files: Names) -> int:
     """Explains an effect, status, flag, output, channel or parameter by its name. Without a name, lists all.
 
     Raises:

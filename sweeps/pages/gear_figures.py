@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data import Json
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
@@ -106,23 +105,17 @@ def gear_runs(
     return answer
 
 
-def ripple_numbers(gear: GearRun) -> Json:
-    """Size and frequency of the ripples in a run."""
+def ripple_row(gear: GearRun) -> tuple[Any, ...]:
+    """Row of the table of ripples: run, pitch, period measured and by eq. (34), amplitudes, load on the guides."""
     tail, signals = gear.tail(TAIL), gear.signals
     line, travel, reaction = (
         ripple_peaks.measure_ripple(gear.time[tail], x[tail])
         for x in (signals.total_current, signals.speed, signals.normal)
     )
-    return {
-        "configuration": gear.name,
-        "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
-        "period_ms": 1e3 * line.period,
-        "equation_ms": 1e3 * gear.period,
-        "current_percent": 100 * line.amplitude,
-        "speed_percent": 100 * travel.amplitude,
-        "reaction_percent": 100 * reaction.amplitude,
-        "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,
-    }
+    pitch = "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm"
+    amplitudes = (100 * ripple.amplitude for ripple in (line, travel, reaction))
+    on_guides = 100 * gear.guide_share if gear.on_tracks else None
+    return gear.name, pitch, 1e3 * line.period, 1e3 * gear.period, *amplitudes, on_guides
 
 
 def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:

@@ -28,7 +28,7 @@ def on_ground(runs: Columns) -> bool:
     return "slope_deg" in runs and "payload_kg" in runs
 
 
-def panels_by_imposed(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
+def panels_by_imposed(voltages: np.ndarray, column: str) -> list[tuple[str, np.ndarray]]:
     """Panels of a figure by imposed quantity: a title and a mask for each of at most three panels.
 
     Up to three voltages each have a panel. A grid with more has panels for the lowest, a middle and the highest. If

@@ -32,7 +32,7 @@ ON_GROUND, ON_SHAFT = ("payloads_kg", "slopes_deg", "surface"), ("load_torques_N
 AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm", "motor_current": "motor_currents_A"}
 
 
-def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
+def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None = None) -> G:
     """Grid with values for every axis of the robot.
 
     Defaults for the packaged robot are the imposed quantities, payloads and slopes of Table 8. For a rig they are
@@ -83,7 +83,7 @@ def check_axes(config: GridPart, robot: Robot) -> None:
         raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {allowed_words(surface, SURFACES)}")
 
 
-def grid_axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:
+def grid_axes(config: GridPart, robot: Robot, battery: bool) -> dict[str, tuple[object, ...]]:
     """Values of each axis of a grid, by column. The slope is last.
 
     Args:

@@ -82,7 +82,7 @@ def imposed_example(robot: Robot) -> float:
         return float(SAID[robot.rig.imposed].one)
 
 
-def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
+def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[float, ...]:
     """Default imposed values of a grid: one third, two thirds and all of the limit, or those of Table 8.
 
     Args:
@@ -128,7 +128,7 @@ def option_refusal(robot: Robot, option: str, instead: str) -> str:
     return f"{option}: the voltage is imposed on this robot, and the motor speed follows; give {instead} [V]"
 
 
-def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] = ()) -> None:
+def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> None:
     """Rejects ground conditions for a load without ground, and shaft conditions for a vehicle.
 
     Args:

@@ -205,7 +205,9 @@ def comparison_answer(found: Comparison) -> str:
     rows, worst = max(e["rows"] for _, e in channel_errors), max(e["max_percent"] for _, e in channel_errors)
     extent_words = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
-        extent_words = f"{_log_duration(found):.3g} s of log"
+        time = found.table["time_s"]
+        runs = found.table.get("run_id", np.zeros(len(time)))
+        extent_words = f"{sum(np.ptp(time[runs == name]) for name in np.unique(runs)):.3g} s of log"
     sentence = f"{extent_words}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
     return sentence if not found.against else f"{sentence} {_second_robot(found)}"
 
@@ -228,13 +230,6 @@ def _both_robots(found: Comparison) -> Table:
     error_columns = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
     rows = [(c.label, *found.rms_of_both[c.name]) for c in found.channels]
     return catalogue.table("comparison.robots", rows, *error_columns)
-
-
-def _log_duration(found: Comparison) -> float:
-    """Duration of all histories of a log [s]."""
-    time = found.table["time_s"]
-    runs = found.table.get("run_id", np.zeros(len(time)))
-    return float(sum(np.ptp(time[runs == name]) for name in np.unique(runs)))
 
 
 def _errors_table(found: Comparison) -> Table:

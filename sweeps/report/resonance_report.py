@@ -150,7 +150,8 @@ class ResonanceResult:
             loads = "" if len(self.modes) == 1 else "at least at one payload: "
             parts.append(f"Avoid {loads}{_ranges_in_words(mode_resonances, self.passing.name)}.")
         elif not bare:
-            largest = ", ".join(f"{s.label} {ripple_percent(self._largest(n))}" for n, s in SIGNALS.items())
+            peaks = {s.label: float(np.nanmax(self.table[f"{n}_ripple_percent"])) for n, s in SIGNALS.items()}
+            largest = ", ".join(f"{label} {ripple_percent(peak)}" for label, peak in peaks.items())
             parts.append(
                 f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: no ripple peak is at a "
                 f"natural frequency (largest ripple: {largest})."
@@ -179,9 +180,6 @@ class ResonanceResult:
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
         return parts
-
-    def _largest(self, signal: str) -> float:
-        return float(np.nanmax(self.table[f"{signal}_ripple_percent"]))
 
     def _spread(self) -> list[tuple[str, float, float]]:
         """Modes that amplify but vary by an octave over the position of the belt, with their range [Hz]."""

@@ -162,7 +162,12 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
     # Ripple is evaluated in steady travel: contacts stop sliding before the evaluated part.
     ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
     if ripples:
-        yield Section("Inside the running gear", tuple(_gear(ripples)), "gear")
+        touchdowns = [
+            catalogue.figure("runs.touchdown", g, f"{g.name}: touchdowns dotted") for g in ripples if g.on_tracks
+        ]
+        blocks: tuple[Block, ...] = (catalogue.figure("runs.ripple", ripples), ripple_table(ripples))
+        blocks += (*touchdowns[:1], catalogue.figure("runs.reactions", ripples))
+        yield Section("Inside the running gear", blocks, "gear")
 
 
 def starts_table(starts: Sequence[Any]) -> Table:
@@ -183,16 +188,7 @@ def ripple_table(ripples: Sequence[Any]) -> Table:
     """Table of the ripple at the end of each run."""
     from sweeps.pages import gear_figures
 
-    return catalogue.table("runs.ripple-table", [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
-
-
-def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
-    """Section on the ripple of currents, speeds and reactions at the end of runs."""
-    yield catalogue.figure("runs.ripple", ripples)
-    yield ripple_table(ripples)
-    for gear in [g for g in ripples if g.on_tracks][:1]:
-        yield catalogue.figure("runs.touchdown", gear, f"{gear.name}: touchdowns dotted")
-    yield catalogue.figure("runs.reactions", ripples)
+    return catalogue.table("runs.ripple-table", [gear_figures.ripple_row(g) for g in ripples])
 
 
 def _posture(stands: Postures, names: Sequence[str]) -> Section:

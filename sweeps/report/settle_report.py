@@ -22,7 +22,7 @@ IMPOSED = {
 }
 
 
-def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Document:
+def settle_document(found: Settled, few: str, notes: Names) -> Document:
     """The report. `few`: sentence on too few settled runs. `notes`: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step

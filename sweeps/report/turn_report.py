@@ -34,7 +34,7 @@ def turn_document(
     ended: Mapping[str, float] | None,
     history: History | None,
     turns: Columns | None,
-    notes: Sequence[str] = (),
+    notes: Sequence[str],
 ) -> Document:
     """Report of a turn.
 

@@ -364,10 +364,15 @@ class Histories(Observer):
                         "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
-        thinned: list[Remark | str] = []
+        remarks: list[Remark | str] = []
         if runs.log is not None:
-            thinned.append(Remark("thinned", source=runs.source, rows=len(runs.log), kept=len(runs)))
-        return [*thinned, *_undriven_remarks(runs)]
+            remarks.append(Remark("thinned", source=runs.source, rows=len(runs.log), kept=len(runs)))
+        undriven = runs.run_names[(applied_drive(runs) == 0) & (runs["slope_deg"] != 0)]
+        if len(undriven):
+            remarks.append(
+                Remark("stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in undriven)))
+            )
+        return remarks
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
@@ -880,7 +885,7 @@ def _conditions_over_time(
     each: list[np.ndarray],
     time: np.ndarray,
     times: np.ndarray,
-    on_lines: Names = (),
+    on_lines: Names,
 ) -> Conditions:
     """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
@@ -1024,18 +1029,6 @@ def _check_signs(runs: Runs) -> None:
                     )
 
 
-def _undriven_remarks(runs: Runs) -> list[Remark | str]:
-    """Remark on runs on a slope whose motors are not driven."""
-    is_undriven = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
-    if not is_undriven.any():
-        return []
-    return [
-        Remark(
-            "stops_on_slope", runs=tuple(dict.fromkeys(str(n) or "(no run_id)" for n in runs.run_names[is_undriven]))
-        )
-    ]
-
-
 def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
     """At most `most` rows of a run, evenly spaced, including its first and last. The last one is repeated as
     padding.
@@ -1057,7 +1050,7 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
-def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
+def _drive_changes(runs: Runs, rows: np.ndarray, share: float) -> np.ndarray:
     """True for rows of a run where its command changes. For the supply of motors, only changes above a share of
     the largest value count.
     """
