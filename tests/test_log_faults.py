@@ -26,10 +26,6 @@ def robot(tmp_path_factory):
     return robot_file.read_robot(file)
 
 
-def still(speed):
-    return np.zeros_like(speed)
-
-
 def held(speed):
     of_runs = speed.reshape(4, 150).copy()
     of_runs[:, 80:] = of_runs[:, 80:81]
@@ -48,7 +44,6 @@ SPEED, VOLTS = "motor_speed_rpm", "supply_voltage_V"
 
 
 @pytest.mark.parametrize("column, fault, words", [
-    (SPEED, still, "the same in every row, so nothing moves"),
     (SPEED, held, "Empty these cells to use the other rows"),
     (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
     (VOLTS, constant, "12 V in every row"),
@@ -62,8 +57,8 @@ def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words)
 
 
 @pytest.mark.parametrize(("kind", "make", "column", "length", "words"), [
-    ("servo", servo, "output_angle_deg", 360, "jumps by -3.* like an angle that wraps; expected an angle that keeps"),
-    ("carriage", carriage, "position_mm", 50, "jumps by -4.* like a position that wraps; expected a position that"),
+    ("servo", servo, "output_angle_deg", 360, "jumps by -3.* like an angle that wraps or .*; expected an angle that keeps"),
+    ("carriage", carriage, "position_mm", 50, "jumps by -4.* like a position that wraps or .*; expected a position that"),
 ])  # fmt: skip
 def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path, kind, make, column, length, words):
     log = make(np.random.default_rng(1))

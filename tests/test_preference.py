@@ -9,10 +9,8 @@ from worlds import tables
 
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import preference
-from calibration.discovery.loop_notes import DRAW
 from calibration.discovery.result import HeldOutAlternative, WorseChannel
 from calibration.discovery.settings import HELD_OUT, settings_for
-from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels
 
@@ -71,43 +69,6 @@ def alternative(name, rms, *, leads=False, rise=0.0, lost=0):
 def test_order_of_alternatives(rms, lost, first):
     rows = [alternative(n, r, lost=m) for n, r, m in zip("abc", rms, lost, strict=True)]
     assert preference._order_alternatives(rows)[0] == first
-
-
-def test_it_is_said_by_what_the_leader_was_chosen():
-    best, other = alternative("series_resistance", 3.0, leads=True), alternative("supply_sag", 2.0, rise=1.4)
-    names = ("series_resistance", "supply_sag")
-    (note,) = preference.leader_remarks((best, other), "fit")
-    assert note == Remark(
-        "led",
-        names=names,
-        rms_sigma=(3.0, 2.0),
-        leader=0,
-        closest=0,
-        best=1,
-        by="fit",
-        prefer="fit",
-        told=preference.TOLD,
-        rise_chi2=0.0,
-    )
-    led = (dataclasses.replace(best, leads=False), dataclasses.replace(other, leads=True))
-    (note,) = preference.leader_remarks(led, HELD_OUT)
-    assert note == Remark(
-        "led",
-        names=names,
-        rms_sigma=(3.0, 2.0),
-        leader=1,
-        closest=0,
-        best=1,
-        by=HELD_OUT,
-        prefer=HELD_OUT,
-        told=preference.TOLD,
-        rise_chi2=1.4,
-    )
-    (note,) = preference.leader_remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
-    assert (note.leader, note.best, note.by) == (0, 0, DRAW)
-    (note,) = preference.leader_remarks((best, other), HELD_OUT)
-    assert (note.leader, note.best, note.by) == (0, 1, HELD_OUT)
-    assert preference.leader_remarks((), "fit") == []
 
 
 def test_another_preference_lists_the_choices():

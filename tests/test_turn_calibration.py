@@ -139,7 +139,7 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
     ]
     lines += [f"6T2A,33,13.1,0,0,1,0.5,{0.1 * k},{-0.05 * k}" for k in range(12)]
     with pytest.raises(
-        BadConfiguration, match=r"history.csv: time histories of a robot .* mmrjax settle history.csv"
+        BadConfiguration, match=r"history.csv: logs of both sides .*mmrjax settle history.csv .* straight runs with"
     ):
         calibrate(
             records.read_runs(text_file(path, "\n".join(lines) + "\n"), robot=robot),

@@ -27,8 +27,6 @@ TURN, UNUSUAL = 180.0, 4.0
 GAP = 5.0
 #: If time goes back in at most this share of rows, the rows are not just in another order.
 SELDOM = 0.02
-#: Degrees of a radian, and relative tolerance for a jump by this factor.
-RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
 def check_contradictions(runs: Runs, robot: Robot) -> None:
@@ -177,8 +175,8 @@ def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
 
 
 def _check_wraps(runs: Runs, column: str) -> None:
-    """Rejects an angle or a position that wraps, and an angle in two units. A position wraps at any length, so it
-    also has to jump against its motion.
+    """Rejects an angle or a position that wraps or changes its unit. A position wraps at any length, so it also has
+    to jump against its motion.
     """
     readings, is_angle, unit = runs[column], column == "output_angle_deg", column.rpartition("_")[2]
     one = "an angle" if is_angle else "a position"
@@ -192,30 +190,18 @@ def _check_wraps(runs: Runs, column: str) -> None:
         usual = np.maximum(np.median(np.abs(step)), _median_of_neighbours(np.abs(step)))
         large = np.abs(step) > UNUSUAL * usual
         if is_angle:
-            large &= (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual)
+            returns = np.minimum(*(np.abs(step + np.roll(step, k)) for k in (1, -1))) < TURN  # a wrong reading
+            large &= (np.abs(step) > TURN) & ((np.abs(step) < 2 * TURN + UNUSUAL * usual) | ~returns)
         else:
             large &= (np.abs(step) > np.ptp(angle) / 2) & (step * _median_of_neighbours(step) < 0)
         jumps = np.flatnonzero(large)
         if jumps.size:
             row, time_steps = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
             gap = time_steps[jumps[0]]
-            why = f"like {one} that wraps; expected {one} that keeps counting"
+            why = f"like {one} that wraps or changes its unit; expected {one} that keeps counting"
             if gap > GAP * np.median(time_steps):
                 why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
             raise BadData(
                 f"{runs.source} row {row + 1}, {column}: jumps by {float(f'{step[jumps[0]]:.4g}'):g} {unit} from the "
                 f"sample before, {why}"
-            )
-        if not is_angle:
-            continue
-        with np.errstate(divide="ignore", invalid="ignore"):
-            times = np.abs(angle[1:] / angle[:-1])
-        other = np.abs(np.abs(np.log(np.where(times > 0, times, 1.0))) / np.log(RADIAN) - 1) < ALIKE / np.log(RADIAN)
-        mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
-        if mixed.size:
-            row, k = int(run_rows[mixed[0] + 1]), mixed[0]
-            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[k : k + 2])
-            raise BadData(
-                f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
-                "if degrees and radians are mixed; write all rows in one unit"
             )

@@ -407,19 +407,6 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
 MOVES, HELD, SWAPPED = 0.05, 0.1, 0.3
 
 
-def still_sentence(runs: Runs) -> str:
-    """Sentence on a log in which nothing moves, empty for others."""
-    moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest]
-    measured = runs.measured()[:, moving]
-    if not (runs.sampled and moving and np.isfinite(measured).any()) or np.nanmax(np.ptp(measured, axis=0)) > 0:
-        return ""
-    columns = ", ".join(runs.headings.get(c, c) for c in (runs.channels[k].column for k in moving))
-    return (
-        f"{runs.source}, {columns}: the same in every row, so nothing moves. The log determines at most the "
-        "winding resistance. Log a run in which the shaft turns, or name the column with its speed or angle"
-    )
-
-
 def _drive_heading(runs: Runs) -> str:
     column = "duty" if runs.has("duty") else runs.layout.imposed_column
     return runs.headings.get(column, column)
@@ -480,7 +467,6 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
         jitter_sentence(runs),
         saturation_sentence(runs),
         constant_conditions_sentence(runs),
-        still_sentence(runs),
         held_sentence(runs),
         swapped_sentence(runs),
         doubtful_time(runs, robot),

@@ -311,7 +311,7 @@ class LoopInput:
         No stages if the windows find nothing, which readings may still do. Neither if they do not show the states.
         """
         other = self.known is not None and not isinstance(self.known.screened.base.space.bare.observe, Windows)
-        if self.equations is not None or other or (equations := equations_of_log(self, LONG)) is None:
+        if self.equations is not None or other or (equations := equations_of_log(self)) is None:
             return None, None
 
         def keep(name: str, make: Callable[[], Any]) -> Any:
@@ -718,17 +718,15 @@ def choose_effects(
     )
 
 
-def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
-    """The same input with the windows of a log as its table. None if the log does not show its states.
+def equations_of_log(given: LoopInput) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states, or if its
+    longest run has fewer than `LONG` steps.
 
     Windows use every row of a log, and only simulations use fewer.
-
-    Args:
-        fewest: fewest steps of the longest run.
     """
     space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
     observe: Any = space.bare.observe
-    if not observe.long or observe.times.shape[1] < fewest:
+    if not observe.long or observe.times.shape[1] < LONG:
         return None
     bare = space.bare
     if given.runs.log is not None:
@@ -1365,7 +1363,6 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
             remarks.append(_repeat_run_remark(found, t))
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
-    remarks += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
     settled, replicates_asked = found.replicates, found.settings.replicates
     if settled < 0.9 * replicates_asked:
         remarks.append(Remark("lost_replicates", settled=settled, asked=replicates_asked))

@@ -367,7 +367,3 @@ class TrackModelQuestion:
     balance: str = ""
     variable: str = ""
     effects: Names = ()
-
-
-#: Hold-out errors that do not decide between alternatives.
-DRAW = "draw"

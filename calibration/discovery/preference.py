@@ -15,13 +15,11 @@ from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, families_of_members
-from calibration.discovery.loop_notes import DRAW
 from calibration.discovery.result import Errors, HeldOutAlternative, WorseChannel
 from calibration.discovery.search import SearchResult, diagnose_candidate
-from calibration.discovery.settings import HELD_OUT, Settings
+from calibration.discovery.settings import Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
-from calibration.inference.fit_notes import Remark
 from calibration.inference.held_out import predict_unseen
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
@@ -175,29 +173,3 @@ def _classes_with_leader(
         ),
         (best, *alike.ladder, *fitted),
     )
-
-
-def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Remark]:
-    """Remark on the choice of the leading effect. It also reports if the other criterion would have chosen
-    differently.
-    """
-    if not table:
-        return []
-    shared = set.intersection(*(set(a.effects) for a in table))
-    leader = next(k for k, a in enumerate(table) if a.leads)
-    wins = _order_alternatives(table)[0]
-    alike = any(_is_draw(table[k], table[0]) for k in _full_predictors(table)[1:])
-    return [
-        Remark(
-            "led",
-            names=tuple(" and ".join(n for n in a.effects if n not in shared) for a in table),
-            rms_sigma=tuple(a.rms_sigma for a in table),
-            leader=leader,
-            closest=min(range(len(table)), key=lambda k: table[k].rise_chi2),
-            best=wins,
-            by=DRAW if prefer == HELD_OUT and leader == wins == 0 and alike else prefer,
-            prefer=prefer,
-            told=TOLD,
-            rise_chi2=table[leader].rise_chi2,
-        )
-    ]

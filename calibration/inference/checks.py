@@ -273,9 +273,8 @@ def _check_stuck_channels(runs: Runs) -> list[Remark]:
                 stiff.append(Remark("stiff_supply", column=channel.column, value=float(readings[0])))
                 continue
             raise BadData(
-                f"{runs.source}, {channel.column}: {readings[0]:g} in every row although the "
-                "conditions vary; "
-                "the instrument was stuck or the column is a copy"
+                f"{runs.source}, {channel.column}: {readings[0]:g} in every row although the conditions vary; "
+                f"{'nothing moved, ' * channel.zero_at_rest}the instrument was stuck or the column is a copy"
             )
     return stiff
 

@@ -15,7 +15,7 @@ from calibration.described import describe
 from calibration.discovery import loop_notes
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.outliers import OutlierCluster
-from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings
+from calibration.discovery.settings import WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax import effects
@@ -649,18 +649,6 @@ def sentence_on_ruled_out_effects(found: DiscoveryResult) -> str:
 # --- beside names ---------------------------------------------------------------------------------------
 
 
-def hidden_effects_sentence(found: DiscoveryResult) -> str:
-    """Sentence on effects that the findings could hide, and on runs that would show them, empty for none."""
-    if not found.hidden:
-        return ""
-    effect_words = [
-        f"{h.name} up to {h.amplitude:.2g} {h.unit}".rstrip(" -")
-        + (f" ({h.experiment} would show it)" if h.experiment else "")
-        for h in found.hidden
-    ]
-    return f"These data could also hide {', '.join(effect_words)}."
-
-
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
     """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated value 4e-06 (+2.3 prior sds)`."""
     ratio = f"{value / stated:.2g} times the " if stated and value / stated > 0 else ""
@@ -727,7 +715,6 @@ def _two_numbers(before: float, after: float) -> str:
 
 
 def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
-    """Question to the track model."""
     return {
         "missing": f"the error of the {about.balance} balance over {bases.variable_in_words(about.variable)}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
@@ -736,7 +723,6 @@ def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
 
 
 def track_model_answer(found: TrackModelResult) -> str:
-    """Answer of the track model."""
     before, after = found.slip_rms
     gear = ", ".join(
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
@@ -820,40 +806,6 @@ UNSHOWN = {
 }
 
 
-def leader_choice(
-    names: Names,
-    rms_sigma: tuple[float, ...],
-    leader: int,
-    closest: int,
-    best: int,
-    by: str,
-    prefer: str,
-    told: float,
-    rise_chi2: float,
-) -> str:
-    """Criterion that chose the leader of a class. A different choice by the other criterion is reported."""
-    criteria = {
-        HELD_OUT: "held-out errors",
-        FIT: "the fit to all rows",
-        loop_notes.DRAW: f"the fit to all rows, since held-out errors differ by less than {told:.0%}",
-    }
-    error_words = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
-    sentence = (
-        f"{names[leader]} is listed first in its class because of {criteria[by]}. Held-out errors: {error_words}"
-    )
-    if prefer == HELD_OUT and leader != closest:
-        sentence += f". The fit to all rows prefers {names[closest]}, by Δχ² {rise_chi2:.1f}"
-    if leader != best:
-        prefers_held_out = prefer == HELD_OUT
-        why = (
-            "describes the data less adequately"
-            if prefers_held_out
-            else (f"would come first with --prefer {HELD_OUT}, where it is adequate")
-        )
-        sentence += f". {names[best]} {why}"
-    return sentence
-
-
 def sentence_on_single_run(
     test: loop_notes.NameTest,
     conditions: Mapping[str, str | float] = MappingProxyType({}),
@@ -902,7 +854,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "late": imposed_delay,
     "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
-    "led": leader_choice,
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted. The thresholds use only these",
     "outstanding": lambda factors, word: (
         f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "

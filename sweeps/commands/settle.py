@@ -76,7 +76,7 @@ def segments_table(found: Settled) -> Columns:
 
 def to_json(found: Settled, few: str = "") -> Json:
     """`result.json`. `few` is the sentence of `words.sentence_on_few_settled_runs`."""
-    omitted = settle_words.omitted_stretches(found.stretches, bool(few))
+    omitted = settle_words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
     return {
         "schema": "mmrjax.settle/1",
         "statement": settle_words.settle_statement(found),

@@ -297,8 +297,7 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
         "standing": loop_words.support_sentence(found),
         "ruled_out": loop_words.sentence_on_ruled_out_effects(found),
     }
-    also = [loop_words.hidden_effects_sentence(found)] if found.hidden else []
-    also += [loop_words.proposed_formula(found.unnamed)] if found.unnamed is not None else []
+    also = [] if found.unnamed is None else [loop_words.proposed_formula(found.unnamed)]
     also += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
@@ -385,16 +384,10 @@ def _blocks_of_missing_terms(
     else:
         if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
             yield catalogue.figure("run.measured_drive_plane", found.robot, found.runs)
-        figure_input = table, verdict, sized
-        yield catalogue.figure(
-            "loop.defects",
-            *figure_input,
-            words=(_closed(found, table) if sized else catalogue.text("loop.three"),),
-        )
-    if found.unnamed is not None:
-        if changes or isinstance(detail, TimeStatistics):  # otherwise it is the first figure
-            yield _curve(found)
-        yield Note(loop_words.proposed_formula(found.unnamed), name="proposal")
+        closed = _closed(found, table) if sized else catalogue.text("loop.three")
+        yield catalogue.figure("loop.defects", table, verdict, sized, words=(closed,))
+    if found.unnamed is not None and (changes or isinstance(detail, TimeStatistics)):  # otherwise the first figure
+        yield _curve(found)
 
 
 def _curve(found: DiscoveryResult) -> Figure:

@@ -27,7 +27,7 @@ def settle_document(found: Settled, few: str, notes: Names) -> Document:
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step
     all_remarks = (*words.settle_remarks(found), *notes)
-    omitted = words.omitted_stretches(found.stretches, bool(few))
+    omitted = words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
     log = catalogue.figure("settle.log", found, finding=words.settle_statement(found))
     sections = [Section("Over the log", (log,))]
     if omitted:

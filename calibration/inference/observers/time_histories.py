@@ -276,8 +276,9 @@ class Histories(Observer):
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         if runs.turns:
             raise BadConfiguration(
-                f"{runs.source}: time histories of a robot that turns can be simulated but not fitted; make a "
-                f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
+                f"{runs.source}: logs of both sides can be simulated but not fitted; fit the settled turns "
+                f"(mmrjax settle {runs.source} --robot FILE), or straight runs with the columns of one side as those "
+                "of the robot"
             )
         if runs.has("held") and robot.loose:
             raise BadConfiguration(
