@@ -129,7 +129,6 @@ def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | No
         "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         **loop_findings.verdict(found),
         **loop_findings.findings(given, found),
-        "screened": None if found.searched is None else [found.searched.asked, found.searched.otherwise],
         "stratum": case.label["stratum"],
         "made": {k: v for k, v in case.label.items() if k not in TRUTH},
         "truth": case.label["effects"],

@@ -159,9 +159,6 @@ def summary(lines: list[dict]) -> list[str]:
     f.say("servos: angle held out within 1.2 of the noise", servos, lambda x: x["held_out"]["found"] <= 1.2)
     late = [x for x in every if x.get("delay")]
     f.say("delay within 3 of its sds", late, lambda x: abs(x["delay"][0] - x["made"]["delay"]) < 3 * x["delay"][1])
-    asked, otherwise = (sum((x.get("screened") or (0, 0))[k] for x in every) for k in (0, 1))
-    if asked:
-        f.note(f"screened sets that simulation confirms (goal >= 95 %): {asked - otherwise} of {asked}")
     scores.ends(f)
     return f.out
 

@@ -65,7 +65,7 @@ def load_robot(config: RobotPart) -> RobotFile:
         and all(c.inertia > 0 for _, c in robot.configurations.items())
     )
     if (
-        resolves and runs and not capabilities.states_parameter(robot, "running_gear.")
+        resolves and runs and not capabilities.states_running_gear(robot)
     ):  # otherwise the model itself would be rejected
         print_message("the robot's file has no running_gear: wheelbase, belt and internal masses are example values")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
@@ -121,21 +121,21 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
             )
 
 
-def check_surface(robot: Robot, names: Collection[str], surface: str | None, where: str) -> None:
+def check_surface(robot: Robot, names: Collection[str], surface: str | None) -> None:
     """Rejects a surface whose adhesion is neither in Table 5 nor in a configuration of the robot.
 
     Args:
         names: names of the configurations that are simulated.
 
     Raises:
-        BadConfiguration: the message has `where` and the known surfaces.
+        BadConfiguration: the message has the known surfaces.
     """
     is_allowed = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
     if not is_allowed and not all(
         surface_labels.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
     ):
         raise BadConfiguration(
-            f"{where}: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"
+            f"--surface: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"
         )
 
 
@@ -217,7 +217,7 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}
-        check_surface(robot, (name,), cell_values.get("surface"), "--surface")
+        check_surface(robot, (name,), cell_values.get("surface"))
     run = records.single_run({**cell_values, "configuration": name}, layout)
     if misplaced := misplaced_levers(run, robot):
         _, column, why = misplaced

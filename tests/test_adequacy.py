@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibration.discovery import discover
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.score_tests import StrongestStatistics
 
 SETTINGS = SimpleNamespace(
@@ -39,12 +38,10 @@ def test_rejected_with_margin_is_above_the_threshold_by_the_margin():
 
 
 @pytest.mark.parametrize(
-    ("gain", "simulated", "long", "chi2", "stands"),
-    [(5.4, True, True, 1, False), (19.0, True, True, 1, True), (0.0, False, True, 1, True), (0.0, True, False, 1, True),
-     (5.4, True, True, 99, True)],
-    ids=["refuted", "confirmed", "not simulated", "table", "other statistic"],
+    ("gain", "chi2", "stands"), [(5.4, 1, False), (19.0, 1, True), (5.4, 99, True)],
+    ids=["refuted", "confirmed", "other statistic"],
 )  # fmt: skip
-def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, simulated, long, chi2, stands):
+def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, chi2, stands):
     """A start of a vehicle that slips is not linear: 4.4 sigma of a score were 2.3 in the simulation."""
     zeros = np.zeros(99)
     null = StrongestStatistics(
@@ -52,14 +49,8 @@ def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, simulate
     )
     settings = SimpleNamespace(shares={"single": 0.03, "pair": 0.03, "chi2": 0.03}, family_wise_error=0.05)
     found = StrongestStatistics(np.asarray(4.4), np.asarray(30.0), *(np.asarray(float(x)) for x in (0, chi2, 0, 1)))
-    library = SimpleNamespace(names=("a", "b"), best_instance=lambda name, scores: "ab".index(name))
-    space = SimpleNamespace(library=library, bare=SimpleNamespace(observe=SimpleNamespace(long=long)))
-    base = SimpleNamespace(space=space, candidate=SimpleNamespace(cost=100.0))
-    ladder = [SimpleNamespace(effects=("a",), cost=100 - gain / 2, simulated=simulated)]
-    left = Diagnosis(None, SimpleNamespace(single=np.array([-4.4, 1.0])), AdequacyTest(found, null, settings))
-    screened = SimpleNamespace(base=base, cluster=None)
-    confirmed = discover._confirm_gains(screened, left, SimpleNamespace(ladder=ladder))
-    assert left.test.rejected and (confirmed is None) == stands
-    if confirmed is not None:
-        assert confirmed.test.found.single == pytest.approx(gain**0.5) and not confirmed.test.rejected
-        assert confirmed.test.found.pair == pytest.approx(30 - 4.4**2 + gain)
+    test = AdequacyTest(found, null, settings)
+    confirmed = test.confirmed(gain)
+    assert test.rejected and confirmed.rejected == stands
+    assert confirmed.found.single == pytest.approx(gain**0.5)
+    assert confirmed.found.pair == pytest.approx(30 - 4.4**2 + gain)

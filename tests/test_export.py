@@ -710,7 +710,9 @@ def test_symbols_fold_numbers_and_keep_the_order_of_operations():
     assert expressions.apply_operation("mul", a, expressions.ZERO) is expressions.ZERO
     assert expressions.apply_operation("add", a, expressions.ZERO) is a
     difference = expressions.apply_operation("sub", a, expressions.apply_operation("sub", b, two))
-    text = expressions.lines_of(expressions.apply_operation("mul", difference, difference), expressions.NUMPY, str)
+    text = expressions.lines_of(
+        expressions.apply_operation("mul", difference, difference), expressions.Dialect("np"), str
+    )
     assert text == ["    x1 = a - (b - 2.0)", "    return x1 * x1"]
     with pytest.raises(BadConfiguration, match="mine: its equation uses"):
         expressions.trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")

@@ -136,7 +136,6 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
         steps.append(name)
         return (base, rejected) if name == "bootstrap 0" else (base, rejected, SimpleNamespace(diagnosis=None))
 
-    monkeypatch.setattr(discover, "_confirm_gains", lambda *stages: None)
     task = SimpleNamespace(
         settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, shows_unmodelled_backlash=lost
     )

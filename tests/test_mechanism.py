@@ -164,20 +164,6 @@ def test_of_mechanisms_that_cannot_be_told_apart_one_that_predicts_is_stated(fou
     assert got.families == (FAMILIES["leads"], where.family) and got.effects == ("leads",)
 
 
-def test_the_family_that_explains_most_is_simulated_before_it_is_claimed(found, monkeypatch):
-    """By regression one of another family explains most, and by simulation little."""
-    tried = []
-
-    def simulate(space, proposals, settings):
-        tried.extend(active for active, _ in proposals)
-        return [fitted(*active, explains=100.0) for active, _ in proposals]
-
-    monkeypatch.setattr(room, "fit_candidates", simulate)
-    leads = dataclasses.replace(fitted("leads", explains=1900.0), simulated=False)
-    assert found(fitted("stribeck", explains=1800.0), leads, curve=0.0).families == (FAMILIES["stribeck"],)
-    assert tried == [("leads",)]
-
-
 def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_channel():
     sd = np.tile([0.1, 10.0], (ROWS, 1))
     space = SimpleNamespace(bare=SimpleNamespace(data=SimpleNamespace(sd=sd)), weight=np.ones((ROWS, 2)))

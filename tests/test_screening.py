@@ -10,14 +10,15 @@ from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import candidates, discover, screening, search
-from calibration.discovery.candidates import Candidate, fill_slots
+from calibration.discovery import candidates, discover, search
+from calibration.discovery.active_set import candidate_space
+from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
 from calibration.discovery.result import EffectRanking, RankedEffect
-from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import predict_unseen
-from calibration.inference.observers import Histories, time_histories
+from calibration.inference.observers import Histories
+from calibration.inference.observers.windows import problem_of_readings
 from calibration.inference.optimizers import Optimum
 from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
@@ -50,200 +51,6 @@ def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_it
     (other,) = (e for e in whole.effects if e.name == "brush_drop")
     assert float(one.amplitude) == float(other.amplitude) != 0
     assert float(mine.motor.resistance) == float(whole.motor.resistance)
-
-
-def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypatch):
-    """One program serves fits with and without effects. Scans are those of the base's coordinates."""
-    asked = []
-
-    def search(self, problem, starts, weights, active=None, **options):
-        asked.append((problem, np.asarray(starts), active, options["scanned"]))
-        raise InterruptedError
-
-    monkeypatch.setattr(Histories, "search", search)
-    monkeypatch.setattr(Histories, "starts", lambda self, problem, *_: np.full((1, len(problem.coordinates)), 0.2))
-    for room in ((), ("churning",)):
-        with pytest.raises(InterruptedError):
-            candidates.fit_base(space.with_room(room), ANALYST.settings, "")
-    (bare, start, nothing, _), (problem, with_slots, active, scanned) = asked
-    assert bare is scanned is space.bare and nothing is None and start.shape == (1, space.free)
-    assert problem.coordinates.names == ("churning",) and active.tolist() == [[-1, -1]]
-    assert with_slots[0].tolist() == [0.2] * space.free + [0.0] * 4
-
-
-@pytest.mark.parametrize("lost", [False, True])
-def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch, lost):
-    """With the priors of its coordinates, which are more than the base's. Not of a fit that is lost."""
-    problem, (empty,) = space.with_room(["churning"]).problem_for_sets([("", "")])
-    size, priors = space.free + 4, []
-
-    def rollouts(evaluate, starts, data, weights, *_, **options):
-        priors.append(np.shape(data.centre))
-        zero = np.zeros(len(starts))
-        square = np.zeros((len(starts), size, size))
-        return Optimum(np.asarray(starts), np.asarray(starts), square, zero, zero, zero == lost, zero), zero
-
-    monkeypatch.setattr(time_histories, "search_rollouts", rollouts)
-    monkeypatch.setattr(time_histories.scans, "scanned_coordinates", lambda problem: (0,))
-    monkeypatch.setattr(
-        time_histories.scans, "search_lower_minima", lambda problem, end, data, search, tell: search(end[0].z + 1)
-    )
-    weights, which = space.weight[None], np.asarray(empty)[None]
-    best, _ = space.bare.observe.search(
-        problem, np.full((1, size), 60.0 * lost), weights, which, rivals=True, most=1, scanned=space.bare
-    )
-    if lost:
-        assert priors == [(size,)] and best.z[0].tolist() == [60.0] * size
-        return
-    assert priors == [(size,)] * 2 and best.z[0].tolist() == [1.0] * space.free + [0.0] * 4
-
-
-def linear_world(space, seed=3):
-    """A linearisation of the space's base in which every reading is linear, and what its effects explain there."""
-    rng, p, rows = np.random.default_rng(seed), space.free, 40
-    jacobian = np.concatenate([rng.standard_normal((rows, p)), np.zeros((rows, p)), np.eye(p)])
-    signatures = rng.standard_normal((rows, len(space.library.of)))
-    m = space.library.best_instance("churning", np.where(space.library.of == 0, 2.0, 1.0))
-    residual = np.concatenate([0.1 * rng.standard_normal(rows), np.zeros(rows), np.zeros(p)])
-    residual[:rows] -= 2.0 * signatures[:, m]  # an amplitude of 2 prior sds takes it away
-    single = np.where(np.arange(len(space.library.of)) == m, 9.0, 1.0)
-    none = jnp.zeros(0)
-    scores = ScoreTable(single, none, none, none, none, none, none, none, none)
-    at = Candidate(("", ""), np.zeros(p + 4), np.ones(p + 4), 0.5 * float(residual @ residual), np.zeros(2),
-                   np.zeros(2), True, True, True)  # fmt: skip
-    linear = SimpleNamespace(jacobian=jacobian, residual=residual, signatures=signatures)
-    return screening.LinearisedFits(space, at, linear, scores, ANALYST.settings), at, linear, m
-
-
-def test_a_regression_is_the_least_squares_fit_of_base_amplitudes_and_their_priors(space):
-    beside, at, linear, m = linear_world(space)
-    found, width, p = beside(("churning", "")), ANALYST.settings.width, space.free
-    columns = np.concatenate([linear.jacobian[:40], width * linear.signatures[:, [m]]], 1)
-    whole, left = np.concatenate([columns, np.eye(p + 1)]), np.concatenate([linear.residual[:40], np.zeros(p + 1)])
-    step, *_ = np.linalg.lstsq(whole, -left, rcond=None)
-    assert_allclose(found.z[:p], step[:p], atol=1e-9)
-    assert found.z[p] == pytest.approx(step[p], rel=1e-9) and abs(found.amplitude[0] - 2.0) < 0.2
-    shape = space.library.at[m]
-    assert found.cost == pytest.approx(0.5 * np.sum((left + whole @ step) ** 2) + 0.5 * shape**2, rel=1e-9)
-    assert not found.simulated and found.cost < 0.1 * at.cost
-
-
-def test_a_regression_takes_an_effect_of_the_other_fit_away(space):
-    """From a fit with an effect that is all there is back to nothing."""
-    beside, at, linear, m = linear_world(space)
-    p, width = space.free, ANALYST.settings.width
-    wide = np.zeros((80 + p + 4, p + 4))
-    wide[:80, :p] = linear.jacobian[:80]
-    wide[:40, p] = width * linear.signatures[:, m]
-    wide[80:] = np.eye(p + 4)
-    there = np.zeros(p + 4)
-    there[p] = 2.0 / width
-    residual = np.concatenate([linear.residual[:80], np.zeros(p + 4)]) + wide @ there
-    fitted = dataclasses.replace(at, active=("churning", ""), z=there, cost=0.5 * float(residual @ residual))
-    after = SimpleNamespace(jacobian=wide, residual=residual, signatures=linear.signatures)
-    back = screening.LinearisedFits(space, fitted, after, beside.scores, ANALYST.settings)(("", ""))
-    assert back.cost == pytest.approx(beside(("", "")).cost, rel=1e-9)
-    assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
-
-
-def ranked_sets(space, far=0.0, **explained):
-    """Screened single effects that explain so much [σ²], of 1000, so far from the prior mean [prior sd]."""
-    at = np.repeat([far, 0.0], [space.free, 4])
-    return [
-        Candidate(fill_slots([n], ANALYST.settings), at, at, 500 - x / 2, np.zeros(2), np.zeros(2), True, True, True,
-                  simulated=False)
-        for n, x in explained.items()
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("simulated", "asked", "otherwise", "far"),
-    [
-        ({"churning": 900, "series_resistance": 500, "stribeck_track": 895}, 3, 0, 2.0),
-        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2, 2.0),
-        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2, 0.5),
-    ],
-)
-def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
-    space, monkeypatch, simulated, asked, otherwise, far
-):
-    tried = []
-
-    def fit(space, proposals, settings):
-        tried.extend(names[0] for names, _ in proposals)
-        return [
-            dataclasses.replace(c, simulated=True)
-            for names, _ in proposals
-            for c in ranked_sets(space, **{names[0]: simulated[names[0]]})
-        ]
-
-    monkeypatch.setattr(screening, "fit_candidates", fit)
-    screened = ranked_sets(space, far, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
-    found = screening.confirm_by_simulation(space.with_room(NAMES), screened, ANALYST.settings)
-    assert (found.asked, found.otherwise) == (asked, otherwise)
-    assert [c.simulated for c in found.candidates].count(True) == asked
-    assert tried[:3] == ["churning", "series_resistance", "stribeck_track"]
-    # From the prior mean too if simulation explains less than the regression, which is not near that mean.
-    assert [tried.count(n) for n in tried[:3]] == ([1, 1, 1] if otherwise == 0 or far < 1 else [2, 1, 2])
-    best = min((c for c in found.candidates if c.simulated), key=lambda c: c.cost)
-    assert best.effects == (("churning",) if otherwise == 0 else ("brush_drop",))
-
-
-@pytest.mark.parametrize("share, tried", [(0.97, 1), (0.9, 2)])
-def test_a_small_share_of_a_large_gain_is_no_reason_for_another_set(space, monkeypatch, share, tried):
-    """Of 100 000 σ² a simulation confirms a share. Each set is then tried once, or again from the prior mean."""
-    asked = []
-
-    def fit(space, proposals, settings):
-        asked.extend(names[0] for names, _ in proposals)
-        return [
-            dataclasses.replace(c, simulated=True, cost=c.cost + (1 - share) * 5e4)
-            for names, _ in proposals
-            for c in screened
-            if c.active == names
-        ]
-
-    monkeypatch.setattr(screening, "fit_candidates", fit)
-    screened = ranked_sets(space, 2.0, churning=1e5, stribeck_track=9e4, series_resistance=5e4, brush_drop=2e3)
-    found = screening.confirm_by_simulation(space.with_room(NAMES), screened, ANALYST.settings)
-    assert [asked.count(n) for n in asked[:3]] == [tried] * 3 and ("brush_drop" in asked) is (tried == 2)
-    assert found.otherwise == found.asked  # 3 % are 3000 σ²
-
-
-@pytest.mark.parametrize(("first", "simulated"), [(905, ["stribeck_track", "brush_drop"]), (930, ["churning"])])
-def test_a_set_that_needs_another_program_has_to_promise_more(space, monkeypatch, first, simulated):
-    """The strongest effect is outside the program, which has two others: 30 or 5 σ² of 400 make the difference."""
-    tried = []
-
-    def fit(space, proposals, settings):
-        tried.extend(names[0] for names, _ in proposals)
-        return [
-            dataclasses.replace(c, simulated=True) for names, _ in proposals for c in screened if c.active == names
-        ]
-
-    monkeypatch.setattr(screening, "fit_candidates", fit)
-    screened = ranked_sets(space, churning=first, stribeck_track=900, brush_drop=500)
-    screening.confirm_by_simulation(space.with_room(["stribeck_track", "brush_drop"]), screened, ANALYST.settings)
-    assert tried[: len(simulated)] == simulated and ("churning" in tried) is (first == 930)
-
-
-def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monkeypatch):
-    """Such a fit begins where it ended with the other sds. One that is not known takes as many steps as it needs."""
-    known, other, new = fill_slots(["churning"], ANALYST.settings), fill_slots(["brush_drop"], ANALYST.settings), []
-    size, at = len(space.coordinates), np.full(len(space.coordinates), 0.3)
-
-    def search(problem, starts, weights, active, most=None):
-        new.append((starts[0][0], most))
-        one = np.zeros((1, size))
-        return Optimum(
-            np.array(starts), one + 1, np.zeros((1, size, size)), one[:, 0], one[:, 0], one[:, 0], one[:, 0]
-        ), None
-
-    monkeypatch.setattr(candidates, "fit_from_each_start", search)
-    near = dataclasses.replace(space, near={known: at})
-    found = candidates.fit_candidates(near, [(known, 0 * at), (other, 0 * at)], ANALYST.settings)
-    assert [c.active for c in found] == [known, other]
-    assert new == [(0.0, None), (0.3, candidates.FEW)]
 
 
 def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
@@ -365,25 +172,6 @@ def test_noise_stated_too_small_is_no_excess_of_a_log():
     assert misfit(0.5) == count
 
 
-@pytest.mark.parametrize(("far", "gain", "begun"), [(0.5, 50.0, False), (60.0, 50.0, True), (60.0, 1.0, False)])
-def test_effects_are_ranked_at_the_set_of_the_equations_where_the_base_is_far(monkeypatch, far, gain, begun):
-    """The base of EMPS ends 60 prior sds away and 112 mm off: its signatures rank nothing."""
-    fits, settings = [], settings_for(Histories)
-    best = SimpleNamespace(cost=100.0 - gain)
-    monkeypatch.setattr(search, "fit_candidates", lambda space, given, _: fits.append(given) or [best])
-    monkeypatch.setattr(search, "diagnose_candidate", lambda *_: "its diagnosis")
-    space = SimpleNamespace(begins={("torque_offset",): np.ones(3)}, free=1)
-    base, left = (
-        SimpleNamespace(z=np.array([far, 0.0, 0.0]), cost=100.0),
-        SimpleNamespace(test=SimpleNamespace(null=0)),
-    )
-    wanted = (best, "its diagnosis") if begun else (base, left)
-    assert search._fit_to_rank_at(space, base, left, (), settings) == wanted
-    assert len(fits) == (far > 4) and search._fit_to_rank_at(
-        SimpleNamespace(begins={}, free=1), base, left, (), settings
-    ) == (base, left)
-
-
 def test_effects_that_remain_without_another_take_the_first_slots(monkeypatch):
     """A gap in the slots shifted the columns of a class, or ended a loop on 509 rows with an internal error."""
     asked = []
@@ -456,3 +244,75 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
     assert {found.verdict, other.verdict} == {"undescribed" if missed else "class"}
     assert found.missed == other.missed == (missed_by[id(base)] if missed else ()) and found.run is run
     assert (found.alike is None) == bool(missed) and found.unused == ("angle",) * bool(missed)
+
+
+@pytest.fixture(scope="module")
+def linear(space):
+    """Coordinates near the prior mean, and the readings that are linear about them."""
+    z = np.full(space.free, 0.1)
+    return z, problem_of_readings(space.bare, z, space.library.scored, ANALYST.settings.width)
+
+
+def test_linear_readings_are_those_of_the_simulation_at_and_near_the_fit(space, linear):
+    z, problem = linear
+    near = z + 1e-4 * np.linspace(-1, 1, space.free)
+    counts = np.asarray(space.weight) > 0
+    for at, atol in ((z, 1e-10), (near, 1e-6)):
+        simulated = np.asarray(space.bare.observe.at(space.bare, at)[2].reading)
+        changed = np.max(np.abs(simulated), 0)
+        assert_allclose((np.asarray(problem.observe.at(problem, at)[2].reading) / changed)[counts],
+                        (simulated / changed)[counts], atol=atol)  # fmt: skip
+
+
+def test_linear_readings_change_with_a_small_amplitude_as_the_simulation_does(space, linear):
+    z, problem = linear
+    table = candidate_space(problem, space.library.effects, ANALYST.library, 2, ANALYST.settings.width)
+    active = ("brush_drop", "")
+    some = np.concatenate([z, [0.01, 0.0, 0.0, 0.0]])
+
+    def change(space):
+        fits = [space.fit_of(active, np.where(np.arange(len(some)) < len(z), some, x)) for x in (some, 0.0)]
+        with_effect, without = (problem.observe.at(problem, z, sets)[2].reading for problem, z, sets in fits)
+        return np.asarray(with_effect - without)[np.asarray(space.weight) > 0]
+
+    linear_change, simulated = change(table), change(space)
+    assert np.abs(simulated).max() > 0
+    assert_allclose(linear_change, simulated, atol=0.01 * np.abs(simulated).max())
+
+
+def test_a_row_without_weight_does_not_change_a_linear_fit(space, linear):
+    z, problem = linear
+    table = candidate_space(problem, space.library.effects, ANALYST.library, 2, ANALYST.settings.width)
+    (without,) = candidates.fit_candidates(table.without([3]), [(("", ""), np.pad(z, (0, 4)))], ANALYST.settings)
+    wrong = dataclasses.replace(table.without([3]))
+    data = wrong.equipped.data
+    data = dataclasses.replace(data, measured=data.measured.at[3].add(1e3))
+    wrong = dataclasses.replace(wrong, equipped=dataclasses.replace(wrong.equipped, data=data))
+    (other,) = candidates.fit_candidates(wrong, [(("", ""), np.pad(z, (0, 4)))], ANALYST.settings)
+    assert_allclose(other.z, without.z, atol=1e-9)
+
+
+@pytest.mark.parametrize(("remain", "chosen"), [((False, False), "b"), ((True, False), "a c"), ((True, True), "a c")])
+def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen, monkeypatch):
+    """The linear readings prefer `a`, the simulation `b`."""
+
+    def one(*effects, cost):
+        return SimpleNamespace(effects=effects, z=0, cost=cost, plausible=True)
+
+    def diagnosis(rejected):
+        return SimpleNamespace(test=SimpleNamespace(rejected_with_margin=rejected, null=None))
+
+    ladder = [one("a", cost=10.0), one("b", cost=11.0), one("a", "c", cost=5.0)]
+    simulated = {("a",): 9.0, ("b",): 6.0, ("a", "c"): 5.0}
+    monkeypatch.setattr(
+        discover, "refine_by_simulation", lambda space, c, *_: one(*c.effects, cost=simulated[c.effects])
+    )
+    rest = iter(remain)
+    monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: diagnosis(next(rest)))
+    space = SimpleNamespace(room=())
+    space.with_noise = space.with_room = lambda *_: space
+    screened = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(weight=None)), bases=())
+    searched = search.SearchResult(tuple(ladder), ladder[2], diagnosis(False))
+    noise = SimpleNamespace(sd=None)
+    best = discover._smallest_confirmed(space, None, screened, diagnosis(True), searched, noise).best
+    assert " ".join(best.effects) == chosen

@@ -96,7 +96,7 @@ def test_constant_output_has_no_indices(design):
 
 def test_size_covers_the_evaluations_that_are_asked_for():
     for evaluations in (1_000, 100_000, 123_456):
-        size = sobol.base_point_count(evaluations, 5, second=True)
+        size = sobol.base_point_count(evaluations, 5)
         assert size * REPLICATES * 12 >= evaluations and size & (size - 1) == 0
 
 

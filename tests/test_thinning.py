@@ -201,9 +201,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("rows", [100, None])
-@pytest.mark.parametrize(
-    "way", [(calibrate, "prepare_input"), (discover, "preparation.prepare_input"), (foresight, "prepare_input")]
-)
+@pytest.mark.parametrize("way", [(calibrate, "prepare_input"), (discover, "preparation.prepare_input")])
 def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     """Of the same log the same rows, whoever asks. Each row once thinned is still of the whole log."""
     room, before = way
@@ -217,7 +215,6 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     call = {
         calibrate: calibrate.calibrate,
         discover: discover.discover,
-        foresight: foresight.predict_identifiability,
     }[room]
     with pytest.raises(InterruptedError):
         call(runs, paper_robots.nominal(), **({} if rows is None else {"rows": rows}))

@@ -217,7 +217,6 @@ def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.nd
 
 
 def _is_time_without_date(cell: str) -> bool:
-    """True if a cell has a time without a date."""
     return cell[2:3] == ":"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -146,17 +146,12 @@ class CandidateSpace:
         equipped: problem of the base and the effects in the slots.
         library: effects that the slots can hold.
         room: names of the effects that the compiled fits of time histories include, see `problem_for_sets`.
-        near: coordinates of earlier fits of the same histories with other sds, by their effects. Fits then start
-            there and take a few steps, and none has effects beyond `room`.
-        begins: start of the first set of effects, from the log's equations in weak form, by its effects.
     """
 
     bare: Problem
     equipped: Problem
     library: ScoredLibrary
     room: Names = ()
-    near: Mapping[Names, np.ndarray] = dataclasses.field(default_factory=dict)
-    begins: Mapping[Names, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def coordinates(self) -> ActiveSet:
@@ -182,11 +177,22 @@ class CandidateSpace:
         """Copy in which some rows (a mask or indices) are ignored."""
         weight = self.weight.copy()
         weight[rows] = 0.0
+        return self.with_noise(None, weight)
 
-        def with_weight(problem: Problem) -> Problem:
-            return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=jnp.asarray(weight)))
+    def with_noise(self, sd: np.ndarray | None, weight: np.ndarray) -> CandidateSpace:
+        """Copy with these standard deviations [SI] and weights of the readings, shape (rows, channels).
 
-        return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
+        Args:
+            sd: None to keep those of the problem. Values of missing readings have no meaning.
+        """
+
+        def with_data(problem: Problem) -> Problem:
+            known = np.asarray(problem.data.sd)
+            new = known if sd is None else np.where(np.isfinite(sd) & (sd > 0), sd, known)
+            data = dataclasses.replace(problem.data, sd=jnp.asarray(new), weight=jnp.asarray(weight))
+            return dataclasses.replace(problem, data=data)
+
+        return dataclasses.replace(self, bare=with_data(self.bare), equipped=with_data(self.equipped))
 
     def with_room(self, names: Sequence[str]) -> CandidateSpace:
         """Copy whose compiled fits of time histories include these effects."""

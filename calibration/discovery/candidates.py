@@ -87,8 +87,6 @@ ADHESION = 2.5
 FEWEST = 4
 #: Difference of the objective between searches that end in the same place [½σ²].
 ALIKE = 1e-9
-#: Gauss-Newton steps from one fit to another nearby.
-FEW = 6
 #: Distance of a regression from the prior above which a search begins at the prior mean too [prior sd].
 UNLIKELY = 4.0
 #: Rise of the objective above which a fit with more effects is worse than without [½σ²].
@@ -110,7 +108,7 @@ class Candidate:
         nearly: True if it would be plausible with `settings.stretched` times larger amplitudes.
         converged: True if the fit is an optimum.
         supplying: effects that would make a balance supply power.
-        simulated: True for a fit of the model, False for a fit of linearised equations (`screening`).
+        simulated: True for a fit of the model, False for a regression (`screening`).
     """
 
     active: Names
@@ -198,7 +196,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 
     Args:
         where: first words of the error message.
-        near: fit of the same runs with other weights or sds, or by regression. For long runs it is the only start,
+        near: fit of the same runs with other weights, or by regression. For long runs it is the only start,
             unless a regression ends `UNLIKELY` far from its prior.
 
     Raises:
@@ -247,32 +245,23 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
 def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
     """Best fit of the base from several starts that the data suggest, and the simulated observation there.
 
-    If `CandidateSpace.room` is known, fits of time histories use that program with empty slots.
     A search from a regression that does not converge is repeated from the prior mean.
     """
-    observe, bare = space.bare.observe, space.bare
-    few, regression = bool(space.near), False
-    if near is not None and (few or observe.long):
+    observe, bare, regression = space.bare.observe, space.bare, False
+    if near is not None and observe.long:
         starts, regression = near.z[None, : space.free], not near.simulated
         if regression:
-            # If an effect is missing, the fits with effects begin at the mean too, and the base explains too little.
-            doubted = np.abs(starts).max() > UNLIKELY and not space.begins
+            doubted = np.abs(starts).max() > UNLIKELY
             mean = [np.zeros(space.free)] if doubted else []
             starts = scans.place_at_minimum(bare, np.stack([*starts, *mean]))
     else:
         starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
-    most = FEW if few else observe.policy.steps if space.begins else None
-    rivals = not few and (regression or near is None or not observe.long)  # a fit of the same runs has scanned them
+    rivals = regression or near is None or not observe.long  # a fit of the same runs has scanned them
 
     def search(starts: np.ndarray) -> tuple[Optimum, Observation]:
         weights = np.repeat(space.weight[None], len(starts), 0)
-        problem, active_sets = bare, None
-        if space.room:
-            problem, (empty,) = space.problem_for_sets([empty_slots(settings)])
-            starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
-            active_sets = np.repeat(np.asarray(empty)[None], len(starts), 0)
-        search_inputs = jnp.asarray(starts), jnp.asarray(weights), active_sets
-        return jax.device_get(observe.search(problem, *search_inputs, rivals=rivals, most=most, scanned=bare))
+        search_inputs = jnp.asarray(starts), jnp.asarray(weights)
+        return jax.device_get(observe.search(bare, *search_inputs, rivals=rivals))
 
     optima = search(starts)
     if regression and len(starts) == 1 and not np.all(optima[0].converged):
@@ -285,25 +274,15 @@ Proposal = tuple[Names, np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fits each set of effects from its start. A set that was fitted before with other sds continues from that fit
-    for a few steps.
-    """
+    """Fits each set of effects from its start."""
     if not proposals:
         return []
     problem, active = space.problem_for_sets(names for names, _ in proposals)
-    candidates: dict[int, Candidate] = {}
-    for most in (None, FEW):
-        positions = [k for k, (names, _) in enumerate(proposals) if (names in space.near) == (most is not None)]
-        if not positions:
-            continue
-        starts = [space.near.get(*proposals[k]) for k in positions]
-        optima, _ = fit_from_each_start(
-            problem, starts, [space.weight] * len(positions), [active[k] for k in positions], most
-        )
-        for j, k in enumerate(positions):
-            optimum = jax.tree.map(lambda x: x[j], optima)  # noqa: B023
-            candidates[k] = candidate_of_fit(space, proposals[k][0], optimum, settings)
-    return [candidates[k] for k in range(len(proposals))]
+    optima, _ = fit_from_each_start(problem, [z for _, z in proposals], [space.weight] * len(proposals), active)
+    return [
+        candidate_of_fit(space, names, jax.tree.map(lambda x: x[k], optima), settings)  # noqa: B023
+        for k, (names, _) in enumerate(proposals)
+    ]
 
 
 def fit_in_addition(

@@ -14,7 +14,6 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
 from calibration.discovery.projection import explained_function
-from calibration.discovery.screening import fit_by_regression
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
@@ -121,8 +120,6 @@ def _fit_without_prior(
 
 #: Number of effects that are tried in place of each one.
 TRIED = 16
-#: Rise of χ² by regression up to which a rival is simulated [σ²], and the same as a share of the effect's decrease.
-NEAR, FAR = 50.0, 0.5
 #: Least predicted decrease of χ² by a shifted prior for it to be fitted, as a share of the effect's.
 SURE = 0.7
 
@@ -183,18 +180,10 @@ def find_classes(
             if cosine[k, j] > settings.alike and names[j] not in best.effects:
                 active = tuple(names[j] if s == slot else n for s, n in enumerate(best.active))
                 requests.append((slot, names[j], active))
-    simulated = {c.key: c for c in ladder if c.simulated}
-    new = [active for _, _, active in requests if frozenset(n for n in active if n) not in simulated]
-    fitted = []
-    if space.bare.observe.long:
-        fitted = fit_by_regression(space, [(w, best, after) for w in new], settings)
-        simulated |= {c.key: c for c in fitted}
-        # Possible members of the class are simulated if the program of the fits includes them.
-        new = [c.active for c in fitted if 2 * (c.cost - best.cost) < max(NEAR, FAR * max(gains))]
-        new = [active for active in new if {n for n in active if n} <= {*space.room, *best.effects}]
-    wanted_fits = [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new]
-    fitted += fit_candidates(space, wanted_fits, settings)
-    simulated |= {c.key: c for c in fitted if c.simulated}
+    fits = {c.key: c for c in ladder}
+    new = [active for _, _, active in requests if frozenset(n for n in active if n) not in fits]
+    fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new], settings)
+    fits |= {c.key: c for c in fitted}
     members, stated_shifts, ammeter = [], [], []
     jacobian, residual = map(np.asarray, (after.linear.jacobian, after.linear.residual))
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
@@ -202,7 +191,7 @@ def find_classes(
         within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
         family = space.library[name].family()
         for s, other, active in requests:
-            rival = simulated[frozenset(n for n in active if n)]
+            rival = fits[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
             akin = space.library[other].family() == family
             limit = within[settings.form_family if akin else settings.form]
@@ -216,11 +205,10 @@ def find_classes(
         linear = left.linear if len(best.effects) == 1 else None
         shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
         stated_shifts.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
-    by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in simulated]
-    latest = {c.key: c for c in by_regression} | {k: c for k, c in simulated.items() if not c.simulated}
-    all_fits = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
     families = ((*families_of_members(space, same), *also) for same, also in zip(members, ammeter, strict=True))
-    return Classes(tuple(members), tuple(stated_shifts), tuple(tuple(dict.fromkeys(f)) for f in families), all_fits)
+    return Classes(
+        tuple(members), tuple(stated_shifts), tuple(tuple(dict.fromkeys(f)) for f in families), (*ladder, *fitted)
+    )
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:

@@ -39,7 +39,7 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.log_simulation import LogSimulation, simulate_models
+from calibration.discovery.log_simulation import LogSimulation, refine_by_simulation, simulate_models
 from calibration.discovery.loop_notes import (
     AlternativeValue,
     Mechanism,
@@ -54,7 +54,6 @@ from calibration.discovery.mechanism import cached_hold_out_score, excess_misfit
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
-    screen_known_rows,
     screen_outliers,
     screen_with_effects,
 )
@@ -70,7 +69,7 @@ from calibration.discovery.result import (
     ReadingsOfRows,
 )
 from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics
-from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
+from calibration.discovery.screening import screen_by_weak_form
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import judge_names
@@ -87,7 +86,7 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.observers.windows import problem_of_readings, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -122,6 +121,8 @@ FAR = 3.0
 LONG = 4000
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
+#: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
+RIVALS = 3
 #: Callback for progress notes.
 Tell = Callable[[Remark | str], None]
 
@@ -253,6 +254,7 @@ class LoopInput:
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
     equations: CandidateSpace | None = None
+    confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -261,18 +263,19 @@ class LoopInput:
         With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
 
         If results with other sds are `known` for the same included rows, their bootstrap replicates are reused: in
-        units of the sds, the statistics hardly depend on the sds. Fits of time histories then take a few Gauss-Newton
-        steps from the known fits. No new sets of effects are compiled and no further row is excluded.
+        units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
 
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
-        if (by_windows := self.trace_windows()) is not None:
-            return by_windows
+        if (of_log := self.trace_known_readings() or self.trace_windows()) is not None:
+            return of_log
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
+            if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
+                return _trace_readings(self, screened, sds, bool(ranked))
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
@@ -280,7 +283,21 @@ class LoopInput:
                 loose = self.shows_unmodelled_backlash and diagnosis.test.rejected
                 word = "undescribed" if missed or loose else "none"
                 return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
+            if self.confirm is not None:
+                searched = self.confirm(screened, diagnosis, searched, sds.noise)
             return _reach_verdict(base_input, screened, diagnosis, sds, searched)
+
+    def trace_known_readings(self) -> LoopStages | None:
+        """Stages of the known linear readings of a log with other noise. None for other tables."""
+        known = self.known
+        if known is None or (run := known.run) is None or not known.screened.base.space.bare.observe.reads:
+            return None
+        space = known.screened.base.space
+        equations = space.with_noise(self.noise.sd, space.weight)
+        confirm = functools.partial(_smallest_confirmed, run.space, self.settings)
+        traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
+        refuted = run.contradicts and traced.verdict != "none"
+        return dataclasses.replace(traced, verdict="place") if refuted else traced
 
     def trace_windows(self) -> LoopStages | None:
         """Stages of the windows of a log with a long run. None without a finding, which a simulation may still
@@ -288,7 +305,7 @@ class LoopInput:
         """
         if self.equations is not None or (self.known is not None and self.known.run is None):
             return None
-        if self.shows_unmodelled_backlash or (equations := equations_of_log(self, LONG)) is None:
+        if self.shows_unmodelled_backlash or (equations := equations_of_log(self)) is None:
             return None
 
         def keep(name: str, make: Callable[[], Any]) -> Any:
@@ -306,28 +323,21 @@ class LoopInput:
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
-        For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
-        is appended to `ranked`, unless effects would only stand in for a backlash.
+        For logs, the equations in weak form give the start of the fit. Their ranking of the library is appended to
+        `ranked`, unless effects would only stand in for a backlash.
         """
         space = self.equations or _space_of(self, noise)
-        known, at = self.known, functools.partial(bases_at_fit, self.runs)
-        near = None
-        if before is not None:
-            space, near = space.with_room(before.space.room), before.candidate
-        else:
+        at = functools.partial(bases_at_fit, self.runs)
+        near = None if before is None else before.candidate
+        if before is None:
             if (ranking := screen_by_weak_form(space, self.settings)) is not None:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 if not self.shows_unmodelled_backlash:
                     ranked.append(self.keep("ranking", make))
-                begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
-                space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
+                near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
         self.progress(progress_remark("base"))
-        if known is not None and space.bare.observe.long:  # the same rows are included here
-            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            base = fit_base(space, self.settings, self.runs.source, near)
-            return screen_known_rows(base, at, known.screened, self.settings)
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
@@ -466,12 +476,6 @@ class LoopStages:
         return () if self.where is None else (self.where.family,)
 
     @property
-    def simulated(self) -> dict[Names, np.ndarray]:
-        """Coordinates of each fit by simulation, by its effects."""
-        all_candidates = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
-        return {c.active: c.z for c in reversed(all_candidates) if c.simulated and np.isfinite(c.cost)}
-
-    @property
     def best(self) -> Candidate:
         """Proposed candidate: the base fit if no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
@@ -512,10 +516,7 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
         if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
         else known_stages.left.test.null
     )
-    base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
-    screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
-    if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+    if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
         for begin in given.later:
             begin(screened.base)
     return screened, diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
@@ -527,8 +528,7 @@ def _search_effects(
     """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
-    base = dataclasses.replace(base, space=base.space.with_room(searched.room))
-    return dataclasses.replace(screened, base=base), left, searched
+    return screened, left, searched
 
 
 def _search_until_clean(
@@ -550,9 +550,7 @@ def _search_until_clean(
             f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
         )
         after = searched.diagnosis
-        if after is None and (confirmed := _confirm_gains(screened, diagnosis, searched)) is not None:
-            return screened, confirmed, None
-        if after is None or not after.test.rejected_with_margin or screened.base.space.near:
+        if after is None or not after.test.rejected_with_margin:
             break
         more = screen_with_effects(
             screened, after.scores, lambda base: bases_at_fit(given.runs, base), given.runs, settings
@@ -562,23 +560,6 @@ def _search_until_clean(
         progress(progress_remark("alone"))
         screened = more
     return screened, diagnosis, searched
-
-
-def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
-    """Diagnosis of the base fit of a log after simulations of the strongest effects.
-
-    Scores are linear but the contact of a vehicle is not, so a significant score may vanish in a simulation. None if
-    the base is rejected with the simulated gains too.
-    """
-    space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
-    gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}
-    best = {name: abs(float(scores[space.library.best_instance(name, scores)])) for name in space.library.names}
-    promising = {(name,) for name, score in best.items() if score > test.threshold("single")}
-    simulated = bool(promising) and promising <= gains.keys()
-    if not (simulated and space.bare.observe.long) or screened.cluster is not None:
-        return None
-    confirmed = test.confirmed(max(0.0, *gains.values()))
-    return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
 def _reach_verdict(
@@ -676,7 +657,7 @@ def choose_effects(
         predicted: cache of hold-out predictions of fits. This function adds to it.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
+    best, after = searched.best, searched.diagnosis
     if best is None or after is None:
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
@@ -685,13 +666,11 @@ def choose_effects(
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
     )
-    stood = support_of() if adequate or long else None
+    stood = support_of() if adequate else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
-    few = None
-    if not (long and stood is not None and stood.stands):  # refits of histories take long
-        progress(progress_remark("held out"))
-        few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
+    progress(progress_remark("held out"))
+    few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
         proposed = (
@@ -708,8 +687,7 @@ def choose_effects(
     names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    simulated_fits = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
-    fits_of_names = [c for c in simulated_fits if c.key == frozenset(names)]
+    fits_of_names = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
     if not fits_of_names:
         active = fill_slots(names, settings)
         begins = start_of_fit(space, proposed[0], active, settings, left.scores)
@@ -727,15 +705,13 @@ def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
     return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
 
 
-def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
-    """The same input with the windows of a log as its table. None if the log does not show its states.
-
-    Args:
-        fewest: fewest steps of the longest run.
+def equations_of_log(given: LoopInput) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states, or if its
+    longest run has fewer than `LONG` steps.
     """
     space = _space_of(given, given.noise)
     observe: Any = space.bare.observe
-    if not observe.long or observe.times.shape[1] < fewest:
+    if not observe.long or observe.times.shape[1] < LONG:
         return None
     fit = fit_weak_form(space.bare, space.library.scored)
     if fit is None or not fit.plan.mechanical:
@@ -754,6 +730,112 @@ def equations_of_log(given: LoopInput, fewest: int) -> LoopInput | None:
         given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table, known=None,
         settings=dataclasses.replace(settings, shares=shares),
     )  # fmt: skip
+
+
+def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: bool) -> LoopStages:
+    """Stages of a log whose readings are linear about the simulated fit of its base, and the simulation of the model
+    that they choose.
+
+    Args:
+        screened, sds: simulated fit of the base, and its noise.
+        ranked: True if the effects have been ranked.
+    """
+    space, settings, measured = screened.base.space, given.settings, given.runs.measured()
+    weight = space.weight.copy()
+    weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
+    problem = space.with_noise(None, weight).bare
+    z = screened.base.candidate.z[: space.free]
+    posed = problem_of_readings(problem, z, space.library.scored, settings.width)
+    equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+
+    def keep(name: str, make: Callable[[], Any]) -> Any:
+        """Stores a stage apart from the simulated one of this name."""
+        if name == "ranking":
+            return None if ranked else given.keep(name, make)
+        return given.keep(f"readings {name}", make)
+
+    confirm = functools.partial(_smallest_confirmed, space, settings)
+    table = dataclasses.replace(
+        given, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
+    )  # fmt: skip
+    traced = table.trace()
+    if not traced.sds.factors:
+        traced = dataclasses.replace(
+            traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
+        )
+    linear = traced.screened.base
+    space = space.with_noise(traced.sds.noise.sd, linear.space.weight)
+    given.progress(progress_remark("confirm"))
+    best = _chosen_fit(traced)
+    space = space if traced.searched is None else space.with_room(traced.searched.room)
+    run = simulate_models(space, linear.candidate, best, settings)
+    traced = dataclasses.replace(traced, run=run)
+    if traced.searched is None:
+        return traced
+    confirmed = traced.left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    if not confirmed.rejected and traced.screened.cluster is None:
+        left = dataclasses.replace(traced.left, test=confirmed)
+        none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
+        return LoopStages("none", traced.screened, left, traced.sds, run=none)
+    return _lower_if_contradicted(table, traced)
+
+
+def _smallest_confirmed(
+    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
+    noise: Noise,
+) -> SearchResult:  # fmt: skip
+    """The search with the smallest set whose simulation leaves no discrepancy, or the largest set, and the diagnosis
+    of its simulation.
+
+    Readings are linear near the fit of the base only. A large effect therefore leaves residuals that another one
+    would explain.
+
+    Args:
+        space: space of the simulated log.
+        screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
+        noise: noise of the readings.
+    """
+    best = searched.best
+    if best is None or searched.diagnosis is None:
+        return searched
+    if len(best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
+        return searched
+    alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
+    sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
+    space = space.with_noise(noise.sd, screened.base.space.weight)
+    space = space.with_room([name for sets in sizes for c in sets for name in c.effects])
+    for sets in filter(None, sizes):
+        fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
+        k = min(range(len(fits)), key=lambda k: fits[k].cost)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings)
+        searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
+        if not diagnosis.test.rejected_with_margin:
+            break
+    return searched
+
+
+def _chosen_fit(traced: LoopStages) -> Candidate:
+    """Fit of the verdict: the proposal, or else the best set of its mechanism."""
+    base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
+    if searched is None or traced.best is not base:
+        return traced.best
+    named = frozenset(() if mechanism is None else mechanism.effects)
+    return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+
+
+def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
+    """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
+    run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
+    if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
+        return traced
+    if traced.verdict == "mechanism":
+        return dataclasses.replace(traced, verdict="place")
+    mechanism = find_mechanism(
+        screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
+        traced.predicted, windows.settings,
+    )  # fmt: skip
+    level = "place" if mechanism is None or mechanism.fails else "mechanism"
+    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
 
 
 def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
@@ -777,10 +859,7 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     if searched is None or beside is None or given.shows_unmodelled_backlash:
         return None
     given.progress(progress_remark("confirm"))
-    base, best = screened.base.candidate, traced.best
-    if best is base:
-        named = frozenset(() if traced.mechanism is None else traced.mechanism.effects)
-        best = min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+    base, best = screened.base.candidate, _chosen_fit(traced)
     run = simulate_models(_space_of(given, given.noise), base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
@@ -789,18 +868,7 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     traced = dataclasses.replace(traced, run=run)
     linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
     refit, fit = (missed_channels(run.space, given.runs, given.noise, x) for x in linear)
-    if fit:
-        return undescribed(refit)
-    if not run.contradicts or traced.verdict == "place":
-        return traced
-    if traced.verdict == "mechanism":
-        return dataclasses.replace(traced, verdict="place")
-    mechanism = find_mechanism(
-        screened.base.space, windows.runs, base, left, searched.ladder, screened.bases, beside, traced.predicted,
-        windows.settings,
-    )  # fmt: skip
-    level = "place" if mechanism is None or mechanism.fails else "mechanism"
-    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+    return undescribed(refit) if fit else _lower_if_contradicted(windows, traced)
 
 
 # --- stages without a module of their own ---------------------------------------------------------------
@@ -946,8 +1014,7 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
 def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
     """Verdict and summary at another noise level."""
     adequate = not traced.ends.test.rejected_with_margin
-    near = bool(traced.screened.base.space.near)
-    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
+    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate)
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
@@ -1006,7 +1073,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     decided, shown = (space, best), diagnosis
     if (run := traced.run) is not None:
         best = run.base if best is base else run.best
-        space, base, noise, traced = run.space, run.base, given.noise, dataclasses.replace(traced, predicted={})
+        noise = noise if space.bare.observe.reads else given.noise
+        space, base, traced = run.space, run.base, dataclasses.replace(traced, predicted={})
         shown, ends = run.diagnosis(base, diagnosis), run.diagnosis(best, ends)
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
@@ -1072,7 +1140,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         runs=runs,
         numbers=numbers,
         included=included,
-        outliers=() if run is not None else tuple(int(numbers[k]) for k in screened.outliers),
+        outliers=tuple(int(numbers[k]) for k in screened.outliers if screened.base.space.bare.observe.reads),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
         unnamed=None

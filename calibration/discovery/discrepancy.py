@@ -301,7 +301,7 @@ def fit_discrepancy(
 def diagnose_with_curve(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
     """Diagnosis of the fit with a curve. Its critical values are those of the base (`left`)."""
     z, effects = jnp.asarray(found.z), space.library.scored
-    linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases, near=left.linear)
+    linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 

@@ -168,7 +168,7 @@ def unnamed_discrepancy(
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:
-    """Simulated candidates that explain the data nearly as well as the proposal, and separately those of implausible
+    """Candidates that explain the data nearly as well as the proposal, and separately those of implausible
     size.
 
     A candidate that only adds effects to the proposal, or to another listed candidate, is omitted if these explain
@@ -180,7 +180,7 @@ def listed_alternatives(
     """
     near: tuple[list[RejectedCandidate], list[RejectedCandidate]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
-    for c in sorted((c for c in ladder if c.simulated), key=lambda x: (len(x.effects), x.cost)):
+    for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
         if c.key in simpler or not c.effects or rise > settings.alternative:
             continue
@@ -295,8 +295,7 @@ def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, s
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     ranking = _rank_effects(space, known.scores, settings)
-    fit = next((c for c in known.alone if c.plausible), known.base)
-    shifts = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
+    shifts = parameter_shifts(space, known.base.z, known.base.z, known.base.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
     return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Any
 
@@ -72,24 +73,26 @@ class LogSimulation:
         )
 
 
+def refine_by_simulation(
+    space: CandidateSpace, fitted: Candidate, starts: Sequence[np.ndarray], settings: Settings
+) -> Candidate:
+    """Best of the simulated fits of a set of effects from these starts, each after a few steps."""
+    problem, _, active = space.fit_of(fitted.active, fitted.z)
+    size, fits = len(problem.coordinates), list[Candidate]()
+    for z in starts:
+        sets = None if active is None else [active]
+        optima, _ = fit_from_each_start(problem, [z[:size]], [space.weight], sets, STEPS)
+        optimum = jax.tree.map(lambda x: x[0], optima)
+        more = len(fitted.z) - size
+        z, sd = np.pad(optimum.z, (0, more)), np.pad(optimum.sd, (0, more), constant_values=1.0)
+        fits.append(candidate_of_fit(space, fitted.active, dataclasses.replace(optimum, z=z, sd=sd), settings))
+    return min(fits, key=lambda x: x.cost)
+
+
 def simulate_models(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> LogSimulation:
     """Simulates the base fit and the best fit of a log's windows, each refined by a few steps."""
-    space = space.with_room(best.effects)
-
-    def refined(c: Candidate, starts: list[np.ndarray]) -> Candidate:
-        """The best of the fits from these starts."""
-        problem, _, active = space.fit_of(c.active, c.z)
-        size, fits = len(problem.coordinates), list[Candidate]()
-        for z in starts:
-            sets = None if active is None else [active]
-            optima, _ = fit_from_each_start(problem, [z[:size]], [space.weight], sets, STEPS)
-            optimum = jax.tree.map(lambda x: x[0], optima)
-            more = len(c.z) - size
-            z, sd = np.pad(optimum.z, (0, more)), np.pad(optimum.sd, (0, more), constant_values=1.0)
-            fits.append(candidate_of_fit(space, c.active, dataclasses.replace(optimum, z=z, sd=sd), settings))
-        return min(fits, key=lambda x: x.cost)
-
-    last = refined(best, [best.z])
+    space = space.with_room([*space.room, *best.effects])
+    last = refine_by_simulation(space, best, [best.z], settings)
     without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
-    first = last if best is base else refined(base, [base.z, without])
+    first = last if best is base else refine_by_simulation(space, base, [base.z, without], settings)
     return LogSimulation(space, first, last, 1 - best.cost / base.cost, 1 - last.cost / first.cost)

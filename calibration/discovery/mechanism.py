@@ -16,7 +16,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, fit_candidates
+from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import errors_of_ammeters
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
@@ -61,7 +61,6 @@ def find_mechanism(
         beside: smooth curve of the discrepancy.
         predicted: hold-out predictions of fits that are already known.
     """
-    ladder = simulate_leading_families(space, base, ladder, settings)
     best, location_families = _best_by_family(space, ladder), _families_of_location(beside.where)
     curved = not space.bare.observe.over_time
     if not curved:  # fits of curves take long, and windows have none
@@ -120,22 +119,6 @@ def find_mechanism(
     return mechanisms[0] if mechanisms else None
 
 
-def simulate_leading_families(
-    space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], settings: Settings
-) -> list[Candidate]:
-    """Candidates, with the best one of each leading family simulated where it was only fitted by regression."""
-    candidates = list(ladder)
-    while True:
-        best = _best_by_family(space, candidates).values()
-        lowest = min((c.cost for c in best), default=0.0)
-        within = max(settings.same, settings.form**2 * 2 * (base.cost - lowest))
-        near = [c for c in best if not c.simulated and 2 * (c.cost - lowest) <= within]
-        if not near:
-            return candidates
-        fits = fit_candidates(space, [(c.active, c.z) for c in near], settings)
-        candidates = [*(c for c in candidates if not any(c is x for x in near)), *fits]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitsWithAndWithout:
     """Fits with and without the effects of one family."""
@@ -161,14 +144,14 @@ def _explained_by_family(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
 ) -> dict[str, FitsWithAndWithout]:
     """For each family, the two fits with and without its effects that differ most in χ²."""
-    simulated = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
+    fits = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
     pairs = {family: FitsWithAndWithout(alone, base) for family, alone in best.items()}
-    for effects, having in simulated.items():
+    for effects, having in fits.items():
         for family in {space.library[name].family() for name in effects} & set(pairs):
             others = frozenset(n for n in effects if space.library[n].family() != family)
-            if others in simulated:
+            if others in fits:
                 pairs[family] = max(
-                    pairs[family], FitsWithAndWithout(having, simulated[others]), key=lambda pair: pair.explained
+                    pairs[family], FitsWithAndWithout(having, fits[others]), key=lambda pair: pair.explained
                 )
     return pairs
 

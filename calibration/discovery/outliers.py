@@ -17,7 +17,7 @@ from scipy.special import ndtr, ndtri
 from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import FEW, BaseFit, Candidate, empty_slots, fit_base
+from calibration.discovery.candidates import BaseFit, Candidate, empty_slots, fit_base
 from calibration.discovery.experiments import predict_menu
 from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import Settings
@@ -31,6 +31,8 @@ from mmrjax.compile.precision import Threads
 
 #: Fewest outliers in a cluster.
 FEWEST = 3
+#: Gauss-Newton steps between changes of the weights of a robust fit.
+FEW = 6
 #: Widths of the windows in which they are counted, as shares of the range.
 WINDOWS = (1 / 16, 1 / 8, 1 / 4)
 #: Permutations that give the p-value of a count.
@@ -161,9 +163,9 @@ def compile_ahead(
 ) -> Iterator[Callable[[BaseFit], None]]:
     """Context manager that compiles programs for later steps, on other cores, during the base fit.
 
-    To compile them, it runs a diagnosis, one bootstrap replicate and, except for long runs, a fit with slots, all at
-    the prior mean. It yields a function of the base fit that does the same for the predictions of experiments or, for
-    long runs, for the fits with slots. All results are discarded.
+    To compile them, it runs a diagnosis and, except for long runs, one bootstrap replicate and a fit with slots, all
+    at the prior mean. It yields a function of the base fit that does the same for the predictions of experiments. All
+    results are discarded.
     """
     nothing, none = np.zeros(len(space.coordinates)), empty_slots(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
@@ -176,23 +178,19 @@ def compile_ahead(
             bases, (linear, _, _) = _diagnose_base(start, bases_at, settings)
         finally:
             looked.set()
-        bootstrap_statistics(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
+        if not space.bare.observe.long:
+            bootstrap_statistics(
+                space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed
+            )
 
     def compile_fit() -> None:
-        if space.bare.observe.long:  # its programs depend on the effects found, which are not known yet
+        if space.bare.observe.long:  # its readings are linear from here
             return
         looked.wait()  # needed last: compilation shares two cores with the base fit
         fit_from_each_start(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
-    def compile_fit_with_slots(base: BaseFit) -> None:
-        problem, z = base.space.problem(none), jnp.asarray(nothing)
-        problem.observe.linearise(problem, z, problem.data, base.space.library.scored)
-
     def compile_predictions(base: BaseFit) -> None:
-        if space.bare.observe.long:
-            if not space.room:
-                jobs.append(others.submit(compile_fit_with_slots, base))
-        elif space.bare.observe.menu:
+        if space.bare.observe.menu:
             jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}, settings))
 
     with Threads(2) as others:
@@ -220,17 +218,6 @@ def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: R
         return screened
     bases, diagnosis = _diagnose_base(base, bases_at, settings)
     return Screening(base, (), bases, diagnosis, together)
-
-
-def screen_known_rows(
-    base: BaseFit, bases_at: Callable[[BaseFit], Bases], known: Screening, settings: Settings
-) -> Screening:
-    """Diagnosis of a base fit with the outliers of an earlier trace of the same table. No further row is excluded.
-
-    Args:
-        base: fit without the rows that `known` excludes.
-    """
-    return Screening(base, known.outliers, *_diagnose_base(base, bases_at, settings), known.cluster)
 
 
 def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> OutlierCluster | None:
@@ -301,7 +288,7 @@ def _diagnose_base(
 ) -> tuple[Bases, Diagnosed]:
     space, bases = base.space, bases_at(base)
     problem, z = space.problem(empty_slots(settings)), base.candidate.z
-    if problem.observe.long and not space.room:  # by the program of its fit
+    if problem.observe.long:  # by the program of its fit
         problem, z = space.bare, z[: space.free]
     return bases, jax.device_get(diagnose_fit(problem, jnp.asarray(z), space.library.scored, bases))
 

@@ -138,8 +138,6 @@ def prefer_by_held_out(
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
-        if not leader.simulated:
-            (leader,) = fit_candidates(space, [(leader.active, leader.z)], settings)
         diagnosis = diagnose_candidate(space, leader, bases, before.test.null, settings)
         sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
         if sound:

@@ -732,7 +732,6 @@ class NoiseVerdict:
 
     Attributes:
         factor: factor on the assumed noise.
-        near: True if its fits start from those at the assumed noise and take a few Gauss-Newton steps.
     """
 
     factor: float
@@ -740,7 +739,6 @@ class NoiseVerdict:
     summary: VerdictSummary
     classes: tuple[Names, ...]
     adequate_after: bool
-    near: bool = False
 
     @property
     def statement(self) -> str:
@@ -749,8 +747,7 @@ class NoiseVerdict:
 
     def to_json(self) -> Json:
         """Entry of result.json."""
-        entries = entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
-        return entries | ({"near": True} if self.near else {})
+        return entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
 
 
 def _effect_json(e: FoundEffect, support: NameSupport | None) -> Json:

@@ -189,22 +189,12 @@ def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Strongest
 Diagnosed = tuple[Linearization, ScoreTable, StrongestStatistics]
 
 
-def diagnose_fit(
-    problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
-) -> Diagnosed:
-    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics.
-
-    Args:
-        near: linearization of a similar fit. For long runs, its sensitivities to effects are reused, because an added
-            curve hardly changes them.
-    """
-    if not problem.observe.long:
-        linear = _linearised(with_solved_rows(problem, z), z, effects)
-    elif near is None:  # by separate programs
+def diagnose_fit(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
+    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics."""
+    if problem.observe.long:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
-        residual, jacobian, _ = problem.observe.at(problem, z)
-        linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
+        linear = _linearised(with_solved_rows(problem, z), z, effects)
     return linear, *_padded_scores(linear, bases)
 
 

@@ -13,7 +13,6 @@ from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import (
-    UNLIKELY,
     Candidate,
     fill_slots,
     fit_candidates,
@@ -21,7 +20,6 @@ from calibration.discovery.candidates import (
     start_of_fit,
 )
 from calibration.discovery.score_tests import ScoreTable, StrongestStatistics, diagnose_fit
-from calibration.discovery.screening import ScreenedSets, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Remark, progress_remark
@@ -38,16 +36,12 @@ class SearchResult:
         ladder: all candidates that were fitted.
         best: proposed candidate. None if no candidate is plausible.
         diagnosis: diagnosis of the proposed candidate.
-        asked, otherwise: number of simulated sets, and of those that simulation did not confirm, see
-            `screening.ScreenedSets`.
-        room: effects in the program of these fits.
+        room: effects in the program of a log's simulations.
     """
 
     ladder: tuple[Candidate, ...]
     best: Candidate | None
     diagnosis: Diagnosis | None
-    asked: int = 0
-    otherwise: int = 0
     room: Names = ()
 
 
@@ -75,13 +69,8 @@ def search_effects(
         base: fit without effects.
         left: diagnosis of that fit.
     """
-    names = _names_by_score(space, left.scores)
-    if not space.bare.observe.long:
-        names = names[: _batch_size(space)]
-    at, rankings = _fit_to_rank_at(space, base, left, bases, settings)
-    rounds = [_fit_sets(space, [(fill_slots([name], settings), at, rankings) for name in names], settings)]
-    space = space.with_room(rounds[0].room)
-    ladder = list(rounds[0].candidates)
+    names = _names_by_score(space, left.scores)[: _batch_size(space)]
+    ladder = fit_in_addition(space, [(fill_slots([name], settings), base, left.scores) for name in names], settings)
     null = np.asarray(left.test.null.single)
     best, diagnosis, diagnosed = _best_plausible(ladder), None, None
     if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
@@ -94,8 +83,7 @@ def search_effects(
         ):
             break
         progress(progress_remark("more effects", best.effects))
-        rounds.append(_extend_set(space, best, diagnosis, at, rankings, settings))
-        more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
+        more = _extend_set(space, best, diagnosis, base, left, settings)
         best = _accept_if_better(_best_plausible(more), ladder, settings)
         ladder += more
         if best is not None:
@@ -104,24 +92,7 @@ def search_effects(
             gains = [2 * (c.cost - best.cost) for c in fewer]
             if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
-    simulated_count, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
-    return SearchResult(tuple(ladder), diagnosed, diagnosis, simulated_count, otherwise, space.room)
-
-
-def _fit_to_rank_at(
-    space: CandidateSpace, base: Candidate, left: Diagnosis, bases: Bases, settings: Settings
-) -> tuple[Candidate, Diagnosis]:
-    """Fit that ranks the effects, and its diagnosis.
-
-    It is the base fit, unless that is `UNLIKELY` far from its prior and its sensitivities mislead. Then it is the set
-    that the log's equations rank first, simulated from the coordinates of the equations.
-    """
-    if not space.begins or np.abs(base.z[: space.free]).max() <= UNLIKELY:
-        return base, left
-    (fitted,) = fit_candidates(space, list(space.begins.items()), settings)
-    if not 2 * (base.cost - fitted.cost) > settings.same:
-        return base, left
-    return fitted, diagnose_candidate(space, fitted, bases, left.test.null, settings)
+    return SearchResult(tuple(ladder), diagnosed, diagnosis)
 
 
 def best_of_each_size(found: SearchResult) -> list[Candidate]:
@@ -154,12 +125,10 @@ def refit_without_each(
         ladder: fits that are already known.
     """
     fewer = [fill_slots([n for n in best.effects if n != name], settings) for name in best.effects]
-    simulated = {c.active: c for c in ladder if c.simulated}
-    new = fit_candidates(
-        space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in simulated], settings
-    )
-    simulated |= {c.active: c for c in new}
-    return [simulated[w] for w in fewer]
+    fits = {c.active: c for c in ladder}
+    new = [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in fits]
+    fits |= {c.active: c for c in fit_candidates(space, new, settings)}
+    return [fits[w] for w in fewer]
 
 
 def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[str] = ()) -> list[str]:
@@ -167,19 +136,6 @@ def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[st
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(last))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
-
-
-def _fit_sets(
-    space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
-) -> ScreenedSets:
-    """Fits sets of effects, each in addition to another fit. For long runs they are first screened by regression."""
-    if not space.bare.observe.long:
-        return ScreenedSets(
-            tuple(
-                fit_in_addition(space, [(w, base_fit, ranking.scores) for w, base_fit, ranking in wanted], settings)
-            )
-        )
-    return confirm_by_simulation(space, fit_by_regression(space, wanted, settings), settings)
 
 
 def _batch_size(space: CandidateSpace) -> int:
@@ -190,19 +146,20 @@ def _extend_set(
     space: CandidateSpace,
     best: Candidate,
     left_by_best: Diagnosis,
-    at: Candidate,
+    base: Candidate,
     left: Diagnosis,
     settings: Settings,
-) -> ScreenedSets:
+) -> list[Candidate]:
     """Fits the best set with one more effect and, if the best is the base, also pairs of effects."""
     names = _names_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
-    if len(best.effects) == 1 and not at.effects:
+    if len(best.effects) == 1:
         for pair in _best_pairs(space, left.scores):
             pair_set, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if pair_set not in sources and swapped not in sources:
-                sources[pair_set] = (at, left)
-    return _fit_sets(space, [(w, at, ranking) for w, (at, ranking) in sources.items()], settings)
+                sources[pair_set] = (base, left)
+    wanted = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
+    return fit_in_addition(space, wanted, settings)
 
 
 def _best_pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
@@ -220,7 +177,7 @@ def _best_pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, st
 
 
 def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:
-    sound = [c for c in candidates if c.plausible and c.simulated and np.isfinite(c.cost)]
+    sound = [c for c in candidates if c.plausible and np.isfinite(c.cost)]
     return min(sound, key=lambda c: c.cost) if sound else None
 
 

@@ -239,27 +239,20 @@ def _compare_with_single_curve(
     return NameSupport(True)
 
 
-def _add_curves(
-    linear: Linearization, seen: Diagnosis, bases: Bases, without: set[str], most: int, settings: Settings
-) -> tuple[list[int], AdequacyTest]:
-    """Adds families of curves, the most significant first, until the residuals are noise. Also returns the test of
-    the residuals.
-
-    Args:
-        seen: diagnosis of the fit.
-        without: equations in which no curve is added.
-        most: largest number of curves.
+def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str, settings: Settings) -> list[int]:
+    """Families of curves outside an equation, the most significant first, until the residuals are noise or `CURVES`
+    are added.
     """
-    places = [n[0] for n in bases_room.family_names(bases)]
-    barred = np.isin([equation_of_place(p) for p in places], list(without))
+    places, linear = [n[0] for n in bases_room.family_names(bases)], seen.linear
+    barred = np.array([equation_of_place(p) == equation for p in places])
     chosen_curves, columns = list[int](), np.zeros((linear.readings, 0))
     deviate, test = np.array(seen.scores.curve), seen.test
-    while test.rejected_with_margin and len(chosen_curves) < most:
+    while test.rejected_with_margin and len(chosen_curves) < CURVES:
         chosen_curves.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen_curves[-1])], 1)
         statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen_curves])
         test = AdequacyTest(statistics, seen.test.null, settings)
-    return chosen_curves, test
+    return chosen_curves
 
 
 def judge_each_name(
@@ -302,7 +295,7 @@ def judge_each_name(
     for effect, without in zip(best.effects, without_effect, strict=True):
         equation = _equation_of_effect(space, effect)
         linear = linearizations[without.active]
-        chosen_curves, _ = _add_curves(after.linear, after, bases, {equation}, CURVES, settings)
+        chosen_curves = _strongest_curves(after, bases, equation, settings)
         beside = _augment_with_curves(space, linear, bases, chosen_curves, effect)
         promised = _largest_root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures

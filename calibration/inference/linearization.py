@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -221,6 +221,14 @@ class Linearization(eqx.Module):
     def with_residual(self, residual: Array) -> Linearization:
         """Copy with these residuals."""
         return dataclasses.replace(self, residual=residual)
+
+    def rescaled(self, factor: Array) -> Self:
+        """Copy with the scale of the readings times a factor, shape (rows, channels)."""
+        by_reading = jnp.concatenate([jnp.ravel(factor), jnp.ones(self.residual.shape[0] - self.readings)])
+        return dataclasses.replace(
+            self, residual=self.residual * by_reading, jacobian=self.jacobian * by_reading[:, None],
+            signatures=self.signatures * jnp.ravel(factor)[:, None], scale=self.scale * factor,
+        )  # fmt: skip
 
     @property
     def points(self) -> int:

@@ -209,15 +209,15 @@ def _begin_search(problem: Problem, start: Z, data: Data) -> Progress:
     )
 
 
-def _advance_search(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:
+def _advance_search(problem: Problem, at: Progress, max_steps: int | Numbers) -> Progress:
     """One step of a problem's search.
 
     The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
     the result of the search, with its residuals, Jacobian and observation.
     """
     solver, function = (
-        _least_squares_solver(data, problem.observe.long),
-        residual_function(problem, data, no_pin(at[0].shape[0])),
+        _least_squares_solver(problem.data, problem.observe.long),
+        residual_function(problem, problem.data, no_pin(at[0].shape[0])),
     )
     y, state = _solver_step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
@@ -305,7 +305,7 @@ def _continue_searches(
 
     def advance(member: SearchMember, at: Progress) -> Progress:
         member_problem = member.problem(problem)
-        new = _advance_search(member_problem, at, member_problem.data, max_steps)
+        new = _advance_search(member_problem, at, max_steps)
         return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
     at = _start_fresh_searches(problem, members, fresh, at)
@@ -335,7 +335,7 @@ def _step_unfinished(
 
     def advance(member: SearchMember, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
         member_problem = dataclasses.replace(member.problem(problem), roots=roots)
-        new = _advance_search(member_problem, at, member_problem.data, max_steps)
+        new = _advance_search(member_problem, at, max_steps)
         new = jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
         return new, _optimum_of_progress(new, member_problem.data, pin)
 

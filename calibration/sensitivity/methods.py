@@ -60,7 +60,7 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
     terms: dict[str, dict[int, sobol.VarianceTerms]] = {name: {} for name in names}
     lost_counts = {name: np.zeros(points) for name in names}
     for input_set, group in group_points(study, moving).items():
-        size = sobol.base_point_count(evaluations / points, len(input_set), True)
+        size = sobol.base_point_count(evaluations / points, len(input_set))
         design = sobol.sobol_design(len(input_set), size, seed)
         scores = _sampled_scores(study, design.points, np.array(input_set))
         for k, outputs in study.sample(study.values_at(scores), group):

@@ -50,9 +50,9 @@ class SobolDesign:
         return (2 * self.inputs if self.second else self.inputs) + 2
 
 
-def base_point_count(evaluations: float, inputs: int, second: bool) -> int:
+def base_point_count(evaluations: float, inputs: int) -> int:
     """Number of base points of a replicate for at least this many evaluations: a power of 2."""
-    blocks = (2 * inputs if second else inputs) + 2
+    blocks = 2 * inputs + 2
     return 2 ** max(math.ceil(math.log2(max(evaluations / (REPLICATES * blocks), FEWEST))), 0)
 
 

@@ -249,8 +249,7 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
         f"with {' and with '.join(factors)} times the noise, the verdict is {words}"
         for words, factors in same.items()
     ]
-    near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
-    return ", and ".join(answers) + near
+    return ", and ".join(answers)
 
 
 def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
@@ -716,7 +715,6 @@ def _two_numbers(before: float, after: float) -> str:
 
 
 def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
-    """Question to the track model."""
     return {
         "missing": f"the error of the {about.balance} balance over {bases.variable_in_words(about.variable)}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
@@ -725,7 +723,6 @@ def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
 
 
 def track_model_answer(found: TrackModelResult) -> str:
-    """Answer of the track model."""
     before, after = found.slip_rms
     gear = ", ".join(
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"

@@ -94,7 +94,6 @@ def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
 
 
 def points_left_out(points: int, total: int, sampled: bool, outputs: Names) -> str:
-    """Points that are left out."""
     who = "too many robots in the sample do" if sampled else "the robot does"
     return f"{points} of {total} operating points are left out, since {who} not travel there ({', '.join(outputs)})"
 

@@ -86,11 +86,9 @@ def computed_outside_trace(function: Callable[P, T]) -> Callable[P, T]:
 
 def as_floats(tree: T) -> T:
     """Returns a tree with its floating-point arrays as JAX arrays, in JAX's current precision."""
-
-    def cast(leaf: Any) -> Any:
-        return jnp.asarray(leaf, float) if eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-
-    return jax.tree.map(cast, tree)
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, float) if eqx.is_array(x) and jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+    )
 
 
 def _in_double_precision(argument: Any) -> Any:

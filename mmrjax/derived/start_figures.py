@@ -210,12 +210,9 @@ def first_crossing(
     def cubic(s: Array) -> Array:
         return x[k] + s * rise + s * (1 - s) * ((1 - s) * (begin - rise) - s * (end - rise))
 
-    def slope(s: Array) -> Array:
-        return jax.jvp(cubic, (s,), (jnp.ones_like(s),))[1]
-
     share = (level - x[k]) / jnp.where(rise > 0, rise, 1.0)
     for _ in range(3):
-        steep = slope(share)
+        steep = jax.jvp(cubic, (share,), (jnp.ones_like(share),))[1]
         share = share - (cubic(share) - level) / jnp.where(jnp.abs(steep) > 0, steep, 1.0)
     return k, jnp.clip(share, 0.0, 1.0)
 

@@ -280,10 +280,8 @@ def _simulate_batch(
     sample: float,
     rolling: bool,
 ) -> TrackTrajectory:
-    def one(conditions: Conditions) -> TrackTrajectory:
-        return track(robot, conditions, duration=duration, step=step, sample=sample, rolling=rolling)
-
-    return jax.vmap(one)(conditions)
+    options: Any = {"duration": duration, "step": step, "sample": sample, "rolling": rolling}
+    return jax.vmap(lambda one: track(robot, one, **options))(conditions)
 
 
 @compiled
@@ -295,10 +293,10 @@ def _begin_runs(robot: Robot, conditions: Conditions, step: float, rolling: bool
 def _advance_runs(
     robot: Robot, conditions: Conditions, motions: HalfRobotState, step: float, sample: float, samples: int
 ) -> tuple[HalfRobotState, SampleRecord]:
-    def one(conditions: Conditions, motion: HalfRobotState) -> tuple[HalfRobotState, SampleRecord]:
-        return _advance_and_record(build_system(robot, conditions, step), motion, round(sample / step), samples)
-
-    return jax.vmap(one)(conditions, motions)
+    steps = round(sample / step)
+    return jax.vmap(lambda one, motion: _advance_and_record(build_system(robot, one, step), motion, steps, samples))(
+        conditions, motions
+    )
 
 
 @compiled

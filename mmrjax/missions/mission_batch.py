@@ -210,11 +210,9 @@ def simulate_batch(
         keep: largest number of steps to record, 0 for none.
     """
     axes = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
-
-    def mission_of_run(conditions: Conditions, profile: Profile) -> Mission:
-        return mission(robot, conditions, profile, start, tolerance=tolerance, keep=keep)
-
-    return jax.vmap(mission_of_run, in_axes=(0, axes))(conditions, profile)
+    return jax.vmap(
+        lambda one, rows: mission(robot, one, rows, start, tolerance=tolerance, keep=keep), in_axes=(0, axes)
+    )(conditions, profile)
 
 
 def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> RunBatch:

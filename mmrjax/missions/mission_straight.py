@@ -44,7 +44,6 @@ PEAKS: dict[str, str] = {
 
 
 def units(robot: Robot) -> Unknowns:
-    """Units of the unknowns."""
     return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
 
 

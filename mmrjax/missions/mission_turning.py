@@ -72,7 +72,6 @@ class TurningInstant(balances.Travel):
 
 
 def units(robot: Robot) -> Unknowns:
-    """Units of the unknowns."""
     return jnp.asarray((*UNITS, *(size for e in robot.remembering for size in (e.memory_size or 1.0,) * 2)))
 
 

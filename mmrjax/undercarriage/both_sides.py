@@ -459,6 +459,5 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
 
 
 def result_of(run: HalfRobotSystem, averages: SteadyAverages, status: Array) -> Result:
-    """See `half_robot.result_of`."""
     assert averages.travel is not None
     return circling.result_of_turn(run.robot, averages.travel, status)

@@ -352,11 +352,9 @@ def _differentiated(
     differentiated = tuple(name for name, change in constants.items() if change is not None)
     contact_inputs = _contact_inputs(run, motion) | {"slip": step.slip}
     linearized = contact_sums.linearize(run.path, run.chassis, contact_inputs, step.gained, differentiated)
-
-    def held(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
-        return _step_residual(run, motion, step.gained, linearized)
-
-    (residual, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
+    (residual, fallen, later, signals, _), d_held = eqx.filter_jvp(
+        lambda run, motion: _step_residual(run, motion, step.gained, linearized), (run, motion), (d_run, d_motion)
+    )
     d_left, d_fallen, d_later, d_signals, d_guided = d_held
     # None: the differentiated quantity does not enter.
     d_gained = jnp.zeros_like(residual) if d_left is None else solve_factorised(step.factors, d_left)
@@ -552,5 +550,4 @@ def status_unless_lost(
 
 
 def result_of(run: HalfRobotSystem, averages: SteadyAverages, status: Array) -> Result:
-    """Result of a run with this status."""
     return result_of_signals(run.robot, averages.signals, status)

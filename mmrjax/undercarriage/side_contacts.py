@@ -26,13 +26,12 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.belt import BeltPath, BeltRuns, belt_runs, tension_along, tips_on_path
-from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
+from mmrjax.undercarriage.running_gear import GROUSERS, WHEELS, RunningGear
 
 #: A number of each contact.
 PerContact = Float[Array, " contacts"]
 
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration carry no load
-TEETH_GROUSER = TEETH_BELT // GROUSERS  # teeth under one grouser's pitch
 
 WHEEL = np.arange(CONTACTS) >= GROUSERS
 _END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0)  # of the wheelbase: front, rear

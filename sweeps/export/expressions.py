@@ -361,7 +361,7 @@ class Torch(Dialect):
         return f"torch.{name}({', '.join(args)})"
 
 
-NUMPY, JAX, TORCH = Dialect("np"), Dialect("jnp"), Torch()
+JAX, TORCH = Dialect("jnp"), Torch()
 
 
 def number_text(value: Any) -> str:

@@ -428,18 +428,18 @@ _DOCUMENT = '''"""One step of the drive: torque at the joint, state after the st
 
 def jax_source(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = ()) -> str:
     """Source of the law in JAX."""
-    return _module_text(joint, constants, _JAX, "Actuator", notes)
+    return _module_text(joint, constants, _JAX, notes)
 
 
 def torch_source(
     joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = (), imports: str = _TORCH.imports
 ) -> str:
     """Source of the law in PyTorch."""
-    return _module_text(joint, constants, dataclasses.replace(_TORCH, imports=imports), "Actuator", notes)
+    return _module_text(joint, constants, dataclasses.replace(_TORCH, imports=imports), notes)
 
 
 def _module_text(
-    joint: DriveJoint, constants: Sequence[LawConstant], library: _ArrayLibrary, what: str, notes: Sequence[str]
+    joint: DriveJoint, constants: Sequence[LawConstant], library: _ArrayLibrary, notes: Sequence[str]
 ) -> str:
     states = ", ".join(f'"{n}": zero' for n in joint.states)
     moving = (
@@ -461,7 +461,7 @@ def _module_text(
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
     shape_arguments = "shape=()" if library.dialect is JAX else "shape=(), device=None"
-    title = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
+    title = f"Actuator of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     wrapped_notes = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
     header = _docstring(f"{title}\n\n{wrapped_notes}\n")
     return (

@@ -105,11 +105,7 @@ def _effect_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> dict[
 
 def mujoco_law_function(normal: float) -> Any:
     """Function of a joint and amplitudes that returns its law, at a normal load of one side [N]."""
-
-    def law(joint: DriveJoint, amplitudes: Mapping[str, float]) -> MujocoLaw:
-        return translate_law(joint, normal, amplitudes)
-
-    return law
+    return lambda joint, amplitudes: translate_law(joint, normal, amplitudes)
 
 
 def translate_law(joint: DriveJoint, normal: float, amplitudes: Mapping[str, float] | None = None) -> MujocoLaw:

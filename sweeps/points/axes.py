@@ -351,11 +351,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         from calibration.inference import priors
 
         coordinates = priors.parameter_coordinates(robot, [name])
-
-        def quantile(u: np.ndarray) -> np.ndarray:
-            return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
-
-        return quantile
+        return lambda u: in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
     return _truncate(kind, numbers, axis.bounds, where)
 
 

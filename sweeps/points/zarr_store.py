@@ -81,7 +81,6 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
-    """Installed versions by package."""
     return {name: importlib.metadata.version(name) for name in packages}
 
 

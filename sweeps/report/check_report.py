@@ -43,7 +43,6 @@ class CheckResult:
 
     @property
     def missed(self) -> list[RequirementOutcome]:
-        """Outcomes of the missed requirements."""
         return [o for o in self.outcomes if not o.met]
 
     def statement(self) -> str:

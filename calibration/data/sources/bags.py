@@ -62,25 +62,15 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
                     )
                 )
                 continue
-            first_message = _first(reader, topic)
-            stamped = any(field == _STAMP for field, _, _ in _message_fields(first_message, ""))
+            fields = dict(_values(_first(reader, topic)))
+            stamped = fields.pop(_STAMP, None) is not None
             read = functools.cache(functools.partial(_topic_values, path, topic))
             clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", _column(read, ""), "ns")
-            for field, words, refused in _message_fields(first_message, ""):
-                if field != _STAMP:
-                    field_path = f"{topic}.{field}"
-                    units = UNITS.get(kind, {})
-                    signals.append(
-                        Signal(
-                            field_path,
-                            count,
-                            _column(read, field),
-                            next((unit for start, unit in units.items() if field.startswith(start)), ""),
-                            clock,
-                            words,
-                            refused,
-                        )
-                    )
+            units = UNITS.get(kind, {})
+            for field, value in fields.items():
+                unit = next((unit for start, unit in units.items() if field.startswith(start)), "")
+                words = isinstance(value, str)
+                signals.append(Signal(f"{topic}.{field}", count, _column(read, field), unit, clock, words))
     return tuple(signals)
 
 
@@ -116,7 +106,7 @@ def _topic_values(path: Path, topic: str) -> Columns:
         names: list[str] | None = None
         for connection, instant, raw in reader.messages(connections=connections):
             message = reader.deserialize(raw, connection.msgtype)
-            values = dict(_values(message, ""))
+            values = dict(_values(message))
             if names is None:
                 names = list(values)
             if len(values) != len(names):
@@ -136,13 +126,7 @@ def _topic_values(path: Path, topic: str) -> Columns:
     return columns | {"": stamps}
 
 
-def _message_fields(message: Any, at: str) -> Iterator[tuple[str, bool, str]]:
-    """Path of each field, True if it has words, and the reason if it cannot be read."""
-    for field, value in _values(message, at):
-        yield field, isinstance(value, str), ""
-
-
-def _values(message: Any, at: str) -> Iterator[tuple[str, Any]]:
+def _values(message: Any, at: str = "") -> Iterator[tuple[str, Any]]:
     for field in message.__dataclass_fields__:
         if field.startswith("__"):
             continue

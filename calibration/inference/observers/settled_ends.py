@@ -274,10 +274,9 @@ def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.nd
 
 @compiled
 def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
-    def fit_one(z: Array, held: Array) -> Optimum:
-        return levenberg_marquardt(problem, z, problem.data, Pin(held, z), max_steps=STEPS)[0]
-
-    return jax.vmap(fit_one)(starts, held)
+    return jax.vmap(
+        lambda z, pinned: levenberg_marquardt(problem, z, problem.data, Pin(pinned, z), max_steps=STEPS)[0]
+    )(starts, held)
 
 
 def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:

@@ -183,6 +183,10 @@ class HistoriesLinearization(Linearization):
     time: Float[Array, " rows"]
     angle: Float[Array, " rows"]
 
+    def rescaled(self, factor: Array) -> HistoriesLinearization:
+        by_sample = jnp.asarray(factor)[self.rows_of][:, None]
+        return dataclasses.replace(super().rescaled(factor), defects=self.defects * by_sample)
+
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         changes = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
         return _to_rows(changes, self.rows_of, self.rows).reshape(-1, shapes.shape[1])

@@ -93,7 +93,6 @@ def errors_title(found: Export) -> str:
 
 
 def export_remarks(found: Export) -> list[str]:
-    """Remarks on an export."""
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
