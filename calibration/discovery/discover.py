@@ -86,7 +86,8 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import problem_of_readings, problem_of_windows
+from calibration.inference.observers.linear_rows import problem_of_readings
+from calibration.inference.observers.windows import problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -105,8 +106,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Size of a delay in its sds from which a note reports it, and as a share of the longest that is searched.
-LATE, ENDS = 4.0, 0.95
+#: Size of a delay in its sds from which a note reports it, and as a share of the longest in the equations.
+LATE, ENDS = 4.0, 0.9
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
@@ -337,7 +338,8 @@ class LoopInput:
                 near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
-        self.progress(progress_remark("base"))
+        if self.equations is None or not space.bare.observe.reads:  # linear readings have a fit
+            self.progress(progress_remark("base"))
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
@@ -1334,7 +1336,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
 
 
 def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remark]:
-    """Remark on a delay that the robot's file does not state, or that is the longest of the search."""
+    """Remark on a delay that the robot's file does not state, or that is as long as the search of the equations."""
     limit = TENTH * float(np.median([runs["time_s"][rows].max() for rows in runs.rows_by_run().values()]))
     ends = abs(delay.after) > ENDS * limit
     if abs(delay.after) <= LATE * delay.sd_after or (stated and not ends):

@@ -29,7 +29,10 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
         more=catalogue.text("sensitivity.sobol") if found.method == "sobol" else "",
     )  # fmt: skip
     idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
-    said = [*([idle] if found.negligible else []), *_next_runs_in_words(found), *found.notes]
+    said = [idle] * bool(found.negligible)
+    if (n := found.next_runs) is not None:
+        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
+        said.append(f"next runs, of {n.candidates} candidates ({n.source}), measured to {n.noise}: {labels}")
     # the most important inputs for each output
     rows = []
     for study in found.outputs.values():
@@ -44,7 +47,7 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
             run_tables.note_on_robot(file, found.model, method + ran),
             catalogue.table("sensitivity.leading", rows),
             overview,
-            *remarks(said),
+            *remarks([*said, *found.notes]),
         ),
         page_sections=lambda: _sections(found),
     )
@@ -112,13 +115,6 @@ def _inputs(found: SensitivityResult) -> Table:
         interval = "{:.3g} to {:.3g}".format(*x.interval)
         rows.append((f"`{name}`", x.meaning, x.unit, x.distribution, x.median, interval, largest))
     return catalogue.table("sensitivity.inputs", rows)
-
-
-def _next_runs_in_words(found: SensitivityResult) -> Iterable[str]:
-    n = found.next_runs
-    if n is not None:
-        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
-        yield f"next runs, of {n.candidates} candidates ({n.source}), measured to {n.noise}: {labels}"
 
 
 def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:

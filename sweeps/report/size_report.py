@@ -125,17 +125,21 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
     tables = _table("best", found, best), requirements_sheet(found.outcomes, terminal=False)
     motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
     designs = [f"{describe_design(f)} ({objective_text(f, s.objective)})" for f in s.alternatives]
+    front_words = _front_in_words(found)
+    front = [
+        b for x in front_words for b in (Note(x, terminal=True), catalogue.figure("size.front", found, finding=x))
+    ]
     next_best = (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
     return Document(
         "Sizing",
         found.statement(),
-        (Note(lead, "lead"), *_limits(found, robot_name), *_front(found)),
+        (Note(lead, "lead"), *_limits(found, robot_name), *front),
         (
             Section("Designs", (Note(about), *tables), "designs"),
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
             *_chart(found),
         ),
-        brief=(lead, *next_best, *_front_in_words(found)),
+        brief=(lead, *next_best, *front_words),
     )
 
 
@@ -192,9 +196,3 @@ def _front_in_words(found: SizeResult) -> Names:
         f"{count_noun(len(front), 'design')} on the Pareto front of {first} and {second}, from "
         f"{objective_text(front[0], first)} to {objective_text(front[-1], second)}.",
     )
-
-
-def _front(found: SizeResult) -> Iterable[Figure | Note]:
-    for text in _front_in_words(found):
-        yield Note(text, terminal=True)
-        yield catalogue.figure("size.front", found, finding=text)
