@@ -99,7 +99,7 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
         "missing": [found.left.test.p_value, found.left.test.rejected, found.left.test.rejected_with_margin],
         "ends": found.ends.test.rejected_with_margin,
     }
-    if best is not base and not found.screened.base.space.bare.observe.long:
+    if best is not base and found.run is None and not found.screened.base.space.bare.observe.long:
         line |= _held_out(given.runs, found)
     return line
 

@@ -11,8 +11,9 @@ Logs come from `tests/worlds/logs.py`, which shares no code with the simulator: 
 states. The loop reads only `rig.toml` and `table.csv`. Only the scorer reads the labels. Every log is one line
 of `--out`, and a restarted campaign continues where it ended. With `--brief` there is no
 hold-out. In the stratum `varied` half of the tables have no sds, a quarter of the logs show an angle alone and a
-quarter have coarse instruments, and effects of the library leave 5 σ. In the stratum `servo` the goal of a controller
-is imposed and a 12-bit encoder shows the angle at 50 or 100 Hz.
+quarter have coarse instruments, and effects of the library leave 5 σ. The stratum `long` is the same with one or two
+runs of 4100 to 25 000 rows at 1 to 5 ms. In the stratum `servo` the goal of a controller is imposed and a 12-bit
+encoder shows the angle at 50 or 100 Hz.
 """
 
 from __future__ import annotations
@@ -41,22 +42,22 @@ TRIES = 6
 TENTH = 0.1
 
 
-def inputs(seed: int, servo: bool = False) -> tuple[str, float]:
+def inputs(seed: int, stratum: str = "") -> tuple[str, float]:
     """Imposed quantity and sampling interval [s], in turn. Each step occurs with each effect."""
-    if servo:
+    if stratum == "servo":
         return logs.GOAL, logs.EVERY[1 + seed % 2]
-    turn = seed // len(logs.IMPOSED)
-    return logs.IMPOSED[seed % len(logs.IMPOSED)], logs.EVERY[(turn + turn // 9) % len(logs.EVERY)]
+    turn, every = seed // len(logs.IMPOSED), logs.LONG_EVERY if stratum == "long" else logs.EVERY
+    return logs.IMPOSED[seed % len(logs.IMPOSED)], every[(turn + turn // 9) % len(every)]
 
 
 @functools.lru_cache(maxsize=2)
 def attempt(kind: str, seed: int, stratum: str = "") -> logs.Case | str:
     """The case of a kind and a seed, or the reason why it is invalid."""
-    varied, servo = stratum == "varied", stratum == "servo"
+    varied, servo, long = stratum in ("varied", "long"), stratum == "servo", stratum == "long"
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
-    imposed, every = inputs(seed, servo)
+    imposed, every = inputs(seed, stratum)
     turn = seed // 2 % 4 if varied else 0
-    made = functools.partial(logs.rig, rng, imposed, every, alone=turn == 1, coarse=servo or turn == 3)
+    made = functools.partial(logs.rig, rng, imposed, every, alone=turn == 1, coarse=servo or turn == 3, long=long)
     stated, sigmas = not varied or seed % 2 == 0, (VARIED if varied else SIGMAS)
     if kind == "clean":
         return logs.case(made(), "", 0.0, seed, stated=stated)
@@ -76,6 +77,10 @@ def work(task: Task) -> dict:
         return {"skipped": case}
     given, found, line = looped(case, task)
     line["intervals"] = intervals(found, case)
+    line["strongest"] = strongest(found)
+    if (run := found.run) is not None:
+        misfit, count = 2 * run.base.cost, int(np.sum(run.space.weight > 0))
+        line["simulated"] = {"promised": run.promised, "gained": run.gained, "misfit": misfit, "readings": count}
     if not task.brief:
         from calibration.data import robot_file
         from calibration.discovery.discover import assemble_result
@@ -97,6 +102,12 @@ def intervals(found, case: logs.Case) -> list[bool]:
     low, high = (np.asarray(every.value(z + side * 1.96 * sd)) for side in (-1, 1))
     truth = {logs.PUBLIC[name]: x for name, x in case.label["constants"].items()}
     return [bool(a <= truth[n] <= b) for n, a, b in zip(every.names, low, high, strict=True) if n in truth]
+
+
+def strongest(found) -> dict[str, float]:
+    """Largest score of each effect on the base fit [σ]."""
+    library, scores = found.screened.base.space.library, np.abs(np.asarray(found.left.scores.single))
+    return {n: round(float(library.largest(scores)[k]), 2) for k, n in enumerate(library.names)}
 
 
 def held_out(whole, case: logs.Case) -> dict:
@@ -122,7 +133,7 @@ def held_out(whole, case: logs.Case) -> dict:
 
 def program(task: Task) -> tuple[str, float, bool]:
     """Properties that logs with the same programs share: what is imposed, the sampling interval, an angle alone."""
-    return *inputs(task.seed, task.stratum == "servo"), task.stratum == "varied" and task.seed // 2 % 4 == 1
+    return *inputs(task.seed, task.stratum), task.stratum in ("varied", "long") and task.seed // 2 % 4 == 1
 
 
 def summary(lines: list[dict]) -> list[str]:

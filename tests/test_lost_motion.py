@@ -155,7 +155,9 @@ def test_a_rigid_base_that_leaves_only_noise_refutes_the_lost_motion(rejected, m
     )
     monkeypatch.setattr(discover, "_search_until_clean", lambda given, screened, *_: (screened, diagnosis, None))
     monkeypatch.setattr(discover, "missed_channels", lambda *_: ())
-    given = discover.LoopInput(runs, None, robot, *[None] * 4, keep=lambda name, make: (
+    monkeypatch.setattr(discover, "equations_of_log", lambda *_: None)
+    notes = tuple(lost_motion_notes(runs, robot))
+    given = discover.LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
         SimpleNamespace(base=base), SimpleNamespace(noise=None)))  # fmt: skip
     assert given.trace().verdict == ("undescribed" if rejected else "none")
 
@@ -176,7 +178,7 @@ def test_a_loop_that_runs_out_of_time_answers_with_the_lost_motion(tmp_path, mmr
 def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
     for play in (1.0, 0.0):
         runs, robot = read(tmp_path, servo(play=play))
-        given = discover.LoopInput(runs, None, robot, *[None] * 4)
+        given = discover.prepare_loop(runs, robot, noise="output_angle=0.1deg")
         assert given.shows_unmodelled_backlash == (play > 0)
 
 
@@ -185,14 +187,15 @@ class Windows:
     keep: Any = None
 
     def trace(self):
-        return [self.keep(name, None) for name in ("ranking", "base", "search 0")]
+        names = [self.keep(name, None) for name in ("ranking", "base", "search 0")]
+        return SimpleNamespace(names=names, screened=SimpleNamespace(base=SimpleNamespace(candidate="fit")))
 
 
-@pytest.mark.parametrize("lost", [True, False])
-def test_stages_of_windows_are_stored_apart_and_only_without_lost_motion(lost, monkeypatch):
+def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(monkeypatch):
     """Windows without a finding left their base fit to the simulated path, which ended with an internal error."""
     monkeypatch.setattr(discover, "equations_of_log", lambda *_: Windows())
-    monkeypatch.setattr(discover, "_confirm_by_simulation", lambda given, windows, traced: traced)
-    given = discover.LoopInput(*[None] * 7, keep=lambda name, make: name)
-    given.__dict__["shows_unmodelled_backlash"] = lost
-    assert given.trace_windows() == (None if lost else ["ranking", "windows base", "windows search 0"])
+    monkeypatch.setattr(discover, "_confirm_by_simulation", lambda given, windows, traced: traced.names)
+    monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
+    robot = SimpleNamespace(has_ground=False)
+    given = discover.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
+    assert given.trace_windows() == (["ranking", "windows base", "windows search 0"], "fit")

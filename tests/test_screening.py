@@ -18,7 +18,7 @@ from calibration.discovery.result import EffectRanking, RankedEffect
 from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.observers import Histories
-from calibration.inference.observers.windows import problem_of_readings
+from calibration.inference.observers.linear_rows import problem_of_readings
 from calibration.inference.optimizers import Optimum
 from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME

@@ -287,10 +287,6 @@ WRONG = {
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 350, x, np.radians(x))),
         r"row 351, output_angle_deg: jumps by -30\d\d deg .* an angle that wraps or changes its unit",
     ),
-    "an angle that wraps": (
-        dict(output_angle_deg=lambda x: np.mod(x, 360.0)),
-        r"output_angle_deg: jumps by -?3\d\d\.?\d* deg from the sample before, like an angle that wraps",
-    ),
 }  # fmt: skip
 
 

@@ -83,10 +83,10 @@ from calibration.inference.fit_notes import Notes, Remark, progress_remark, rema
 from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
-from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.observers.windows import problem_of_readings, problem_of_windows
+from calibration.inference.observers.linear_rows import problem_of_readings
+from calibration.inference.observers.windows import Windows, problem_of_windows
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -105,8 +105,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage above which a value is not noise about rest [-].
 EITHER_WAY = 0.05
-#: Size of a delay in its sds from which a note reports it, and as a share of the longest that is searched.
-LATE, ENDS = 4.0, 0.95
+#: Size of a delay in its sds from which a note reports it, and as a share of the longest in the equations.
+LATE, ENDS = 4.0, 0.9
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
@@ -119,6 +119,8 @@ LIKELY = 4.0
 FAR = 3.0
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
 LONG = 4000
+#: Difference of a delay from whole rows up to which a simulation begins at these [rows].
+NEAREST = 0.25
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
 #: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
@@ -236,6 +238,7 @@ class LoopInput:
         progress: callback for progress messages.
         keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
         known: results for the same table with other sds.
+        begin: fit of the base of a long log to its windows.
         others: open while later programs are compiled on other cores, see `later`. None if there is nothing to
             compile.
     """
@@ -255,6 +258,7 @@ class LoopInput:
     others: contextlib.ExitStack | None = None
     equations: CandidateSpace | None = None
     confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
+    begin: Candidate | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -268,14 +272,17 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
-        if (of_log := self.trace_known_readings() or self.trace_windows()) is not None:
-            return of_log
+        if (of_readings := self.trace_known_readings()) is not None:
+            return of_readings
+        by_windows, begin = self.trace_windows()
+        if by_windows is not None:
+            return by_windows
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
-            base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
+            base_input = dataclasses.replace(self, others=others if ahead else None, later=[], begin=begin)
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
             if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
-                return _trace_readings(self, screened, sds, bool(ranked))
+                return _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
@@ -299,26 +306,34 @@ class LoopInput:
         refuted = run.contradicts and traced.verdict != "none"
         return dataclasses.replace(traced, verdict="place") if refuted else traced
 
-    def trace_windows(self) -> LoopStages | None:
-        """Stages of the windows of a log with a long run. None without a finding, which a simulation may still
-        make.
+    def trace_windows(self) -> tuple[LoopStages | None, Candidate | None]:
+        """Stages of the windows of a log with a long run, and their fit of its base.
+
+        No stages if the windows find nothing, which readings may still do. Neither if they do not show the states.
         """
-        if self.equations is not None or (self.known is not None and self.known.run is None):
-            return None
-        if self.shows_unmodelled_backlash or (equations := equations_of_log(self)) is None:
-            return None
+        other = self.known is not None and not isinstance(self.known.screened.base.space.bare.observe, Windows)
+        if self.equations is not None or other or (equations := equations_of_log(self)) is None:
+            return None, None
 
         def keep(name: str, make: Callable[[], Any]) -> Any:
             """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
             return self.keep(name if name == "ranking" else f"windows {name}", make)
 
         equations = dataclasses.replace(equations, keep=keep)
-        return _confirm_by_simulation(self, equations, equations.trace())
+        traced = equations.trace()
+        slides = self.robot.has_ground and self.robot.rig.imposed == "voltage"  # which equations do not show
+        begin = None if slides else _delayed_by_rows(self, traced.screened.base.candidate)
+        return _confirm_by_simulation(self, equations, traced), begin
 
     @functools.cached_property
+    def space(self) -> CandidateSpace:
+        """Candidate space of the runs."""
+        return build_candidate_space(self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library)
+
+    @property
     def shows_unmodelled_backlash(self) -> bool:
         """True if the log shows backlash but the robot has none."""
-        return bool(lost_motion_notes(self.runs, self.robot))
+        return bool(remarks_with_codes(self.at_first, "lost_motion"))
 
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
@@ -326,18 +341,22 @@ class LoopInput:
         For logs, the equations in weak form give the start of the fit. Their ranking of the library is appended to
         `ranked`, unless effects would only stand in for a backlash.
         """
-        space = self.equations or _space_of(self, noise)
+        same = noise is self.noise
+        space = self.equations or (self if same else dataclasses.replace(self, noise=noise)).space
         at = functools.partial(bases_at_fit, self.runs)
         near = None if before is None else before.candidate
         if before is None:
-            if (ranking := screen_by_weak_form(space, self.settings)) is not None:
+            if self.begin is not None:  # as near as a simulated fit, and its effects are ranked
+                near = dataclasses.replace(self.begin, simulated=True)
+            elif (ranking := screen_by_weak_form(space, self.settings)) is not None:
                 make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 if not self.shows_unmodelled_backlash:
                     ranked.append(self.keep("ranking", make))
                 near = None if ranking.slides else ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
-        self.progress(progress_remark("base"))
+        if self.equations is None or not space.bare.observe.reads:  # linear readings have a fit
+            self.progress(progress_remark("base"))
         return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
@@ -701,33 +720,36 @@ def choose_effects(
     )
 
 
-def _space_of(given: LoopInput, noise: Noise) -> CandidateSpace:
-    return build_candidate_space(given.runs, given.robot, noise.sd, given.settings, given.stated, given.library)
-
-
 def equations_of_log(given: LoopInput) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states, or if its
     longest run has fewer than `LONG` steps.
+
+    Windows use every row of a log, and only simulations use fewer.
     """
-    space = _space_of(given, given.noise)
+    space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < LONG:
         return None
-    fit = fit_weak_form(space.bare, space.library.scored)
-    if fit is None or not fit.plan.mechanical:
+    bare = space.bare
+    if given.runs.log is not None:
+        sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
+        bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
+        observe = bare.observe
+    fit = fit_weak_form(bare, space.library.scored)
+    if fit is None:
         return None
 
     def columns(rows: np.ndarray) -> dict[str, np.ndarray]:
-        table = {name: x[rows] for name, x in given.runs.columns.items() if x.dtype.kind == "f"}
+        table = {name: x[rows] for name, x in runs.columns.items() if x.dtype.kind == "f"}
         return {**table, "configuration": np.asarray(observe.of_rows.configuration)[rows]}
 
     settings = given.settings
-    posed, rows = problem_of_windows(space.bare, fit, space.library.scored, columns, settings.width)
+    posed, rows = problem_of_windows(bare, fit, space.library.scored, columns, settings.width)
     table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
-    noise = dataclasses.replace(given.noise, sd=given.noise.sd[rows])
+    noise = dataclasses.replace(given.noise, sd=sd[rows])
     shares = settings_for(type(posed.observe), settings.replicates).shares
     return dataclasses.replace(
-        given, runs=given.runs.where(rows), numbers=given.numbers[rows], noise=noise, equations=table, known=None,
+        given, runs=runs.where(rows), numbers=numbers[rows], noise=noise, equations=table, known=None,
         settings=dataclasses.replace(settings, shares=shares),
     )  # fmt: skip
 
@@ -823,6 +845,23 @@ def _chosen_fit(traced: LoopStages) -> Candidate:
     return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
 
 
+def _delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
+    """The fit of a log's windows with a delay of whole rows, if that is near.
+
+    A held quantity jumps at its rows. So a fast current jumps too as a function of the delay, and steps from one side
+    do not lead to the other.
+    """
+    coordinates, steps = given.space.coordinates.base, np.diff(given.runs.whole["time_s"])
+    if priors.DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
+        return fit
+    k, step = coordinates.names.index(priors.DELAY), float(np.median(steps[steps > 0]))
+    delay = float(coordinates.value(fit.z[: given.space.free])[k])
+    off = round(delay / step) * step - delay
+    if abs(off) > NEAREST * step:
+        return fit
+    return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
+
+
 def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
     """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
     run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
@@ -856,11 +895,12 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
             return undescribed(given.known.missed)
         refuted = given.known.run is not None and given.known.run.contradicts
         return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
-    if searched is None or beside is None or given.shows_unmodelled_backlash:
+    if searched is None or beside is None:
         return None
     given.progress(progress_remark("confirm"))
-    base, best = screened.base.candidate, _chosen_fit(traced)
-    run = simulate_models(_space_of(given, given.noise), base, best, given.settings)
+    chosen, base = _chosen_fit(traced), _delayed_by_rows(given, screened.base.candidate)
+    best = base if chosen is screened.base.candidate else _delayed_by_rows(given, chosen)
+    run = simulate_models(given.space, base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:
@@ -1334,7 +1374,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
 
 
 def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remark]:
-    """Remark on a delay that the robot's file does not state, or that is the longest of the search."""
+    """Remark on a delay that the robot's file does not state, or that is as long as the search of the equations."""
     limit = TENTH * float(np.median([runs["time_s"][rows].max() for rows in runs.rows_by_run().values()]))
     ends = abs(delay.after) > ENDS * limit
     if abs(delay.after) <= LATE * delay.sd_after or (stated and not ends):

@@ -64,9 +64,10 @@ class SeriesNoise:
 
     def sd(self, sizes: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """Standard deviation of readings of these sizes [SI]. At least that of rounding, and at least `FLOOR` of the
-        reading.
+        reading, unless that is an angle, which may grow without limit.
         """
-        return np.maximum(np.hypot(self.floor, self.share * sizes), np.maximum(self.least, FLOOR * sizes))
+        least = np.maximum(self.least, FLOOR * self.channel.settled * sizes)
+        return np.maximum(np.hypot(self.floor, self.share * sizes), least)
 
 
 def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:

@@ -39,6 +39,8 @@ JUMP, KINK, GAP = 0.05, 0.3, 3.0
 REST_SD, REST = 5.0, 0.01
 #: Noise of the slope of an angle, as a share of its usual size; most rows whose slope it is.
 STEEP, STEEPEST = 0.02, 201
+#: Change of a delay from which its effect is extrapolated, at most [rows].
+REACH = 2.0
 #: Width added to both ends of an interval, so that a single row has one [rows].
 EDGE = 1e-4
 #: Fields of `Conditions` with a mean over an interval; others are those at its middle.
@@ -207,10 +209,14 @@ class ImposedCourse:
         and the derivative of the mean with respect to the delay.
         """
         low, high = (edge - delay for edge in self.cell.T)
+        inner = 1e-3 * (high - low)  # an interval may end at a jump
         mean, drift = {}, {}
         for name, x in self.integrals.items():
             mean[name] = (np.interp(high, self.time, x) - np.interp(low, self.time, x)) / (high - low)
-            ends = [self.values[name][np.searchsorted(self.time, t, side="right") - 1] for t in (low, high)]
+            ends = [
+                self.values[name][np.searchsorted(self.time, t, side="right") - 1]
+                for t in (low + inner, high - inner)
+            ]
             drift[name] = (ends[0] - ends[1]) / (high - low)
         return mean, drift
 
@@ -476,7 +482,7 @@ def points_and_windows(
     turned_angle = np.cumsum(np.where(time_steps > 0, 0.5 * (speed + np.roll(speed, 1)) * time_steps, 0.0))
     zeros = np.zeros(len(run))
     arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], time_steps, time, joined["row"]
-    late = zeros + delay, zeros + log.step, drift
+    late = zeros + delay, zeros + REACH * log.step, drift
     windows = [
         _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))
         for r in range(len(parts))

@@ -39,6 +39,7 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
 from calibration.inference.shown_states import (
     APART,
+    REACH,
     LogPoints,
     RunWindows,
     StatePlan,
@@ -118,6 +119,7 @@ class _MeasuredStates(eqx.Module):
 
     Attributes:
         turning: motor speed [rad/s] and current [A].
+        lead: the part of the current by which it is later than its reading, see `_current_lead` [A].
         unit: reading of the motion channel per motor speed.
         per_ampere: reading of the current channel per ampere.
         errors: errors of the instruments, by channel.
@@ -125,9 +127,24 @@ class _MeasuredStates(eqx.Module):
 
     turning: Scalar
     current: Scalar
+    lead: Scalar
     unit: Scalar
     per_ampere: Scalar
     errors: dict[int, Scalar]
+
+
+def _current_lead(robot: Robot, row: LogPoints) -> Scalar:
+    """Mean current around a point, less the mean of its readings [A].
+
+    A held voltage changes at a row, whose reading shows the current before. So the reading of a fast winding shows
+    the mean voltage since the row before. That of a slow winding is the mean current around its row.
+    """
+    if "voltage" not in row.drift or robot.rig.between_rows == "linear":
+        return jnp.zeros(())
+    step, ratio = row.reach / REACH, robot.motor.inductance / robot.motor.resistance
+    rise = jnp.maximum(ratio / step, 1e-6)
+    share = 0.5 - rise - 1 / jnp.expm1(-1 / rise) - 1
+    return -share * step * row.drift["voltage"] / robot.motor.resistance
 
 
 def _measured_states(plan: StatePlan, robot: Robot, row: LogPoints, shown: Array) -> _MeasuredStates:
@@ -143,11 +160,13 @@ def _measured_states(plan: StatePlan, robot: Robot, row: LogPoints, shown: Array
     turning: Scalar = none
     unit: Scalar = one
     per_ampere: Scalar = one
+    lead: Scalar = none
     if conditions.motor_current is not None:
         current = jnp.asarray(conditions.motor_current)
     if plan.current >= 0:
         per_ampere = per_unit(plan.current, State(one, none, none, none, distance=none))
-        current = shown[plan.current] / per_ampere
+        lead = _current_lead(robot, row)
+        current = shown[plan.current] / per_ampere + lead
     if plan.imposed == "motor_speed":
         turning = jnp.asarray(conditions.motor_speed)
     else:
@@ -166,7 +185,7 @@ def _measured_states(plan: StatePlan, robot: Robot, row: LogPoints, shown: Array
         current = current - errors[plan.current] / per_ampere
     if plan.motion >= 0 and not plan.angle:
         turning = turning - errors[plan.motion] / unit
-    return _MeasuredStates(turning, current, unit, per_ampere, errors)
+    return _MeasuredStates(turning, current, lead, unit, per_ampere, errors)
 
 
 def _rolling_signals(
@@ -180,10 +199,8 @@ def _rolling_signals(
     rolls, distance = radius * turning / robot.gearbox.ratio, radius * row.angle
     state = State(current, turning, rolls, jnp.zeros(()), row.memory, distance=distance)
     if plan.imposed == "voltage" and plan.current < 0:
-        current = _solve_current(robot, row.conditions, state, row.way)
-    return balances.rolling_signals(
-        robot, row.conditions, dataclasses.replace(state, current=current), row.way
-    ), current
+        current = _solve_current(robot, conditions, state, row.way)
+    return balances.rolling_signals(robot, conditions, dataclasses.replace(state, current=current), row.way), current
 
 
 def _total_inertia(robot: Robot, chassis: Any, signals: Signals) -> Scalar:
@@ -274,7 +291,7 @@ def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Ar
     states = jax.lax.scan(step, (read[0, :count], jnp.asarray(True)), (rows, read))[1]
     readings, rate = rows.shown, rows.rate
     if plan.electrical:
-        readings = readings.at[:, plan.current].set(states[:, 1] * units.per_ampere)
+        readings = readings.at[:, plan.current].set((states[:, 1] - units.lead) * units.per_ampere)
     if plan.angle:
         rate = states[:, 0] * units.unit
     else:

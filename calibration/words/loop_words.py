@@ -786,13 +786,13 @@ def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
 
 
 def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
-    """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is the longest of the search."""
-    when = "later" if delay > 0 else "earlier"
-    acts = f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, "
-    if ends:
-        return f"{acts}the longest delay that is searched. Check the clocks of the columns"
-    line = f'"{delay:.3g} ± {sd:.2g}"'
-    return f"{acts}and the rig file gives no delay. To start the fit from this delay, set [rig] delay = {line}"
+    """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is a tenth of a run or more."""
+    why = "the equations are searched up to a tenth of a run. Check the clocks of the columns"
+    return (
+        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {'later' if delay > 0 else 'earlier'} "
+        f"than its column states, and {why if ends else 'the rig file gives no delay'}. To start the fit from this "
+        f'delay, set [rig] delay = "{delay:.3g} ± {sd:.2g}"'
+    )
 
 
 #: Reason why a log does not show the states of its equations → sentence part, and what to log.

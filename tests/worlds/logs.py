@@ -1,14 +1,16 @@
 """Logs over time of random rigs with undeclared effects: one drive and a load on a shaft, from plain NumPy physics.
 
 The voltage, the current or the speed of the motor is imposed. A speed is smooth: a cubic spline of its rows. Four runs
-of 200 rows. Shares nothing with mmrjax. Many
-perturbed rigs go through the classical Runge-Kutta method at once, with steps of the winding's time constant.
+of 200 rows, or one or two of 4000 to 25 000. Shares nothing with mmrjax. Many
+perturbed rigs go through the classical Runge-Kutta method at once, with steps of the winding's time constant. Windings
+of long logs have none.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +31,12 @@ GOAL = "goal_angle"
 LIMIT = 0.9
 RUNS, ROWS = 4, 200
 EVERY = (0.005, 0.01, 0.02)  # [s]
+#: Sampling steps of long logs [s], duration of a run [s], fewest rows of a run and most of a log, longest step of its
+#: integration [s], time constant that its file states for the winding [s], and sd of its angle [deg].
+LONG_EVERY, LASTS, FEWEST, MOST = (0.001, 0.002, 0.005), (20.0, 60.0), 4100, 25_000
+COARSEST, NONE, ANGLE = 2.5e-3, 1e-6, (0.02, 0.1)
+#: Time after which the state of a long log counts as unknown [s]: what drives it further is never known exactly.
+FORGETS = 2.0
 #: Time constant of a winding [s], and of a servo's, which its file states. Steps are half as long: the method is stable
 #: to 2.7 of them.
 WINDING, SERVO_WINDING = 2e-4, 1e-3
@@ -56,6 +64,7 @@ ENCODER, COARSE = 360 / 1024, 2.5
 
 #: Amplitudes that are simulated to find the one that leaves a wanted strength [ordinary sizes].
 LADDER = np.geomspace(0.003, 3.0, 13)
+LONG_LADDER = np.geomspace(1e-4, 3.0, 8)
 #: Change of a torque [of the rig's] at which the rounds that find the torque at the output end.
 SETTLED = 1e-10
 LAWS = laws.LOGS | laws.OUTSIDE_LOGS
@@ -80,6 +89,7 @@ class Rig:
         sd: of each channel [unit of the column].
         load_torque: of a brake at each row, held until the next [N·m], shape (runs, rows). None: none.
         alone: True if the output's angle is the only reading (with a voltage or a current imposed).
+        long: True for a log of thousands of rows a run, whose winding has no time constant.
         steps: of the readings of coarse instruments [unit of the column]. `sd` then includes their rounding.
     """
 
@@ -97,6 +107,7 @@ class Rig:
     sd: dict[str, float]
     load_torque: np.ndarray | None = None
     alone: bool = False
+    long: bool = False
     steps: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
@@ -119,7 +130,17 @@ class Rig:
     @property
     def winding(self) -> float:
         """Time constant of the winding [s]."""
-        return SERVO_WINDING if self.imposed == GOAL else WINDING
+        return NONE if self.long else SERVO_WINDING if self.imposed == GOAL else WINDING
+
+    @property
+    def per(self) -> int:
+        """Steps between two rows."""
+        return int(np.ceil(self.every / COARSEST)) if self.long else round(2 * self.every / self.winding)
+
+    @property
+    def pace(self) -> float:
+        """Factor on the time of laws, whose scale is a short run's."""
+        return 4 / (self.inputs.shape[1] * self.every) if self.long else 1.0
 
     @property
     def scale(self) -> SimpleNamespace:
@@ -127,7 +148,13 @@ class Rig:
 
 
 def rig(
-    rng: np.random.Generator, imposed: str, every: float | None = None, *, alone: bool = False, coarse: bool = False
+    rng: np.random.Generator,
+    imposed: str,
+    every: float | None = None,
+    *,
+    alone: bool = False,
+    coarse: bool = False,
+    long: bool = False,
 ) -> Rig:
     """A random rig. Its readings' noise is set by what they show without effects.
 
@@ -135,6 +162,7 @@ def rig(
         every: sampling step [s]. None: a random one.
         alone: as of `Rig`, unless a speed is imposed.
         coarse: True for instruments with steps.
+        long: as of `Rig`.
     """
     supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
     stall, ratio = between(rng, 3, 30), float(np.round(between(rng, 15, 60)))
@@ -158,15 +186,25 @@ def rig(
     stated["efficiency"] = min(stated["efficiency"], 0.97)
     drawn = float(rng.choice(EVERY))
     every = drawn if every is None else every
-    inputs = np.stack([_inputs(rng, imposed, every, supply, rated, fast) for _ in range(RUNS)])
+    size = {"voltage": supply, GOAL: 1.5, "motor_speed": fast}.get(imposed, 1.2 * rated)
+    if long:
+        runs = int(rng.choice([1, 1, 2]))
+        rows = int(np.clip(rng.uniform(*LASTS) / every, FEWEST, MOST / runs))
+        inputs = np.stack([_profile(rng, imposed == "motor_speed", every, rows) for _ in range(runs)])
+        inputs = np.round(size * inputs, 4)
+    else:
+        inputs = np.stack([_inputs(rng, imposed, every, size) for _ in range(RUNS)])
     late = float(rng.choice([0.0, rng.uniform(0.0, 2.0)]))
-    step = (SERVO_WINDING if imposed == GOAL else WINDING) / 2  # readings are those of a step
+    made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, 0.0, {}, long=long)
+    step = every / made.per  # readings are those of a step
     # The current of an imposed speed jumps where its friction turns: late by whole rows it is not read in between.
     delay = every * round(late) if imposed == "motor_speed" else step * round(late * every / step)
-    made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, delay, {})
-    made = dataclasses.replace(made, alone=alone and imposed != "motor_speed")
+    made = dataclasses.replace(made, delay=delay, alone=alone and imposed != "motor_speed")
     shown = histories(made, [p])[0]
     sd = {n: typed(CHANNELS[n][2] * np.sqrt(np.mean(shown[n] ** 2)), 2) for n in made.channels}
+    if long:
+        worse = between(rng, 1, 3)
+        sd = {n: typed(between(rng, *ANGLE) if n == "output_angle" else worse * x, 2) for n, x in sd.items()}
     if not coarse:
         return dataclasses.replace(made, sd=sd)
     encoder = ENCODER / 4 if imposed == GOAL else ENCODER
@@ -175,15 +213,39 @@ def rig(
     return dataclasses.replace(made, sd=sd, steps=steps)
 
 
-def _inputs(rng, imposed, every, supply, rated, fast) -> np.ndarray:
+def _profile(rng, smooth: bool, every: float, rows: int) -> np.ndarray:
+    """What is imposed at each row of a long run, as a share of the largest: rests, steps, ramps, reversals, sweeps.
+
+    Args:
+        smooth: True without jumps.
+    """
+    parts, last = [np.zeros(round(0.5 / every))], 0.0
+    while sum(map(len, parts)) < rows:
+        count = round(rng.uniform(0.5, 4.0) / every)
+        share, level = np.arange(1, count + 1) / count, rng.uniform(0.35, 1.0) * rng.choice([-1, 1])
+        kind = rng.choice(["rest", "step", "ramp", "reversal", "sweep"], p=[0.1, 0.25, 0.25, 0.15, 0.25])
+        waves = rng.uniform(0.3, 0.8) * share + rng.uniform(0.0, 1.5) * share**2
+        part = {
+            "rest": 0 * share, "step": level + 0 * share, "ramp": last + (level - last) * share,
+            "reversal": -last + 0 * share, "sweep": level * np.sin(2 * np.pi * count * every * waves),
+        }[kind]  # fmt: skip
+        parts.append(part)
+        last = float(part[-1])
+    course = np.concatenate(parts)[:rows]
+    if smooth:
+        kernel = np.hanning(round(0.4 / every))
+        course = np.convolve(np.r_[np.zeros(len(kernel) - 1), course], kernel / kernel.sum(), "valid")
+    return course / np.abs(course).max()
+
+
+def _inputs(rng, imposed, every, size) -> np.ndarray:
     """What is imposed at each row of a run: stairs both ways, of a speed sums of waves from rest."""
     t = np.arange(ROWS) * every
     if imposed == "motor_speed":
         waves = sum(
             rng.uniform(0.2, 1.0) * np.sin(k * 2 * np.pi * t / t[-1] * rng.uniform(0.8, 1.2)) for k in (1, 2, 4)
         )
-        return np.round(rng.uniform(0.5, 0.9) * fast * waves / np.abs(waves).max(), 4)
-    size = {"voltage": supply, GOAL: 1.5}.get(imposed, 1.2 * rated)
+        return np.round(rng.uniform(0.5, 0.9) * size * waves / np.abs(waves).max(), 4)
     levels = rng.uniform(0.35, 1.0, 8) * np.where(rng.random(8) < 0.5, -1, 1) * size
     at = np.sort(rng.choice(np.arange(10, ROWS - 5), 7, replace=False))
     return np.round(levels[np.searchsorted(at, np.arange(ROWS), side="right")], 4)
@@ -196,16 +258,17 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
         members: constants of each.
         terms: of each.
     """
-    count, per = len(members), round(2 * r.every / r.winding)
-    p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
+    count, per, (runs, length) = len(members), r.per, r.inputs.shape
+    p = {n: np.repeat([m[n] for m in members], runs) for n in r.p}
     inputs = np.tile(r.inputs, (count, 1))
-    every = _side_by_side(terms or ())
+    every = _side_by_side(terms or (), runs)
+    quasi_static, electric = r.long and r.imposed != "motor_speed", any(t.law.balance == "electrical" for t in every)
     J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
 
     braked = np.zeros_like(inputs) if r.load_torque is None else np.tile(r.load_torque, (count, 1))
 
     def signals(time, y, given, slope, brake, way=None):
-        s = SimpleNamespace(time=time, C=C, fast=r.w_k, I=y[0], w=y[1], turn=y[2], b=y[3])
+        s = SimpleNamespace(time=time * r.pace, C=C, fast=r.w_k, I=y[0], w=y[1], turn=y[2], b=y[3])
         if r.imposed == "motor_speed":
             s.w = given
         s.w_k = s.w / i
@@ -214,6 +277,12 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
         def extra(balance):
             return laws.total(every, balance, s)
 
+        if quasi_static and r.imposed == "voltage":
+            s.I = (given - C * s.w) / R
+            for _ in range(5 * electric):
+                s.I = (given - C * s.w - extra("electrical")) / R
+        elif quasi_static:
+            s.I = given
         load = p["dry"] * s.d + p["damping"] * s.w_k + brake + extra("track")
         s.B = load
         idle = p["friction"] * s.d + p["viscous"] * s.w
@@ -241,7 +310,9 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
                 if not (np.abs(change) > SETTLED * r.torque).any():  # NaN: no such run
                     break
                 earlier, last = before, change
-        if r.imposed == GOAL:
+        if quasi_static:
+            s.dI = 0.0 * s.I
+        elif r.imposed == GOAL:
             duty = np.clip(p["kp"] * (given - s.turn) - p["kd"] * s.w_k, -LIMIT, LIMIT)
             s.dI = (duty * r.supply - C * s.w - R * s.I - extra("electrical")) / (r.winding * R)
         elif r.imposed == "voltage":
@@ -252,39 +323,52 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
 
     def rates(time, y, given, slope, brake, way=None):
         s = signals(time, y, given, slope, brake, way)
-        b = (s.w_k - s.w_k * s.d * s.b) / YIELDS
-        if r.imposed == "motor_speed":
-            return np.stack([0 * s.w, 0 * s.w, s.w_k, b])
+        b = (s.w_k - s.w_k * s.d * s.b) / YIELDS * (not r.long)  # `yielded` takes longer steps
         return np.stack([s.dI, i * s.rate * (way != 0), s.w_k, b])
 
-    way = np.zeros(count * RUNS)  # in which dry friction acts as of motion; 0 where it holds the shaft
-    y = np.zeros((4, count * RUNS))
-    lines = r.imposed == "motor_speed"
-    curve = CubicSpline(np.arange(ROWS), inputs, axis=1)  # an imposed speed, at half steps, and its slope
-    smooth = [curve(np.arange(2 * per * (ROWS - 1) + 1) / (2 * per), n).T / r.every**n for n in (0, 1) if lines]
+    def yielded(before, y):
+        """Sets the contacts after a turn one way."""
+        turn = y[2] - before[2]
+        way = np.sign(turn)
+        y[3] = way + (before[3] - way) * np.exp(-np.abs(turn) / YIELDS)
+
+    way = np.zeros(count * runs)  # in which dry friction acts as of motion; 0 where it holds the shaft
+    y = np.zeros((4, count * runs))
     h, late = r.every / per, round(r.delay / (r.every / per))
-    wanted = {max(row * per - late, 0) for row in range(ROWS)}
+    order = {"total_current": 0, "motor_speed": 1, "output_angle": 2}
+    if r.imposed == "motor_speed":  # no state but the contacts'
+        curve, fine = CubicSpline(np.arange(length), inputs, axis=1), np.arange(per * (length - 1) + 1) / per
+        states = [y, *(np.zeros_like(y) for _ in fine[1:])]
+        for state, turn in zip(states, curve.antiderivative()(fine).T * r.every / i, strict=True):
+            state[2] = turn
+        for before, state in itertools.pairwise(states):
+            yielded(before, state)
+        every_row = np.stack(states[::per], 1)
+        now, slope = (curve(np.arange(length), n).T / r.every**n for n in (0, 1))
+        s = signals(np.arange(length)[:, None] * r.every, every_row, now, slope, braked.T)
+        read = np.maximum(np.arange(length) - late // per, 0)
+        return [{"total_current": x.T} for x in np.moveaxis(s.I[read].reshape(length, count, runs), 1, 0)]
+    wanted = {max(row * per - late, 0) for row in range(length)}
     kept: dict[int, list[np.ndarray]] = {}
-    for row in range(ROWS):
+    for row in range(length):
         now = inputs[:, row]
         for n in range(per):
             t = (row + n / per) * r.every
 
-            def at(x: float, y: np.ndarray, what: Any = rates) -> Any:
-                half = min(2 * (row * per + n) + round(2 * x), len(smooth[0]) - 1) if lines else 0  # noqa: B023
-                given, slope = (smooth[0][half], smooth[1][half]) if lines else (now, 0.0)  # noqa: B023
-                return what(t + x * h, y, given, slope, braked[:, row])  # noqa: B023
+            def at(way: Any, x: float, y: np.ndarray) -> Any:
+                return rates(t + x * h, y, now, 0.0, braked[:, row], way)  # noqa: B023
 
             if row * per + n in wanted:
-                s = at(0.0, y, signals) if lines else SimpleNamespace(I=y[0], w=y[1])
+                s = SimpleNamespace(I=y[0], w=y[1])
+                if quasi_static and r.imposed == "voltage":  # the current before a jump at this row
+                    s.I = signals(t, y, now if n else inputs[:, max(row - 1, 0)], 0.0, 0.0, way).I
                 kept[row * per + n] = [s.I, s.w, y[2]]
-            if lines:
-                y = runge_kutta(at, y, h)
-                continue
-            y, way = _step(lambda way, x, y: at(x, y, functools.partial(rates, way=way)), y, way, h)
-    rows = np.array([kept[max(row * per - late, 0)] for row in range(ROWS)])  # (rows, 3, columns)
-    shown = np.moveaxis(rows, 0, -1).reshape(3, count, RUNS, ROWS)
-    order = {"total_current": 0, "motor_speed": 1, "output_angle": 2}
+            before = y
+            y, way = _step(at, y, way, h)
+            if r.long:
+                yielded(before, y)
+    rows = np.array([kept[max(row * per - late, 0)] for row in range(length)])  # (rows, 3, columns)
+    shown = np.moveaxis(rows, 0, -1).reshape(3, count, runs, length)
     return [{n: shown[order[n], k] / CHANNELS[n][1] for n in r.channels} for k in range(count)]
 
 
@@ -320,15 +404,15 @@ def _step(rates: Any, y: np.ndarray, way: np.ndarray, h: float) -> tuple[np.ndar
     return new, way
 
 
-def _side_by_side(terms: Sequence[Sequence[Term]]) -> list[Term]:
+def _side_by_side(terms: Sequence[Sequence[Term]], runs: int) -> list[Term]:
     """Terms of each member as few that all have: one of a law, its amplitude and shapes as arrays over columns."""
     laws_of = {t.name: t.law for own in terms for t in own}
     every = []
     for name, law in laws_of.items():
         own = [next((t for t in x if t.name == name), None) for x in terms]
         some = next(t for t in own if t is not None)
-        amplitude = np.repeat([0.0 if t is None else t.amplitude for t in own], RUNS)
-        shapes = {k: np.repeat([(t or some).shapes[k] for t in own], RUNS) for k in law.shapes}
+        amplitude = np.repeat([0.0 if t is None else t.amplitude for t in own], runs)
+        shapes = {k: np.repeat([(t or some).shapes[k] for t in own], runs) for k in law.shapes}
         every.append(Term(name, amplitude, shapes, law))
     return every
 
@@ -336,6 +420,31 @@ def _side_by_side(terms: Sequence[Sequence[Term]]) -> list[Term]:
 def whitened(r: Rig, shown: Mapping[str, np.ndarray]) -> np.ndarray:
     """Readings over their sds, shape (runs, readings)."""
     return np.concatenate([shown[n] / r.sd[n] for n in r.channels], -1)
+
+
+def forgotten(r: Rig, change: np.ndarray) -> np.ndarray:
+    """Change of a long log's whitened readings, beside the states that begin each `FORGETS` seconds.
+
+    A different speed fades with the time constant of the motion. A different angle stays.
+    """
+    p, i, length = r.p, r.ratio, r.inputs.shape[1]
+    torque = p["viscous"] + (p["torque_constant"] ** 2 / p["resistance"] if r.imposed == "voltage" else 0.0)
+    eta = p["efficiency"]
+    fades = (p["damping"] + i**2 * eta * torque) / (p["inertia"] + i**2 * eta * p["rotor"])
+    by_channel = change.reshape(len(change), len(r.channels), length)
+    if r.imposed == "motor_speed":
+        return by_channel.ravel()
+    left = []
+    for begin in range(0, length, round(FORGETS / r.every)):
+        part = by_channel[:, :, begin : begin + round(FORGETS / r.every)]
+        t = np.arange(part.shape[2]) * r.every
+        fading = {"motor_speed": np.exp(-fades * t), "output_angle": -np.expm1(-fades * t) / (fades * i)}
+        fading["total_current"] = -p["torque_constant"] / p["resistance"] * fading["motor_speed"]
+        angle = {"output_angle": 1 + 0 * t}
+        states = [[x.get(n, 0 * t) / CHANNELS[n][1] / r.sd[n] for n in r.channels] for x in (fading, angle)]
+        columns = np.stack([1e3 * np.ravel(x) for x in states if np.any(x)], 1)
+        left.append(np.stack([remainder(x.ravel(), columns) for x in part]).ravel())
+    return np.concatenate(left)
 
 
 def moved(p: Mapping[str, float], name: str, z: float) -> dict[str, float]:
@@ -366,7 +475,9 @@ def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence
 def rivals(r: Rig) -> list[Term]:
     """Library effects that a log of a rig may have, each with the shapes of its grid."""
     able = {n: law.at(r.scale) for n, law in LAWS.items() if law.cls and law.needs(r.imposed)}
-    return [Term(n, 0.02 * law.size, shapes, law) for n, law in able.items() for shapes in law.grid(9)]
+    return [
+        Term(n, 0.02 * law.size, shapes, law) for n, law in able.items() for shapes in law.grid(3 if r.long else 9)
+    ]
 
 
 def oracle(term: Term, left: np.ndarray, tried: Sequence[Term], units: Sequence[np.ndarray]) -> dict[str, Any]:
@@ -395,23 +506,26 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
     terms: tuple[Term, ...] = ()
     effects = []
     if name:
-        term, tried = shaped(name, rng, LAWS[name].at(r.scale)), rivals(r)
-        rungs = [dataclasses.replace(term, amplitude=x * term.law.size) for x in LADDER]
+        term, tried = shaped(name, rng, LAWS[name].at(r.scale)), [] if r.long else rivals(r)
+        ladder = LONG_LADDER if r.long else LADDER
+        rungs = [dataclasses.replace(term, amplitude=x * term.law.size) for x in ladder]
         y, base, changes = slopes(r, r.p, (), [[t] for t in (*rungs, *tried)])
-        columns = np.stack([b.ravel() for b in base], 1)
+        forget = functools.partial(forgotten, r) if r.long else np.ravel
+        columns = np.stack([forget(b) for b in base], 1)
 
         def left_of(change: np.ndarray) -> np.ndarray:
-            return remainder(np.nan_to_num(change, nan=1e3).ravel(), columns)
+            return remainder(forget(np.nan_to_num(change, nan=1e3)), columns)
 
         left = [left_of(x) for x in changes]
         sizes = np.maximum.accumulate([np.linalg.norm(x) for x in left[: len(rungs)]])
-        share = np.exp(np.interp(np.log(sigmas), np.log(sizes), np.log(LADDER)))
+        share = np.exp(np.interp(np.log(sigmas), np.log(sizes), np.log(ladder)))
         terms = (dataclasses.replace(term, amplitude=float(share) * term.law.size),)
     shown = histories(r, [r.p], [terms])[0]
     if name:
         change = whitened(r, shown) - y
         apart = oracle(terms[0], left_of(change), tried, left[len(rungs) :])
-        effects.append(terms[0].label | {"sigmas": left_over(r, y + change)} | apart)
+        sigmas = float(np.linalg.norm(left_of(change))) if r.long else left_over(r, y + change)
+        effects.append(terms[0].label | {"sigmas": sigmas} | apart)
     measured = {n: _read(r, n, x, rng) for n, x in shown.items()}
     column = {
         "voltage": "supply_voltage_V",
@@ -419,10 +533,11 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
         "motor_speed": "motor_speed_rpm",
         GOAL: "goal_angle_deg",
     }
-    t = np.round(np.arange(ROWS) * r.every, 6)
+    runs, length = r.inputs.shape
+    t = np.round(np.arange(length) * r.every, 6)
     table: dict[str, np.ndarray] = {
-        "run_id": np.repeat([f"run{k}" for k in range(RUNS)], ROWS),
-        "time_s": np.tile(t, RUNS),
+        "run_id": np.repeat([f"run{k}" for k in range(runs)], length),
+        "time_s": np.tile(t, runs),
         column[r.imposed]: (r.inputs / {"motor_speed": RPM, GOAL: np.pi / 180}.get(r.imposed, 1.0)).ravel(),
     }
     if r.load_torque is not None:
@@ -431,7 +546,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
         head, _, unit = CHANNELS[n][0].rpartition("_")
         table[CHANNELS[n][0]] = np.array([typed(x, 9) for x in measured[n].ravel()])
         if stated:
-            table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.noise(n))
+            table[f"{head}_sd_{unit}"] = np.full(runs * length, r.noise(n))
     label = {
         "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
         "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p, "alone": r.alone,
@@ -559,6 +674,7 @@ def toml(r: Rig) -> str:
     }  # fmt: skip
     if r.imposed == GOAL:
         tables["controller"] = {"limit": LIMIT, "supply_voltage": r.supply}
+    if r.imposed == GOAL or (r.long and r.imposed == "voltage"):
         tables["motor"] = {"inductance": f"{r.winding * r.p['resistance']!r} ± 0"}
     for name in r.names:
         table, _, key = PUBLIC[name].partition(".")

@@ -1,0 +1,200 @@
+"""Rows linear about one fit: readings of a log near the simulated fit of its base, or windows of its equations.
+
+All stages of the loop run on such rows without a simulation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from calibration.inference.linearization import Linearization, ScoredEffect
+from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate
+from calibration.inference.observers.time_histories import Histories, HistoriesLinearization
+from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
+from calibration.inference.problem import Data, Observation, Problem
+from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.model.robot import Robot
+from mmrjax.model.signals import CONVERGED
+
+
+class LinearRows(Observer):
+    """Observer whose rows are linear in the base coordinates and the amplitudes, about one fit.
+
+    Attributes:
+        linear: linearization at `origin`, with one weight for all readings.
+        origin: base coordinates of that fit.
+        start: base coordinates at which searches begin.
+        width: prior sd of an amplitude, relative to that of its field.
+        effect, grid: effect of each instance, and its neighbours on the grid of its shape: before, at, after.
+    """
+
+    policy: ClassVar[SearchPolicy] = SearchPolicy(batch=16, steps=30, searches=1, one_by_one=False)
+    rows_tell: ClassVar[bool] = False
+
+    linear: eqx.AbstractVar[Any]
+    origin: eqx.AbstractVar[Float[Array, " parameters"]]
+    start: eqx.AbstractVar[Float[Array, " parameters"]]
+    width: eqx.AbstractVar[float]
+    effect: eqx.AbstractVar[Int[Array, " instances"]]
+    grid: eqx.AbstractVar[Float[Array, "three instances"]]
+
+    def errors(self, coordinates: Any, z: Array) -> Array:
+        """Predictions minus readings at coordinates z, shape (readings,)."""
+        linear, size = self.linear, self.origin.shape[0]
+        readings = linear.readings
+        errors = linear.residual[:readings] + linear.jacobian[:readings] @ (z[:size] - self.origin)
+        if not hasattr(coordinates, "active"):
+            return errors
+        _, amplitude, shape = coordinates.parts(z)
+        before, here, after = self.grid
+        rise = (shape[:, None] - before) / (here - before)
+        fall = (after - shape[:, None]) / (after - here)
+        share = jnp.clip(jnp.minimum(*(jnp.where(jnp.isfinite(x), x, 1.0) for x in (rise, fall))), 0.0, 1.0)
+        own = self.effect == jnp.asarray(coordinates.active)[:, None]
+        return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * own * share, 0)
+
+    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Any:
+        r, jacobian, _ = _evaluate(self, problem.coordinates, data, z)
+        linear = self.linear.rescaled(data.weight / data.sd)
+        return dataclasses.replace(linear, residual=r, jacobian=jacobian)
+
+    @property
+    def long(self) -> bool:
+        return False
+
+    @property
+    def over_time(self) -> bool:
+        return True
+
+    def operating_points(self, robot: Robot) -> None:
+        return None
+
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        return np.zeros(np.shape(status), bool)
+
+    def starts(
+        self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
+    ) -> np.ndarray:
+        return np.asarray(self.start)[None]
+
+    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
+        return keys
+
+    def fit_replicate(
+        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
+    ) -> Linearization:
+        return linear_replicate(data, linear, drawn)
+
+    def search(
+        self,
+        problem: Problem,
+        starts: Numbers,
+        weights: Numbers,
+        active: Numbers | None = None,
+        *,
+        rivals: bool = False,
+        most: int | None = None,
+        scanned: Problem | None = None,
+    ) -> tuple[Optimum, Observation]:
+        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+            parts = []
+            for at, member in zip(z, members, strict=True):
+                coordinates, data = problem.coordinates, problem.data
+                if active is not None:
+                    coordinates = coordinates.with_effects(jnp.asarray(active[member]))
+                data = dataclasses.replace(data, weight=jnp.asarray(weights[member]))
+                parts.append(jax.device_get(_evaluated(self, coordinates, data, jnp.asarray(at))))
+            return jax.tree.map(lambda *x: np.stack(x), *parts)
+
+        steps = self.policy.steps if most is None else most
+        return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
+
+    def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+        return self.at(problem, z, active)[2]
+
+    def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
+        coordinates = problem.coordinates
+        if active is not None:
+            coordinates = coordinates.with_effects(jnp.asarray(active))
+        return _evaluated(self, coordinates, problem.data, jnp.asarray(z))
+
+
+class LinearHistories(LinearRows, Histories):
+    """Observer of time histories whose readings are linear about the fit of their base.
+
+    Attributes:
+        linear: linearization of the simulated readings, see `LinearRows`.
+    """
+
+    policy: ClassVar[SearchPolicy] = LinearRows.policy
+
+    linear: HistoriesLinearization = eqx.field(kw_only=True)
+    origin: Float[Array, " parameters"] = eqx.field(kw_only=True)
+    start: Float[Array, " parameters"] = eqx.field(kw_only=True)
+    width: float = eqx.field(kw_only=True, static=True)
+    effect: Int[Array, " instances"] = eqx.field(kw_only=True)
+    grid: Float[Array, "three instances"] = eqx.field(kw_only=True)
+
+    def at_fit(self, problem: Problem, z: Numbers) -> LinearHistories:
+        return self
+
+
+def grid_of_effects(effects: tuple[ScoredEffect, ...]) -> tuple[Array, Array]:
+    """Effect of each instance, and its neighbours on the grid of its shape, see `LinearRows`."""
+    grid = [np.asarray(e.at) for e in effects]
+    before, after = (
+        [np.r_[x, np.inf * s][1:] if s > 0 else np.r_[np.inf * s, x][:-1] for x in grid] for s in (-1, 1)
+    )
+    index = np.repeat(np.arange(len(grid)), [len(x) for x in grid])
+    return jnp.asarray(index), jnp.asarray(np.stack([np.concatenate(x) for x in (before, grid, after)]))
+
+
+def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEffect, ...], width: float) -> Problem:
+    """Problem of a log whose readings are linear about a fit of its base.
+
+    Args:
+        problem: problem of the log.
+        z: coordinates of the fit.
+        effects: effects whose signatures are computed.
+        width: prior sd of amplitudes, relative to those of their fields.
+    """
+    data, observe, z = problem.data, problem.observe, np.asarray(z)
+    linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), data, effects))
+    scale = np.asarray(data.weight / data.sd)
+    raw = jax.tree.map(jnp.asarray, linear.rescaled(np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)))
+    fields = {f.name: getattr(observe, f.name) for f in dataclasses.fields(observe) if f.name != "known"}
+    index, grid = grid_of_effects(effects)
+    simulated: Any = observe.at_fit(problem, z)
+    rows = LinearHistories(
+        **fields, known=simulated.known, linear=raw, origin=jnp.asarray(z), start=jnp.asarray(z), width=width,
+        effect=index, grid=grid,
+    )  # fmt: skip
+    return dataclasses.replace(problem, observe=rows)
+
+
+def _evaluate(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
+    """Residuals of rows, penalties and priors, their Jacobian, and the observation."""
+
+    def both(z: Array) -> tuple[Array, Array]:
+        errors = observe.errors(coordinates, z)
+        return errors, errors
+
+    slopes, errors = jax.jacfwd(both, has_aux=True)(z)
+    scale, penalties = (data.weight / data.sd).ravel(), jnp.zeros(len(data.weight))
+    r = jnp.concatenate([scale * errors, penalties, z - data.centre])
+    jacobian = [scale[:, None] * slopes, jnp.zeros((len(penalties), len(z))), jnp.eye(len(z))]
+    status = jnp.full(len(penalties), CONVERGED)
+    reading = errors.reshape(data.weight.shape) + data.measured
+    seen = Observation(reading, penalties, status, jnp.zeros_like(status))
+    return r, jnp.concatenate(jacobian), seen
+
+
+_evaluated = functools.partial(compiled, options=SELDOM)(_evaluate)
