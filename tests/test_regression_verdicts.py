@@ -23,16 +23,19 @@ SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
 SETTINGS = settings_for(Histories, 333)
 
 
-def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0):
+def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, swings=False):
     """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
 
     Args:
         late: rows by which the voltage acts later than its column says.
         forward: friction is larger by this share forward, smaller backward. sticks: larger by it at rest, and falls over 60 rad/s.
+        swings: the voltage swings, and is held from row to row.
     """
     rng = np.random.default_rng(seed)
     levels = np.where(np.arange(5) % 2, rng.uniform(1.2, 4.0, (4, 5)), rng.uniform(4.0, 24.0, (4, 5)))
     volts = np.repeat(levels * rng.choice([-1.0, 1.0], (4, 5)), ROWS // 5, axis=1)
+    if swings:
+        volts = 13 * np.sin(np.arange(ROWS) * EVERY * np.array([[7.0], [9.0], [11.0], [5.0]])) + 4
     acts = np.concatenate([np.zeros((4, late)), volts], 1)[:, :ROWS]
     current, speed, shown = np.zeros(4), np.zeros(4), []
     for n in range(ROWS):
@@ -105,6 +108,18 @@ def test_a_delay_of_ten_rows_is_a_parameter_and_nothing_is_missing(answered):
     assert not found.missing and value == pytest.approx(0.1, abs=EVERY)
 
 
+def test_a_held_voltage_that_swings_a_row_late_biases_nothing(answered):
+    """A delay of one row had no derivative, and a reading before a step of the voltage shows the current before."""
+    space = answered.space_of(late=1, swings=True)
+    fit, coordinates = weak_form.fit_weak_form(space.bare, space.library.scored), space.coordinates.base
+    sd = np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian)))
+    value, sds = coordinates.value(fit.z), np.asarray(coordinates.spread) * sd
+    for name, truth in (("rig.delay", EVERY), ("motor.resistance", 0.9)):
+        k = coordinates.names.index(name)
+        assert abs(value[k] - truth) < 3 * max(sds[k], 0.002 * truth) and sd[k] < 0.5
+    assert abs(np.sum(fit.residual**2) - fit.windows) < 5 * np.sqrt(2 * fit.windows)
+
+
 def test_windows_fit_effects_as_least_squares_do(answered):
     """A log is a table of equations: residuals, slopes and signatures of its regression, and shapes between them."""
     space = answered.space_of(forward=0.3)
@@ -147,6 +162,6 @@ def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered
 @pytest.mark.parametrize("fault, family", [({"forward": 0.3}, "loss torque that changes with direction"), ({}, "")])
 def test_the_windows_of_a_log_decide_and_one_simulation_confirms(answered, monkeypatch, fault, family):
     monkeypatch.setattr(discover, "LONG", 0)
-    traced = answered.input_of(**fault).trace_windows()
-    assert (traced is None) == (not fault)
+    traced, begin = answered.input_of(**fault).trace_windows()
+    assert (traced is None) == (not fault) and begin is not None
     assert not fault or (family in traced.families and traced.run.gained > 0.5 * traced.run.promised > 0)
