@@ -185,6 +185,7 @@ def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
 @dataclasses.dataclass
 class Windows:
     keep: Any = None
+    confirm: Any = None
 
     def trace(self):
         names = [self.keep(name, None) for name in ("ranking", "base", "search 0")]
@@ -198,4 +199,5 @@ def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(
     monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
     robot = SimpleNamespace(has_ground=False)
     given = discover.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
+    given.__dict__["space"] = None
     assert given.trace_windows() == (["ranking", "windows base", "windows search 0"], "fit")

@@ -205,10 +205,7 @@ def test_a_search_from_a_regression_that_does_not_converge_is_repeated_from_the_
     observe = SimpleNamespace(long=True, policy=SimpleNamespace(steps=60), search=optima)
     space = SimpleNamespace(
         bare=SimpleNamespace(observe=observe),
-        near={},
         free=2,
-        begins={("churning", ""): 0},
-        room=(),
         weight=np.ones(3),
     )
     regression = SimpleNamespace(z=np.array([-2.9, 1.0, 0.0]), simulated=False)
@@ -226,18 +223,19 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
         diagnosis=lambda fit, left: SimpleNamespace(linear=fit),
     )  # fmt: skip
     monkeypatch.setattr(discover, "simulate_models", lambda *_: run)
-    monkeypatch.setattr(discover, "_space_of", lambda *_: None)
+    monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
     monkeypatch.setattr(discover, "excess_misfit", lambda *_: 1e3)
     monkeypatch.setattr(discover, "unused_inputs", lambda _: ("angle",))
     missed_by = {id(base): (MissedChannel("position", 0.8, 0.0),), id(best): missed}
     monkeypatch.setattr(discover, "missed_channels", lambda space, runs, noise, fit: missed_by[id(fit)])
     given = SimpleNamespace(
-        known=None, shows_unmodelled_backlash=False, progress=lambda _: None, runs=None, noise=None, settings=None
-    )
+        known=None, shows_unmodelled_backlash=False, progress=lambda _: None, runs=None, noise=None, settings=None,
+        space=SimpleNamespace(with_room=lambda _: None),
+    )  # fmt: skip
     screened = SimpleNamespace(base=SimpleNamespace(candidate=base))
     left = SimpleNamespace(test=SimpleNamespace(confirmed=lambda _: SimpleNamespace(rejected=True)))
     traced = discover.LoopStages(
-        "class", screened, left, None, SimpleNamespace(best=best), alike="classes", beside="curve"
+        "class", screened, left, None, SimpleNamespace(best=best, room=()), alike="classes", beside="curve"
     )
     found = discover._confirm_by_simulation(given, given, traced)
     other = discover._confirm_by_simulation(SimpleNamespace(**{**vars(given), "known": found}), given, traced)
@@ -316,3 +314,23 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen,
     noise = SimpleNamespace(sd=None)
     best = discover._smallest_confirmed(space, None, screened, diagnosis(True), searched, noise).best
     assert " ".join(best.effects) == chosen
+
+
+@pytest.mark.parametrize(("cost", "chosen"), [(4.0, "a c"), (1e6, "a")])
+def test_windows_propose_no_larger_set_whose_simulation_leaves_more(cost, chosen, monkeypatch):
+    """Windows of EMPS found a second effect, whose simulation left 2000 times as much as the first alone."""
+    small, large = (
+        SimpleNamespace(effects=e, z=0, cost=x, plausible=True) for e, x in ((("a",), 9.0), (("a", "c"), 5.0))
+    )
+    monkeypatch.setattr(
+        discover, "refine_by_simulation",
+        lambda space, c, *_: SimpleNamespace(cost=cost if c is large else 100.0),
+    )  # fmt: skip
+    monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: "diagnosis")
+    space = SimpleNamespace(room=(), with_room=lambda _: space)
+    screened = SimpleNamespace(base=SimpleNamespace(space=None), bases=())
+    left = SimpleNamespace(test=SimpleNamespace(null=None))
+    searched = search.SearchResult((small, large), large, "of both")
+    found = discover._best_simulated_size(space, None, screened, left, searched, None)
+    assert " ".join(found.best.effects) == chosen
+    assert found.diagnosis == ("of both" if found.best is large else "diagnosis")

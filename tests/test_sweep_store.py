@@ -377,7 +377,7 @@ def test_full_disk_of_the_journal_loses_no_more_than_its_chunk(sweep, whole, mon
 def test_progress_has_rate_and_time_and_the_path_comes_last(sweep):
     _, out, _ = ends(sweep("s"), "300/300", "/s", code=0)
     assert out.splitlines()[-1] == "s"
-    assert "slides" in out and "demand above μ_s N" in " ".join(out.split())
+    assert "slides" in out and "above the adhesion limit μ_s N" in " ".join(out.split())
 
 
 def test_failing_write_leaves_no_file_behind(tmp_path, monkeypatch):

@@ -266,7 +266,7 @@ class LoopInput:
 
         With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
 
-        If results with other sds are `known` for the same included rows, their bootstrap replicates are reused: in
+        If results with other sds are `known` for the same included rows, their bootstrap replicates are reused. In
         units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
 
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
@@ -319,7 +319,8 @@ class LoopInput:
             """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
             return self.keep(name if name == "ranking" else f"windows {name}", make)
 
-        equations = dataclasses.replace(equations, keep=keep)
+        confirm = functools.partial(_best_simulated_size, self.space, self.settings)
+        equations = dataclasses.replace(equations, keep=keep, confirm=confirm)
         traced = equations.trace()
         slides = self.robot.has_ground and self.robot.rig.imposed == "voltage"  # which equations do not show
         begin = None if slides else _delayed_by_rows(self, traced.screened.base.candidate)
@@ -724,14 +725,16 @@ def equations_of_log(given: LoopInput) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states, or if its
     longest run has fewer than `LONG` steps.
 
-    Windows use every row of a log, and only simulations use fewer.
+    Windows use every row of a log, except for an angle alone. Simulations use fewer.
     """
     space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < LONG:
         return None
     bare = space.bare
-    if given.runs.log is not None:
+    motions = [c.settled for c in bare.channels if c.zero_at_rest]
+    # With every row, windows of an angle alone are biased: EMPS had half of its mass.
+    if given.runs.log is not None and (any(motions) or not motions):
         sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
         bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
         observe = bare.observe
@@ -836,6 +839,29 @@ def _smallest_confirmed(
     return searched
 
 
+def _best_simulated_size(
+    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
+    noise: Noise,
+) -> SearchResult:  # fmt: skip
+    """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
+
+    Windows of many rows have the power for a second effect, whose simulation may leave more than that of the first.
+
+    Args: as for `_smallest_confirmed`, of the windows. The noise of the simulated log is that of `space`.
+    """
+    sets = best_of_each_size(searched)
+    space = space.with_room([name for c in sets for name in c.effects])
+    searched = dataclasses.replace(searched, room=space.room)
+    if len(sets) < 2:
+        return searched
+    costs = [refine_by_simulation(space, c, [c.z], settings).cost for c in sets]
+    best = sets[int(np.argmin(costs))]
+    if best is searched.best:
+        return searched
+    diagnosis = diagnose_candidate(screened.base.space, best, screened.bases, left.test.null, settings)
+    return dataclasses.replace(searched, best=best, diagnosis=diagnosis)
+
+
 def _chosen_fit(traced: LoopStages) -> Candidate:
     """Fit of the verdict: the proposal, or else the best set of its mechanism."""
     base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
@@ -900,7 +926,7 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     given.progress(progress_remark("confirm"))
     chosen, base = _chosen_fit(traced), _delayed_by_rows(given, screened.base.candidate)
     best = base if chosen is screened.base.candidate else _delayed_by_rows(given, chosen)
-    run = simulate_models(given.space, base, best, given.settings)
+    run = simulate_models(given.space.with_room(searched.room), base, best, given.settings)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or excess_misfit(run.space, run.base) < noise:

@@ -64,9 +64,10 @@ class SeriesNoise:
 
     def sd(self, sizes: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """Standard deviation of readings of these sizes [SI]. At least that of rounding, and at least `FLOOR` of the
-        reading, unless that is an angle, which may grow without limit.
+        reading. The error of an angle repeats with each turn, so its floor is that of one turn at most.
         """
-        least = np.maximum(self.least, FLOOR * self.channel.settled * sizes)
+        largest = 2 * np.pi if self.channel.unit_si == "rad" else np.inf
+        least = np.maximum(self.least, FLOOR * np.minimum(sizes, largest))
         return np.maximum(np.hypot(self.floor, self.share * sizes), least)
 
 
