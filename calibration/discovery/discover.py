@@ -809,8 +809,9 @@ def _smallest_confirmed(
     space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
     noise: Noise,
 ) -> SearchResult:  # fmt: skip
-    """The search with the smallest set whose simulation leaves no discrepancy, or the largest set, and the diagnosis
-    of its simulation.
+    """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
+
+    The diagnosis is that of its simulation.
 
     Readings are linear near the fit of the base only. A large effect therefore leaves residuals that another one
     would explain.

@@ -416,8 +416,9 @@ def _with_imposed(rows: LogPoints, given: Columns) -> LogPoints:
 
 
 def fit_delay(problem: Problem, plan: StatePlan) -> float:
-    """Delay of the imposed quantity after the time that its column states [s], negative if earlier: the best of a
-    profile of the regression, over a tenth of a run in either direction.
+    """Delay of the imposed quantity after the time that its column states [s], negative if earlier.
+
+    It is the best of a profile of the regression, over a tenth of a run in either direction.
 
     The terms are nearly affine in the imposed quantities, so a few evaluations serve all delays. The windows contain
     jumps, because jumps show a delay best. If several delays fit equally well, as with a periodic input, the shortest
