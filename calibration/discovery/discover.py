@@ -793,7 +793,7 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     given.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
     space = space if traced.searched is None else space.with_room(traced.searched.room)
-    run = simulate_models(space, linear.candidate, best, settings)
+    run = simulate_models(space, linear.candidate, best, settings, screened.base.candidate)
     traced = dataclasses.replace(traced, run=run)
     if traced.searched is None:
         return traced

@@ -89,10 +89,17 @@ def refine_by_simulation(
     return min(fits, key=lambda x: x.cost)
 
 
-def simulate_models(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> LogSimulation:
-    """Simulates the base fit and the best fit of a log's windows, each refined by a few steps."""
+def simulate_models(
+    space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings, known: Candidate | None = None
+) -> LogSimulation:
+    """Simulates the base fit and the best fit of a log's linear rows, each refined by a few steps.
+
+    Args:
+        known: simulated fit of the base, from which its refinement starts too.
+    """
     space = space.with_room([*space.room, *best.effects])
-    last = refine_by_simulation(space, best, [best.z], settings)
+    starts = [] if known is None else [known.z]
+    last = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])], settings)
     without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
-    first = last if best is base else refine_by_simulation(space, base, [base.z, without], settings)
+    first = last if best is base else refine_by_simulation(space, base, [base.z, without, *starts], settings)
     return LogSimulation(space, first, last, 1 - best.cost / base.cost, 1 - last.cost / first.cost)
