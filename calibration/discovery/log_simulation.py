@@ -95,7 +95,7 @@ def simulate_models(
     """Simulates the base fit and the best fit of a log's linear rows, each refined by a few steps.
 
     Args:
-        known: simulated fit of the base, from which its refinement starts too.
+        known: simulated fit of the base. Its refinement starts there too.
     """
     space = space.with_room([*space.room, *best.effects])
     starts = [] if known is None else [known.z]

@@ -13,8 +13,8 @@ Readings are regressors too, and their noise biases the parameters. So derivativ
 kind, in posterior sds. The kinds are a motor with voltage, current and speed, a carriage with force and speed, and an
 angle alone, also with coarse instruments. An independent NumPy regression with exact states as instruments has 0.21
 (standard error 0.1), and 91 to 99 % of its intervals hold. An iterated covariance has 0.97 (82 %), on the motor with
-its log-determinant as much as without. With windows of sin⁴, the covariance used before has 0.90 (72 %), and one that
-changes within the fit 0.29 (56 %).
+its log-determinant as much as without. With windows of sin⁴, the covariance used before has 0.90 (72 %). One that
+changes within the fit has 0.29 (56 %).
 """
 
 from __future__ import annotations

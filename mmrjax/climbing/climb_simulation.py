@@ -525,8 +525,9 @@ def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Foo
 
 
 class VerdictState(eqx.Module):
-    """State from which the verdict follows: verdict, its time, furthest position, the time of that, and the shaft
-    angle since then.
+    """State from which the verdict follows: the verdict and its time.
+
+    It also has the furthest position, its time, and the shaft angle since then.
     """
 
     verdict: Array
