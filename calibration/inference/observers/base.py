@@ -315,7 +315,6 @@ class Observer(eqx.Module):
         *,
         rivals: bool = False,
         most: int | None = None,
-        scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
         """Fits from any number of starts, each with its own weights, and the observations at their optima.
 
@@ -325,7 +324,6 @@ class Observer(eqx.Module):
             active: set of effects of each member, see `ActiveSet`. None: those of the problem.
             rivals: True if all members search the same optimum, so that some may be stopped early.
             most: largest number of steps. None: that of the policy.
-            scanned: problem of the base, whose coordinates come first and are scanned. None: the problem itself.
         """
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:

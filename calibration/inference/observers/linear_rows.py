@@ -102,7 +102,6 @@ class LinearRows(Observer):
         *,
         rivals: bool = False,
         most: int | None = None,
-        scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
         def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
             parts = []
@@ -116,9 +115,6 @@ class LinearRows(Observer):
 
         steps = self.policy.steps if most is None else most
         return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
-
-    def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
-        return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         coordinates = problem.coordinates

@@ -353,7 +353,6 @@ class SettledRuns(Observer):
         *,
         rivals: bool = False,
         most: int | None = None,
-        scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
         data, count = problem.data, len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))

@@ -761,7 +761,6 @@ class Histories(Observer):
         *,
         rivals: bool = False,
         most: int | None = None,
-        scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
         """Fits from several starts, see `Observer.search`. The runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
@@ -778,27 +777,23 @@ class Histories(Observer):
         unended = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
         if most is None and np.any(near & unended):  # a proposal has to be an optimum
             optima = search_from(np.asarray(optima[0].z))
-        bare = problem if scanned is None else scanned
-        if not rivals or not scans.scanned_coordinates(bare):
+        if not rivals or not scans.scanned_coordinates(problem):
             return optima
-        k, size = int(np.nanargmin(optima[0].cost)), len(bare.coordinates)
+        k = int(np.nanargmin(optima[0].cost))
         if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
             return optima
 
         def result_of_member(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
-            best, observation = jax.tree.map(lambda leaf: leaf[k], every)
-            return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), observation
+            return jax.tree.map(lambda leaf: leaf[k], every)
 
         def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
-            return result_of_member(search_from(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
+            return result_of_member(search_from(z[None], slice(k, k + 1)), 0)
 
-        scan_data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen_observation = scans.search_lower_minima(
-            bare, result_of_member(optima, k), scan_data, search_again, lambda _: None
+        scan_data = dataclasses.replace(problem.data, weight=weights[k])
+        best = scans.search_lower_minima(
+            problem, result_of_member(optima, k), scan_data, search_again, lambda _: None
         )
-        optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
-        best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen_observation))
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, best)
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
