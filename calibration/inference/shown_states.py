@@ -418,20 +418,24 @@ class _LogArrays:
 
     def course(self, cells: list[np.ndarray]) -> ImposedCourse:
         """Imposed quantities over time. `cells`: intervals of the points of each run."""
+        observe, runs = self.observe, len(cells)
+        imposed = {n: x for n in IMPOSED if (x := getattr(observe.conditions, n)) is not None and np.ptp(x) > 0}
         changing = {
-            name: np.asarray(x, float)
-            for name in IMPOSED
-            if (x := getattr(self.of_rows, name)) is not None and np.ptp(np.asarray(x)) > 0
+            n: np.asarray(x, float) if np.ndim(x) > 1 else np.full((runs, 1), 1.0) * np.c_[x]
+            for n, x in imposed.items()
         }
         linear = self.problem.base.rig.between_rows == "linear"
         knots, drive_changes = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
-        for rows, cell in zip(self.every, cells, strict=True):
-            period = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
-            time = np.r_[self.time[rows[0]] - period, self.time[rows], self.time[rows[-1]] + period]
+        for run, cell in enumerate(cells):
+            times = np.asarray(observe.times[run])
+            instants = np.flatnonzero(np.diff(times, prepend=-1.0) > 0)
+            times, period = times[instants], times[-1] + 1.0
+            time = np.r_[-period, times, times[-1] + period]
             begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
-                padded = x[np.r_[rows[0], rows, rows[-1]]]
+                of_run = np.broadcast_to(x[run], observe.times[run].shape)[instants]
+                padded = of_run[np.r_[0, 0 : len(of_run), -1]]
                 lines = linear or name in ("motor_speed", "motor_acceleration")
                 mean = 0.5 * (padded[1:] + padded[:-1]) if lines else padded[:-1]
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])

@@ -292,10 +292,10 @@ def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Ar
     readings, rate = rows.shown, rows.rate
     if plan.electrical:
         readings = readings.at[:, plan.current].set((states[:, 1] - units.lead) * units.per_ampere)
+    motion = states[:, 0] * units.unit
     if plan.angle:
-        rate = states[:, 0] * units.unit
-    else:
-        readings = readings.at[:, plan.motion].set(states[:, 0] * units.unit)
+        rate, motion = motion, jnp.cumsum(0.5 * (motion + jnp.roll(motion, 1)) * rows.since)
+    readings = readings.at[:, plan.motion].set(motion)
     return dataclasses.replace(rows, shown=readings, rate=rate)
 
 

@@ -41,6 +41,8 @@ from mmrjax.model.robot import Robot
 TOGETHER = 128
 #: Number of effects that are fitted before the rest counts as a disturbance.
 FITTED = 4
+#: Most rounds for the intensity of the disturbance, and its relative change at which they end.
+ROUNDS, SAME = 8, 0.05
 #: Variables of curves that follow from the states if no channel shows them.
 UNSHOWN = ("speed_motor", "current")
 
@@ -211,9 +213,12 @@ def problem_of_windows(
             channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
 
-    linear = linearised(np.zeros(len(places)))
-    unknown = _unexplained(linear, parts, sd, fit, np.asarray(data.weight))
-    linear = linearised(unknown) if unknown.any() else linear
+    linear = linearised(unknown := np.zeros(len(places)))
+    for _ in range(ROUNDS):  # the intensity depends on the weights of the windows, which depend on it
+        before, unknown = unknown, _unexplained(linear, parts, unknown, sd, fit, np.asarray(data.weight))
+        if np.allclose(unknown, before, rtol=SAME):
+            break
+        linear = linearised(unknown)
     middle = np.take_along_axis(windows.rows, np.argmax(windows.weight, 1)[:, None], 1)[:, 0]
     table = {name: jnp.asarray(x) for name, x in columns(np.asarray(fit.rows.first)).items()}
     table |= {c.column: fit.rows.shown[:, k] for k, c in enumerate(problem.channels)}
@@ -226,9 +231,14 @@ def problem_of_windows(
 
 
 def _unexplained(
-    linear: WindowsLinearization, parts: list[RunWindows], sd: np.ndarray, fit: WeakFormFit, weight: np.ndarray
-) -> np.ndarray:
-    """Intensity of the disturbance of each equation that neither the readings nor a few effects explain."""
+    linear: WindowsLinearization, parts: list[RunWindows], unknown: np.ndarray, sd: np.ndarray, fit: WeakFormFit,
+    weight: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Intensity of the disturbance of each equation that neither the readings nor a few effects explain.
+
+    Args:
+        unknown: intensity for which the windows are weighted.
+    """
     readings, places = linear.readings, linear.integrals.places
     columns, e = (np.asarray(x) for x in (linear.jacobian, linear.residual))
     signatures = np.zeros((len(e), linear.signatures.shape[1]))
@@ -240,13 +250,15 @@ def _unexplained(
         norm = np.where(norm > 1e-3 * np.linalg.norm(signatures, axis=0), norm, np.inf)
         best = int(np.argmax(np.abs(rest.T @ left) / norm))
         columns = np.concatenate([columns, signatures[:, [best]]], 1)
-    factors = [covariance_factor(fit.plan, w, sd, fit.smooth, np.zeros(len(places))) for w in parts]
+    factors, of_readings = (
+        [covariance_factor(fit.plan, w, sd, fit.smooth, x) for w in parts] for x in (unknown, 0.0 * unknown)
+    )
     by_window = left[:readings].reshape(linear.rows, -1)[:, list(places)]
     plain = [
         (x @ by_window[k].T.ravel()).reshape(len(places), -1).T
         for k, x in zip(np.split(np.arange(linear.rows), len(parts)), factors, strict=True)
     ]
-    noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in factors]
+    noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in of_readings]
     unit = [np.tile(np.sum(w.weight**2 / w.steps, 1)[:, None], len(places)) for w in parts]
     counts = weight[:, places[0]] > 0
     free = counts.sum() / max(counts.sum() - (fit.z.size + FITTED) / len(places), 1.0)
