@@ -53,7 +53,7 @@ def write_stage(file: Path, value: Any) -> None:
     except (RecursionError, TypeError, ValueError) as error:  # nested too deeply, without attributes, a huge number
         raise Unwritable(f"{type(error).__name__}: {error}") from error
     with file.open("wb") as stream:
-        data = np.frombuffer(b"".join(writer.data), np.uint8)
+        data = np.concatenate([np.zeros(0, np.uint8), *writer.data])
         np.savez(stream, allow_pickle=False, tree=np.frombuffer(tree, np.uint8), data=data)
 
 
@@ -84,7 +84,7 @@ class _Writer:
     """Encodes values: JSON has lists and plain values as they are, everything else as [KIND, ...]."""
 
     def __init__(self) -> None:
-        self.data: list[bytes] = []
+        self.data: list[np.ndarray] = []
         self._size = 0
         self._number: dict[int, int] = {}
         self._alive: list[Any] = []  # so that ids stay unique
@@ -133,7 +133,7 @@ class _Writer:
         order: Literal["F", "C"] = (
             "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
         )  # which sums depend on
-        content = x.tobytes(order)
+        content = x.ravel(order).view(np.uint8)
         offset, self._size = self._size, self._size + len(content)
         self.data.append(content)
         return [x.dtype.str, list(x.shape), order, offset]

@@ -290,9 +290,12 @@ def test_a_row_without_weight_does_not_change_a_linear_fit(space, linear):
     assert_allclose(other.z, without.z, atol=1e-9)
 
 
-@pytest.mark.parametrize(("remain", "chosen"), [((False, False), "b"), ((True, False), "a c"), ((True, True), "a c")])
-def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen, monkeypatch):
-    """The linear readings prefer `a`, the simulation `b`."""
+@pytest.mark.parametrize(
+    ("remain", "room", "chosen"),
+    [((False, False), "", "b"), ((True, False), "", "a c"), ((True, True), "", "a c"), ((False,), "ac", "a")],
+)
+def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, chosen, monkeypatch):
+    """The linear readings prefer `a`, the simulation `b`, unless it has room for `a` and `c` alone."""
 
     def one(*effects, cost):
         return SimpleNamespace(effects=effects, z=0, cost=cost, plausible=True)
@@ -307,7 +310,7 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen,
     )
     rest = iter(remain)
     monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: diagnosis(next(rest)))
-    space = SimpleNamespace(room=())
+    space = SimpleNamespace(room=tuple(room))
     space.with_noise = space.with_room = lambda *_: space
     screened = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(weight=None)), bases=())
     searched = search.SearchResult(tuple(ladder), ladder[2], diagnosis(False))

@@ -59,7 +59,7 @@ class LogSimulation:
         linear = HistoriesLinearization(
             jnp.asarray(residual), jnp.asarray(jacobian), jnp.zeros((rows * count, 0)), jnp.zeros(0),
             problem.data.weight / problem.data.sd, no_signals, observe.rows_of, observe.knots, observe.time,
-            jnp.zeros(rows), channels=channels.channel_names(problem.channels),
+            jnp.zeros(rows), balances=(), channels=channels.channel_names(problem.channels),
             magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
         test, count = windows.test, len(windows.test.null.single)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import operator
 import re
 import threading
@@ -168,10 +169,11 @@ NEAR = 3.0
 class HistoriesLinearization(Linearization):
     """Linearization of time histories.
 
-    `defects` has shape (balances, runs, knots, samples, channels): the error of a balance has a value at each knot of
-    a run.
+    `defects` [SI] has shape (balances, runs, knots, samples, channels): the error of a balance has a value at each
+    knot of a run. Copies with other scales share it, because it is large.
 
     Attributes:
+        balances: indices of the balances of `defects`.
         rows_of: indices of each run's rows in order of time, padded with -1, shape (runs, samples).
         knots: rows between which an error is linear, shape (runs, knots).
         time: time of each row since the start of its run [s].
@@ -182,14 +184,13 @@ class HistoriesLinearization(Linearization):
     knots: Int[Array, "runs knots"]
     time: Float[Array, " rows"]
     angle: Float[Array, " rows"]
-
-    def rescaled(self, factor: Array) -> HistoriesLinearization:
-        by_sample = jnp.asarray(factor)[self.rows_of][:, None]
-        return dataclasses.replace(super().rescaled(factor), defects=self.defects * by_sample)
+    balances: tuple[int, ...] = eqx.field(static=True, kw_only=True)
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        changes = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        return _to_rows(changes, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+        place = jnp.argmax(jnp.asarray([*self.balances, balance]) == balance)
+        defects = jnp.take(self.defects, place, 0, mode="fill")
+        changes = jnp.einsum("rksc,rkt->rsct", defects, shapes[self.knots])
+        return (_to_rows(changes, self.rows_of, self.rows) * self.scale[:, :, None]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -664,7 +665,9 @@ class Histories(Observer):
         r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
         residual, jacobian = zero_inactive_residuals(r, jacobian, adhesion_penalty_slice(data))
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
-        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
+        places = {*bases_room.balances_of(problem.base), *itertools.chain(*bases_room.STANDS_FOR.values())}
+        probed = tuple(k for k, b in enumerate(PROBED) if b in places)
+        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd, probed)
         return HistoriesLinearization(
             residual,
             jacobian,
@@ -676,6 +679,7 @@ class Histories(Observer):
             self.knots,
             self.time,
             angle,
+            balances=probed,
             channels=channels.channel_names(problem.channels),
             magnitudes=robot.rig.magnitudes,
         )
@@ -1263,7 +1267,7 @@ def _evaluate(
 
 @functools.partial(compiled, options=SELDOM)
 def _responses(
-    observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array
+    observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array, probed: tuple[int, ...]
 ) -> tuple[Array, Array, Signals, Array]:
     """Signatures and balance errors for `HistoriesLinearization`, signals of each row, and the angle of the shaft
     there.
@@ -1271,10 +1275,10 @@ def _responses(
     Args:
         observe: observer with simulated runs.
         scale: scale of the readings [1/SI], shape (rows, channels).
+        probed: indices of the balances with errors.
     """
-    defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
+    defects, by_effects = observe.changes(robot, tuple(balance_probe(PROBED[k]) for k in probed), effects)
     rows_of, rows = observe.rows_of, len(scale)
-    defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
     signatures = _to_rows(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
@@ -1378,9 +1382,10 @@ class _ProbedRobot(NamedTuple):
         begin_changes = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
         unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begin_changes], 1)
         changed = run_response(conditions, along, source, seen, unmoved)
-        state_changes = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
-        knots = state_changes[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
-        own_changes = state_changes[:, :, size * len(clock) :]
+        wide, at_begin = size * len(clock), seen(clock[0], begins, unmoved, first)
+        knots = jnp.where(instants[:, None, None] > 0, changed[instants - 1, :, :wide], at_begin[:, :wide])
+        knots = knots.reshape(len(instants), -1, size, len(clock))
+        own_changes = jnp.concatenate([at_begin[None, :, wide:], changed[:, :, wide:]])
         if delayed:
             step, share = robot.rig.before(times, time)
             by_effects = own_changes[step] + share[:, None, None] * (own_changes[step + 1] - own_changes[step])
