@@ -303,7 +303,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
 
     def interrupted(compiled, values, *told):
         if len(simulated) == 3:
-            while not any((tmp_path / "s.partial" / "chunks").glob("*.npz")):
+            while not any((tmp_path / "s.partial" / "chunks").glob("*.stage")):
                 time.sleep(0.001)  # the first is being written meanwhile
             raise KeyboardInterrupt
         simulated.append(len(values))
@@ -312,7 +312,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resumes the sweep after its last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
-    kept = len(list((tmp_path / "s.partial" / "chunks").glob("*.npz")))
+    kept = len(list((tmp_path / "s.partial" / "chunks").glob("*.stage")))
     assert 0 < kept <= 3
     simulated.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
@@ -333,7 +333,7 @@ def test_interrupt_before_anything_is_done_leaves_nothing(mmrjax, tmp_path, monk
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --chunk 60 --no-report --out"
     honest, calls = scale.Compiled.__call__, []
-    kept = tmp_path / "s.partial" / "chunks" / "chunk-000000.npz"
+    kept = tmp_path / "s.partial" / "chunks" / "chunk-000000.stage"
 
     def interrupted(*call):
         if calls:
