@@ -119,7 +119,7 @@ FORGED = {
     "another class as a type": call("builtins.eval", "1"),
     "a module of another package": b"cthis\nc\n.",
     "a module that ours imports": b"cmmrjax.compile.programs\nos\n.",
-    "a function in a module that ours imports": b"\x80\x04\x8c\x18mmrjax.compile.programs\x8c\x09os.system\x93.",
+    "a function in a module that ours imports": b"\x80\x04\x8c\x17mmrjax.compile.programs\x8c\x09os.system\x93.",
     "a class that ours imports": call("mmrjax.compile.programs.Path", "x"),
     "a class that is no dataclass": call("mmrjax.compile.programs.Programs", "x"),
     "a field that there is not": call(
