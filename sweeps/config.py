@@ -15,7 +15,6 @@ from calibration.data import Json, Names, presets_file
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words
 from calibration.data.input_files import toml_content, toml_text
-from calibration.inference import solvers
 from mmrjax import fidelities
 from mmrjax.model import channels
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
@@ -151,13 +150,6 @@ def _check_fidelity(model: str) -> str:
     if model not in fidelities.TABLE:
         raise PydanticCustomError("unknown", f"input should be {_join_with_or(map(repr, fidelities.TABLE))}")
     return model
-
-
-def _check_solver(name: str) -> str:
-    """The name of a solver for fits. Unknown names are rejected."""
-    if name not in solvers.NAMES:
-        raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
-    return name
 
 
 def _join_with_or(names: Iterable[str]) -> str:
@@ -692,13 +684,6 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
         None, "Largest number of generations of the population", usual="30", solver=True
-    )
-    solver: Annotated[str, AfterValidator(_check_solver)] | None = option_field(
-        None,
-        f"Solver of the searches, of optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
-        f"({', '.join(solvers.OF_OPTAX)})",
-        usual="Levenberg-Marquardt of mmrjax",
-        solver=True,
     )
     profiles: bool | None = option_field(
         None, "Compute the profile likelihood of each parameter", usual="for steady, except turns"
