@@ -234,11 +234,11 @@ def reproduce() -> None:
     config.Render,
     config.Picture,
     group=MODEL,
-    common="robot configuration voltage slope payload begin end slow",
-    example="mmrjax render start.gif --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
+    common="robot configuration voltage slope payload time",
+    example="mmrjax render start.png --slope 10 --payload 5 --time 0.4",
 )
 def render() -> None:
-    """Draw a picture or film of the track model.
+    """Draw a picture of the track model.
 
     The picture shows the robot on its slope, its track and the contact forces. The run starts from standstill. The
     command works without a display.

@@ -305,12 +305,8 @@ class GivenRuns(OneRun, FolderPart):
 class Picture(OneRun):
     """File of `render`, and the run that it shows."""
 
-    file: Path = option_field(..., "Output file, ending in .png or .gif", argument=True)
-    begin: float | None = option_field(
-        None, "Time of the picture or start of the film (s)", usual="0; for a picture 0.8"
-    )
-    end: float | None = option_field(None, "End of the film (s)", usual="begin + 0.1")
-    slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
+    file: Path = option_field(..., "Output file, ending in .png", argument=True)
+    time: float = option_field(0.8, "Time of the picture (s)")
     force: bool = option_field(False, "Replace an existing file")
 
 
@@ -602,7 +598,6 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         "Also compute derivatives with respect to these, comma-separated: any parameter, adhesion, payload, voltage "
         "(with --battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
-    film: bool = option_field(False, "Write climb.gif")
     duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
     time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step")
 
@@ -627,9 +622,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
             raise PydanticCustomError("idle", "`nose_mm` has an effect only with steps and stairs")
         if self.battery and self.supply_voltage_V is not None:
             raise PydanticCustomError("idle", "`supply_voltage_V` cannot be combined with `battery`")
-        for name in ("film", "derivatives"):
-            if getattr(self, name) and self.find is not None:
-                raise PydanticCustomError("idle", f"`{name}` cannot be combined with `find`")
+        if self.derivatives and self.find is not None:
+            raise PydanticCustomError("idle", "`derivatives` cannot be combined with `find`")
         return self
 
 
