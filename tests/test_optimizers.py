@@ -177,6 +177,15 @@ def test_steps_are_those_of_another_implementation(bent):
     assert bool(over) and rejected > 0
 
 
+def test_a_penalty_within_its_edge_is_no_residual(bent):
+    posed, truth = bent[0], jnp.asarray([0.7, 0.4, -0.2, 0.3])
+    assert (posed.adhesion_excess(posed.observation(truth), posed.data) < -1).all()
+    r, jacobian, _ = fit._evaluate_residuals(posed, posed.data, fit.no_pin(4), truth)
+    r, jacobian = fit.clip_penalties(r, jacobian, posed.data)
+    penalties = fit.adhesion_penalty_slice(posed.data)
+    assert penalties.stop > penalties.start and not np.any(r[penalties]) and not np.any(jacobian[penalties])
+
+
 def test_a_start_that_is_not_finite_is_no_optimum(bent):
     posed, members, (wanted, _) = bent
     found, _ = alone(posed, dataclasses.replace(members, start=np.r_[np.full((1, 4), np.nan), members.start[1:]]), 40)
