@@ -30,7 +30,6 @@ from calibration.inference import (
     population,
     priors,
     scans,
-    solvers,
 )
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, progress_remark, remarks_with_codes
@@ -77,7 +76,6 @@ def calibrate(
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
     rows: int = ROWS,
-    solver: str | optimizers.Solver | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Fits parameters of `robot` to measured runs.
@@ -102,14 +100,11 @@ def calibrate(
             depend on the kind of data and the fidelity.
         rows: largest number of rows. Larger tables are thinned evenly: logs in time, tables over their conditions. A
             note reports it.
-        solver: solver of optimistix, or its name (`solvers.NAMES`), for the searches from the starts. None: the
-            solver of this package, which also serves all fits that begin at the optimum (profiles, blocks). Other
-            solvers ignore adhesion penalties below zero.
         tell: callback for progress messages.
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check_data`.
-        BadConfiguration: an unknown fidelity, parameter or solver. A number that is not allowed. An invalid prior or
+        BadConfiguration: an unknown fidelity or parameter. A number that is not allowed. An invalid prior or
             noise, or a prior of a mass that the table states. Rows that no robot near the priors reaches, or a call
             inside `jax.jit` while JAX uses single precision.
     """
@@ -124,7 +119,6 @@ def calibrate(
     for name, (value, low) in counts.items():
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
-    solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
     runs, progress = used_rows(runs, robot, rows), report_in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
@@ -146,10 +140,10 @@ def calibrate(
         generations or GENERATIONS,
         members,
     )
-    search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress, solver)
+    search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress)
     setting = _CalibrationInput(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
     if not free and priors.DELAY not in (*fix, *ready.names):
-        setting, search = _free_delay_if_needed(setting, search, progress, solver)
+        setting, search = _free_delay_if_needed(setting, search, progress)
     return _calibration_result(setting, search, beside, seed, progress)
 
 
@@ -234,7 +228,6 @@ def _free_delay_if_needed(
     setting: _CalibrationInput,
     found: MultistartResult,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None,
 ) -> tuple[_CalibrationInput, MultistartResult]:
     """Repeats the search with a free delay, if the error of a log is concentrated in the samples after steps.
 
@@ -254,7 +247,7 @@ def _free_delay_if_needed(
     start = np.zeros((1, len(coordinates)))
     start[0, index] = found.best.z
     start = scans.place_at_minimum(posed, start)
-    found = multistart.search_one_by_one(posed, ready.noise, start, found.shares, tell, solver)
+    found = multistart.search_one_by_one(posed, ready.noise, start, found.shares, tell)
     return dataclasses.replace(setting, ready=ready), found
 
 
@@ -292,7 +285,6 @@ def _search(
     members_file: Path | None,
     seed: int,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None,
 ) -> tuple[MultistartResult, np.ndarray | None]:
     """Searches for the optimum. Also returns the optimum of `steady` if the searches started there."""
     rng, all_members = np.random.default_rng(seed), None
@@ -301,23 +293,23 @@ def _search(
         all_members = observers.pose_problem(runs.log, base, posed.coordinates, sd)
     points = posed.observe.starts(posed, rng, starts, all_members)
     if not posed.observe.long:
-        return multistart.search_from_starts(posed, known, points, solver), None
+        return multistart.search_from_starts(posed, known, points), None
     if not posed.observe.starts_from_steady:
         shares = multistart.initial_noise_shares(known)
-        return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
+        return multistart.search_one_by_one(posed, known, points, shares, tell), None
     tell(progress_remark("steady"))
     if size:
         population.MemberRunner(posed, members_file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
-        observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws, solver
+        observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws
     )
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.starts_from_posterior(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
     if not size:
-        return multistart.search_one_by_one(posed, known, points, easy.shares, tell, solver), beside
+        return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
     # The first generation has the posterior of `steady`, but the prior for friction of contacts, which has another
     # meaning there.
     covariance = identifiability.analyse_identifiability(easy.problem, jnp.asarray(beside)).covariance.copy()
@@ -347,7 +339,7 @@ def _search(
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
     edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
     searched = population.PopulationSearch(everyone, best_member, names, slope, left, edge)
-    return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
+    return multistart.optimum_of_population(posed, known, shares, searched, tell), beside
 
 
 def _calibration_result(
