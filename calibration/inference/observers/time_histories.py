@@ -51,7 +51,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate
+from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate, with_effects
 from calibration.inference.optimizers import (
     CORES,
     SAME,
@@ -110,8 +110,6 @@ DELAYS, SCANNED = (256, 2048), 32
 #: Time up to which a first sample has to show a robot at rest [s]; largest allowed reading there, as a share of the
 #: largest speed and in sds.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
-#: Members of a search that one call of its program evaluates; calls for others run in parallel.
-TOGETHER = 1
 #: Differences between neighbouring residuals, over their median, above which they are jumps rather than noise [-].
 JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
@@ -659,11 +657,7 @@ class Histories(Observer):
         are computed along its runs.
         """
         problem = dataclasses.replace(problem, data=data)
-        active_set = getattr(problem.coordinates, "active", None)
-        twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(data.weight), None if active_set is None else twice(active_set)
-        r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
-        residual, jacobian = zero_inactive_residuals(r, jacobian, adhesion_penalty_slice(data))
+        residual, jacobian, _, simulated = _evaluate_at(problem, z)
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
         places = {*bases_room.balances_of(problem.base), *itertools.chain(*bases_room.STANDS_FOR.values())}
         probed = tuple(k for k, b in enumerate(PROBED) if b in places)
@@ -686,11 +680,7 @@ class Histories(Observer):
 
     def at_fit(self, problem: Problem, z: Numbers) -> Histories:
         """Observer with its runs as simulated at coordinates z, by the program of the searches."""
-        active_set = getattr(problem.coordinates, "active", None)
-        twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(problem.data.weight), None if active_set is None else twice(active_set)
-        simulated = _evaluate(problem, *members)[3]
-        return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
+        return dataclasses.replace(self, known=_evaluate_at(problem, z)[3])
 
     def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
@@ -797,19 +787,15 @@ class Histories(Observer):
         best = scans.search_lower_minima(
             problem, result_of_member(optima, k), scan_data, search_again, lambda _: None
         )
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, best)
+        put = lambda every, mine: np.concatenate([every[:k], np.asarray(mine)[None], every[k + 1 :]])  # noqa: E731
+        return jax.tree.map(put, optima, best)
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, Jacobian and observation, see `Observer.at`, by the program of the searches."""
-        active_sets = None if active is None else np.asarray(active)[None]
-        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], active_sets)
-        r, jacobian, observation = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *zero_inactive_residuals(
-            jnp.asarray(r), jnp.asarray(jacobian), adhesion_penalty_slice(problem.data)
-        ), observation
+        return _evaluate_at(with_effects(problem, active), z)[:3]
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Bases of curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
@@ -1221,8 +1207,7 @@ def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Arr
 
 
 def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
-    """Function that evaluates the model for members of a search. A call takes `TOGETHER` of them, calls run in
-    parallel.
+    """Function that evaluates the model for members of a search, in parallel.
 
     Args:
         weights, active: values for each member, see `Histories.search`.
@@ -1230,17 +1215,15 @@ def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | No
 
     weights, made = np.asarray(weights), threading.Event()
 
-    def evaluate_together(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-        filled = np.resize(np.arange(len(members)), TOGETHER)
-        slots = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], slots)[:3])
+    def evaluate_one(z: np.ndarray, member: int) -> tuple[np.ndarray, np.ndarray, Observation]:
+        slots = None if active is None else np.asarray(active)[member][None]
+        return jax.device_get(_evaluate(problem, z[None], weights[member][None], slots)[:3])
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-        parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
         with Threads(CORES if made.is_set() else 1) as cores:
-            results = list(cores.map(lambda part: evaluate_together(*part), parts))
+            results = list(cores.map(evaluate_one, z, members))
         made.set()  # the first call has compiled the program
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *results)
+        return jax.tree.map(lambda *x: np.concatenate(x), *results)
 
     return evaluate
 
@@ -1260,9 +1243,19 @@ def _evaluate(
         observe: Histories = problem.observe.with_simulated_runs(problem_there.robot(z))  # type: ignore[attr-defined]
         problem_there = dataclasses.replace(problem_there, observe=observe)
         assert observe.known is not None
-        return *linearise_rollout(problem_there, z, dataclasses.replace(problem.data, weight=weight)), observe.known
+        data = dataclasses.replace(problem.data, weight=weight)
+        r, jacobian, observation = linearise_rollout(problem_there, z, data)
+        penalties = adhesion_penalty_slice(data)  # negative, because adhesion is not penalised
+        return *zero_inactive_residuals(r, jacobian, penalties), observation, observe.known
 
     return jax.vmap(evaluate_member)(z, weights, active)
+
+
+def _evaluate_at(problem: Problem, z: Numbers) -> tuple[Numbers, Numbers, Observation, LinearisedRun]:
+    """Result of `_evaluate` at one point, for the effects in the slots of the problem, as NumPy arrays."""
+    at = z, problem.data.weight, getattr(problem.coordinates, "active", None)
+    evaluated = _evaluate(problem, *jax.tree.map(lambda x: np.asarray(x)[None], at))
+    return jax.tree.map(lambda x: x[0], jax.device_get(evaluated))
 
 
 @functools.partial(compiled, options=SELDOM)
