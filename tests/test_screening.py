@@ -301,7 +301,7 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, c
         return SimpleNamespace(effects=effects, z=0, cost=cost, plausible=True)
 
     def diagnosis(rejected):
-        return SimpleNamespace(test=SimpleNamespace(rejected_with_margin=rejected, null=None))
+        return SimpleNamespace(test=SimpleNamespace(rejected_with_margin=rejected, null=None), linear=None)
 
     ladder = [one("a", cost=10.0), one("b", cost=11.0), one("a", "c", cost=5.0)]
     simulated = {("a",): 9.0, ("b",): 6.0, ("a", "c"): 5.0}

@@ -836,7 +836,7 @@ def _smallest_confirmed(
     for sets in filter(None, sizes):
         fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
         k = min(range(len(fits)), key=lambda k: fits[k].cost)
-        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings, left.linear)
         searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
         if not diagnosis.test.rejected_with_margin:
             break

@@ -189,9 +189,19 @@ def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Strongest
 Diagnosed = tuple[Linearization, ScoreTable, StrongestStatistics]
 
 
-def diagnose_fit(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
-    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics."""
-    if problem.observe.over_time:  # by separate programs
+def diagnose_fit(
+    problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
+) -> Diagnosed:
+    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics.
+
+    Args:
+        near: linearization of another fit. Its changes of the readings by effects and curves are used. None: they are
+            computed at this fit, which for a log takes a program.
+    """
+    if near is not None:
+        residual, jacobian, _ = problem.observe.at(problem, z)
+        linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
+    elif problem.observe.over_time:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
         linear = _linearised(with_solved_rows(problem, z), z, effects)
