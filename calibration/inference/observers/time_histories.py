@@ -465,7 +465,7 @@ class Histories(Observer):
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def changes(
-        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
+        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...], kind: Any = float
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
         """Changes of the readings by an error of the balance of each probe [unit of the balance], and by each effect
         at each point of its grid. A probe has amplitude 1. The error is 1 at a knot of a run and falls linearly to 0
@@ -473,7 +473,7 @@ class Histories(Observer):
 
         An effect with one amplitude enters one balance. So it changes a run as an error of that balance would, with
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
-        linear.
+        linear. `kind`: type of the numbers.
         """
         probed = _ProbedRobot.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
@@ -482,7 +482,9 @@ class Histories(Observer):
         assert followed_signals is not None
         # One run at a time: each has a wide array, by its knots.
         inputs = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
-        knots, by_effects = jax.lax.map(lambda of_run: probed.changes(*of_run, delayed=self.delayed), inputs)
+        knots, by_effects = jax.lax.map(
+            lambda of_run: probed.changes(*of_run, kind=kind, delayed=self.delayed), inputs
+        )
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def with_simulated_runs(self, robot: Robot) -> Histories:
@@ -1270,7 +1272,8 @@ def _responses(
         scale: scale of the readings [1/SI], shape (rows, channels).
         probed: indices of the balances with errors.
     """
-    defects, by_effects = observe.changes(robot, tuple(balance_probe(PROBED[k]) for k in probed), effects)
+    probes = tuple(balance_probe(PROBED[k]) for k in probed)
+    defects, by_effects = observe.changes(robot, probes, effects, jnp.float32)  # hundreds of megabytes for a long log
     rows_of, rows = observe.rows_of, len(scale)
     signatures = _to_rows(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
@@ -1328,6 +1331,7 @@ class _ProbedRobot(NamedTuple):
         times: Array,
         time: Array,
         *,
+        kind: Any,
         delayed: bool,
     ) -> tuple[Array, Array]:
         """Changes of a run's readings by an error at each knot, and by each effect.
@@ -1339,6 +1343,7 @@ class _ProbedRobot(NamedTuple):
             along: the simulated run.
             times: times of the instants [s].
             time: times of the samples [s].
+            kind: type of the numbers.
             delayed: True if readings are delayed.
         """
         robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))
@@ -1368,7 +1373,7 @@ class _ProbedRobot(NamedTuple):
             by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
             term = terms(t, y, held)
             shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), self.at_sensor * term], 1)
-            return by_state @ dy + both(at_once, t, term) + shows
+            return (by_state @ dy + both(at_once, t, term) + shows).astype(kind)
 
         first, begins = first_conditions_and_state(robot, conditions)
         by_probes = jax.jacfwd(lambda a: first_conditions_and_state(self.at(a), conditions)[1])(none)
