@@ -250,10 +250,10 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (dict(generations=3), "have an effect only with --population"),
+        (dict(generations=3), "--generations: has an effect only with --population"),
         (dict(population=50), "a population search needs settled rows and --model drive or track"),
         (dict(population=2, model="drive"), "at least 4 members"),
-        (dict(generations=3, population=0, model="track"), "have an effect only with --population"),
+        (dict(generations=3, population=0, model="track"), "--generations: has an effect only with --population"),
     ],
 )
 def test_options_of_a_population_that_cannot_be_are_refused(options, says):
