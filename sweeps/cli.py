@@ -671,6 +671,8 @@ def _report_failure(error: BaseException) -> int:
         advice = "no run folder was written"
         if "sweep" in sys.argv[1:2]:
             advice = "the same command with the same --out resumes the sweep after its last complete chunk"
+        if "calibrate" in sys.argv[1:2]:
+            advice = "the same command with the same --out resumes a population after its last generation"
         if "loop" in sys.argv[1:2]:
             advice = "the same command with the same --out resumes the loop after its last complete stage"
         return _print_failure(f"interrupted; {advice}", INTERRUPTED)

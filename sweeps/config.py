@@ -365,13 +365,7 @@ class InferencePart(Part):
     seed: Seed = option_field(0, "Random seed")
 
 
-class MembersPart(Part):
-    """Folder in which a population keeps its runs. It changes no number."""
-
-    members: Path | None = option_field(None, "File for the runs of the population, to resume from")
-
-
-class FittedRuns(MembersPart, Measured, VerbosePart):
+class FittedRuns(Measured, VerbosePart):
     """Options of `calibrate` that change no number."""
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +36,7 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
-from calibration.inference.population import GENERATIONS, LEAST
+from calibration.inference.population import GENERATIONS, LEAST, StoreStage
 from calibration.inference.preparation import PreparedInput, prepare_input
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import calibration_remarks, row_numbers
@@ -71,7 +70,7 @@ def calibrate(
     starts: int | None = None,
     population: int | None = None,
     generations: int | None = None,
-    members: Path | None = None,
+    keep: StoreStage = lambda name, make: make(),
     seed: int = 0,
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
@@ -93,7 +92,7 @@ def calibrate(
         population: number of members of each generation of a search without gradients, which precedes the search with
             a rollout. None: `POPULATION` if parameters are free that `steady` does not use, otherwise 0.
         generations: largest number of generations. None: `population.GENERATIONS`.
-        members: file in which the members are stored, so that the same calibration can resume.
+        keep: storage of the population's generations, so that the same calibration can resume.
         seed: random seed of the starts and all other draws.
         profiles: True to compute a profile likelihood of each parameter.
         blocks: kinds of blocks to hold out. True: all that are informative for such data. Defaults of these two
@@ -134,11 +133,10 @@ def calibrate(
     base, of_product = _with_guide_priors(runs, ready, fidelity)
     coordinates = priors.parameter_coordinates(base, ready.names, {**of_product, **ready.stated})
     posed = observers.pose_problem(runs, base, coordinates, ready.noise.sd, fidelity)
-    has_population_options = members is not None or generations is not None
     evolved = (
-        _population_size(posed, ready.names, runs, population, has_population_options),
+        _population_size(posed, ready.names, runs, population, generations is not None),
         generations or GENERATIONS,
-        members,
+        keep,
     )
     search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress)
     setting = _CalibrationInput(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
@@ -256,15 +254,15 @@ def _population_size(posed: Problem, names: Sequence[str], runs: Runs, populatio
 
     Args:
         population: argument of `calibrate`.
-        more: True if other options of that search are given.
+        more: True if its number of generations is given.
 
     Raises:
-        BadConfiguration: options are given but there is no population, or the data do not support such a search.
+        BadConfiguration: a number of generations without a population, or the data do not support such a search.
     """
     if population is None:
         population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if more and not population:
-        raise BadConfiguration("--generations, --members: have an effect only with --population; give it too")
+        raise BadConfiguration("--generations: has an effect only with --population; give it too")
     if population and not posed.observe.starts_from_steady:
         raise BadConfiguration(
             f"--population: got {population}; a population search needs settled rows and --model drive or track"
@@ -282,7 +280,7 @@ def _search(
     starts: int,
     size: int,
     generations: int,
-    members_file: Path | None,
+    keep: StoreStage,
     seed: int,
     tell: Callable[[Remark], None],
 ) -> tuple[MultistartResult, np.ndarray | None]:
@@ -298,8 +296,6 @@ def _search(
         shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell), None
     tell(progress_remark("steady"))
-    if size:
-        population.MemberRunner(posed, members_file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
@@ -316,10 +312,9 @@ def _search(
     friction = np.array([FRICTION in name for name in easy.problem.coordinates.names])
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
-    members = population.MemberRunner(posed, members_file)
     everyone = population.run_evolution(
-        members, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
-        seed=seed, beside=points, tell=tell,
+        posed, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
+        seed=seed, beside=points, tell=tell, keep=keep,
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
@@ -333,7 +328,7 @@ def _search(
     tell(progress_remark("derivatives"))
     identifiability_there = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
     unreliable = population.unreliable_derivatives(
-        posed, members, everyone.z[best_member], identifiability_there.jacobian, identifiability_there.sd
+        posed, everyone.z[best_member], identifiability_there.jacobian, identifiability_there.sd
     )
     names = tuple(n for n, apart in zip(posed.coordinates.names, unreliable, strict=True) if apart)
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
