@@ -79,7 +79,7 @@ def read_json(path):
 
 def schema_of(command):
     """Schema of a command's result.json."""
-    return read_json(ROOT / "docs" / "schemas" / f"{command}.schema.json")
+    return read_json(ROOT / "docs/schemas" / f"{command}.schema.json")
 
 
 def motor_on_bench(torque_constant, resistance):

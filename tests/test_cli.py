@@ -125,12 +125,12 @@ def test_empty_path_and_a_table_that_is_a_number_are_refused(mmrjax, tmp_path):
 
 def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
     (tmp_path / "mine.partial").mkdir()
-    (tmp_path / "mine.partial" / "thesis.txt").write_text("years of work")
+    (tmp_path / "mine.partial/thesis.txt").write_text("years of work")
     ends(
         mmrjax("simulate --no-report --out mine --force"),
         "mine.partial already exists and was not created by mmrjax",
     )
-    assert (tmp_path / "mine.partial" / "thesis.txt").read_text() == "years of work"
+    assert (tmp_path / "mine.partial/thesis.txt").read_text() == "years of work"
 
 
 def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
@@ -146,10 +146,10 @@ def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
     import hashlib
 
     (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "runs.csv").write_text(f"{HEADER}\n6T2A,15,13.1,0,5,2.75,4800,400\n")
+    (tmp_path / "sub/runs.csv").write_text(f"{HEADER}\n6T2A,15,13.1,0,5,2.75,4800,400\n")
     assert mmrjax("compare sub/runs.csv --no-report --out x")[0] == 0
-    known = hashlib.sha256((tmp_path / "sub" / "runs.csv").read_bytes()).hexdigest()
-    assert read_json(tmp_path / "x" / "manifest.json")["hashes"]["runs.csv"] == known
+    known = hashlib.sha256((tmp_path / "sub/runs.csv").read_bytes()).hexdigest()
+    assert read_json(tmp_path / "x/manifest.json")["hashes"]["runs.csv"] == known
 
 
 @pytest.mark.slow
@@ -159,11 +159,11 @@ def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_
     _, out, err = ends(mmrjax("sweep --model track", *arguments, "--out", "t"), code=0)
     assert out.rstrip().splitlines()[-1] == "t"
     assert "simulating" in err and "4/4" in err
-    rows = table(tmp_path / "t" / "runs.csv")
+    rows = table(tmp_path / "t/runs.csv")
     assert [row["status"] for row in rows] == ["converged", "slides", "converged", "converged"]
     shares = [float(row["guide_share"]) for row in rows]
     assert shares[0] > 0.95 and shares[2:] == [0.0, 0.0]
-    assert read_json(tmp_path / "t" / "manifest.json")["versions"]["mujoco-mjx"]
+    assert read_json(tmp_path / "t/manifest.json")["versions"]["mujoco-mjx"]
 
 
 @pytest.mark.slow
@@ -255,9 +255,9 @@ def test_unwritable_or_taken_folder_is_refused(mmrjax, tmp_path):
     ends(mmrjax("sweep --out file/below"), "--out: file/below cannot be written")
     ends(mmrjax("sweep --out file"), "--out: file exists already")
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    (tmp_path / "mine/thesis.txt").write_text("years of work")
     ends(mmrjax("sweep --out mine --force"))
-    assert (tmp_path / "mine" / "thesis.txt").exists()  # --force replaces run folders only
+    assert (tmp_path / "mine/thesis.txt").exists()  # --force replaces run folders only
 
 
 def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
@@ -265,7 +265,7 @@ def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
     assert mmrjax(one)[0] == 0
     assert mmrjax(one)[0] == 2
     assert mmrjax(f"{one} --slope 5 --force")[0] == 0
-    assert table(tmp_path / "r" / "runs.csv")[0]["slope_deg"] == "5"
+    assert table(tmp_path / "r/runs.csv")[0]["slope_deg"] == "5"
 
 
 def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch):
@@ -303,7 +303,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
 
     def interrupted(compiled, values, *told):
         if len(simulated) == 3:
-            while not any((tmp_path / "s.partial" / "chunks").glob("*.npz")):
+            while not any((tmp_path / "s.partial/chunks").glob("*.npz")):
                 time.sleep(0.001)  # the first is being written meanwhile
             raise KeyboardInterrupt
         simulated.append(len(values))
@@ -312,15 +312,15 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resumes the sweep after its last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
-    kept = len(list((tmp_path / "s.partial" / "chunks").glob("*.npz")))
+    kept = len(list((tmp_path / "s.partial/chunks").glob("*.npz")))
     assert 0 < kept <= 3
     simulated.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
     assert mmrjax(f"{arguments} --chunk 10 --out s")[0] == 0
     assert simulated == [fidelities.FEW] * (6 - kept)  # filled up, and none twice
-    resumed = (tmp_path / "s" / "runs.csv").read_text()
+    resumed = (tmp_path / "s/runs.csv").read_text()
     assert mmrjax(f"{arguments} --chunk 60 --out t")[0] == 0
-    assert resumed == (tmp_path / "t" / "runs.csv").read_text()
+    assert resumed == (tmp_path / "t/runs.csv").read_text()
     assert not (tmp_path / "s.partial").exists()
 
 
@@ -333,7 +333,7 @@ def test_interrupt_before_anything_is_done_leaves_nothing(mmrjax, tmp_path, monk
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --chunk 60 --no-report --out"
     honest, calls = scale.Compiled.__call__, []
-    kept = tmp_path / "s.partial" / "chunks" / "chunk-000000.npz"
+    kept = tmp_path / "s.partial/chunks/chunk-000000.npz"
 
     def interrupted(*call):
         if calls:
@@ -350,7 +350,7 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
     assert kept.exists()
     mmrjax(arguments, "s", "--set", "motor.resistance=0.9", "--force")
     mmrjax(arguments, "t", "--set", "motor.resistance=0.9")
-    assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()
+    assert (tmp_path / "s/runs.csv").read_text() == (tmp_path / "t/runs.csv").read_text()
 
 
 @pytest.mark.slow
@@ -414,7 +414,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
 def test_flags_are_set_before_jax_is_imported(tmp_path, arguments, flags):
     """In a process of its own, up to where the options are checked and a folder refused."""
     (tmp_path / "taken").mkdir()
-    (tmp_path / "taken" / "thesis.txt").write_text("years of work")
+    (tmp_path / "taken/thesis.txt").write_text("years of work")
     (tmp_path / "grid.toml").write_text('model = "track"\n')
     probe = (
         "import os, sys\n"

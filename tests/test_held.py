@@ -12,6 +12,7 @@ from calibration.data import rig_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import scales
+from calibration.inference.calibration import calibrate
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax import effects
 from mmrjax.errors import UsageError

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
@@ -104,7 +105,7 @@ def test_repeated_instants_change_nothing():
     )
     np.testing.assert_array_equal(first, second)
     last = history_signals(robot, one, jnp.asarray(long)).speed_motor
-    np.testing.assert_allclose(last[120:], last[119], rtol=1e-12)
+    assert_allclose(last[120:], last[119], rtol=1e-12)
 
 
 def test_run_that_cannot_be_followed_is_not_finite():
@@ -126,8 +127,8 @@ def test_known_states_change_neither_values_nor_derivatives():
     by_friction = jax.jit(jax.jacfwd(current, has_aux=True))
     (slope, value), (slope_known, value_known) = by_friction(friction), by_friction(friction, known)
     assert np.abs(value).max() > 1 and np.abs(slope).max() > 0.1
-    np.testing.assert_allclose(value_known, value, rtol=1e-12)
-    np.testing.assert_allclose(slope_known, slope, rtol=1e-9, atol=1e-12)
+    assert_allclose(value_known, value, rtol=1e-12)
+    assert_allclose(slope_known, slope, rtol=1e-9, atol=1e-12)
     # And they are what is followed: those of another run are shown as they are.
     _, other = by_friction(friction, jax.tree.map(lambda x: 2 * x, known))
-    np.testing.assert_allclose(other[1:], 2 * value[1:], rtol=1e-12)
+    assert_allclose(other[1:], 2 * value[1:], rtol=1e-12)

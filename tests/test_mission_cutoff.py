@@ -1,12 +1,12 @@
 """Missions that a battery's cut-off ends: beside an independent integration, its derivative, its words, bad input."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import mmrjax as mm
@@ -18,7 +18,7 @@ from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
-from tests.commands import command_in, ends, read_rig, rows
+from tests.commands import command_in, ends, read_json, read_rig, rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -175,7 +175,7 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     _, exact = both(zero)
     for k in range(4):
         apart = (both(zero.at[k].add(h))[0] - both(zero.at[k].add(-h))[0]) / (2 * h)
-        np.testing.assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
+        assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
         assert abs(float(apart[0])) > 1.0  # s: the moment moves
 
 
@@ -216,7 +216,7 @@ def run_folder(folder, capsys, monkeypatch):
 @pytest.mark.slow
 def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
     out, err = ((run_folder.parent / f"{name}.txt").read_text() for name in ("out", "err"))
-    result = json.loads((run_folder / "result.json").read_text())
+    result = read_json(run_folder / "result.json")
     left = 100 * result["state_of_charge"]
     assert result["status"] == "cut_off" and "cut_off" in result["flags_raised"]
     assert "no charge left" not in out and f"ended with {left:.1f} % of the charge left" in " ".join(out.split())
@@ -254,7 +254,7 @@ def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, cap
         "voltage_V",
         "speed_mm_s",
     }
-    last = rows(folder / "mission" / "history.csv")[-1]
+    last = rows(folder / "mission/history.csv")[-1]
     assert float(last["distance_m"]) == pytest.approx(-float(last["displacement_m"]), rel=1e-6)
 
 

@@ -248,4 +248,4 @@ def test_calibrated_robot_is_its_fit(tmp_path):
     again = robot_file.read_robot(tmp_path / "robot.toml")
     shown = steady_batch(again, unweighed(runs).conditions(again))
     for name, reading in found.readings.items():
-        assert_allclose(np.asarray(shown.reading[name]), reading.after, rtol=1e-8)
+        assert_allclose(shown.reading[name], reading.after, rtol=1e-8)

@@ -41,7 +41,7 @@ def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name):
 def test_packaged_names_are_the_packaged_files():
     from importlib import resources
 
-    folder = resources.files("calibration") / "data" / "profiles"
+    folder = resources.files("calibration") / "data/profiles"
     assert {p.name for p in folder.iterdir()} == {f"{name}.csv" for name in profiles.PACKAGED}
 
 

@@ -129,7 +129,7 @@ def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
     for package in programs.OWN:
         (tmp_path / package / "room").mkdir(parents=True)
         for content in ("x = 1\n", "x = 2\n"):
-            (tmp_path / package / "room" / "module.py").write_text(content)
+            (tmp_path / package / "room/module.py").write_text(content)
             found.add(programs.source_hash.__wrapped__(tmp_path))
     assert len(found) == 2 * len(programs.OWN)
 

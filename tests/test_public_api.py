@@ -112,7 +112,7 @@ def test_package_states_its_names_version_and_types():
 
 
 def test_type_checkers_see_every_public_name():
-    text = (ROOT / "mmrjax" / "__init__.pyi").read_text(encoding="utf-8")
+    text = (ROOT / "mmrjax/__init__.pyi").read_text(encoding="utf-8")
     assert set(re.findall(r"import (\w+) as \1", text)) == set(mm.__all__) - {"__version__"}
 
 
@@ -404,7 +404,7 @@ def test_other_wrong_use_is_said(robot):
 
 MASKED = np.ma.masked_array([24.0, 12.0], [False, True])
 FREE = "motor.resistance"
-MEASURED = ROOT / "calibration" / "data" / "measured.csv"
+MEASURED = ROOT / "calibration/data/measured.csv"
 
 
 @pytest.fixture(scope="module")

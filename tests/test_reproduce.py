@@ -2,7 +2,6 @@
 """The paper remade by `mmrjax reproduce`: complete, offline, true to the paper's tables and to the model's numbers."""
 
 import dataclasses
-import json
 import sys
 
 import jax
@@ -20,6 +19,7 @@ from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import cli
 from sweeps.paper import data
+from tests.commands import read_json
 
 FIGURES = {
     "fig28_current_over_slope",
@@ -59,7 +59,7 @@ def paper(reproduced):
 @pytest.mark.slow
 def test_run_folder_has_the_papers_rows(paper):
     folder = paper[0]
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     assert result["schema"] == "mmrjax.reproduce/1" and result["rows"] == 20
     assert result["errors"]["paper"]["total_current"]["rms_percent"] == pytest.approx(4.0, abs=0.05)
     rows = (folder / "rows.csv").read_text().splitlines()

@@ -8,6 +8,7 @@ import re
 import equinox as eqx
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import configuration_tables, rig_facts, rig_file, robot_file, stated
 from calibration.data.input_errors import BadConfiguration
@@ -229,7 +230,7 @@ def test_linear_unit_is_a_shaft(tmp_path, travel, radius, sides):
     ]
     weight = 2.5 * GRAVITY * 0.5
     forces = [12.0 * radius / sides, 40.0 * radius**2 / sides, (3.0 + weight) * radius / sides]
-    np.testing.assert_allclose(found, [radius, 1e-5 + 2.5 * radius**2 / sides, *forces], rtol=1e-12)
+    assert_allclose(found, [radius, 1e-5 + 2.5 * radius**2 / sides, *forces], rtol=1e-12)
     assert "speed" in robot.rig.channels
     assert same(again(tmp_path, robot), robot)
 
@@ -625,7 +626,7 @@ def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
         read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
 
 
-ROBOT_FILES = ROOT / "docs" / "reference" / "robot-files.md"
+ROBOT_FILES = ROOT / "docs/reference/robot-files.md"
 PAGE = ROBOT_FILES.read_text(encoding="utf-8")
 EXAMPLES = PAGE.split("```toml\n")[1:]
 

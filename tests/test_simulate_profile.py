@@ -167,11 +167,11 @@ def test_battery_that_ends_in_the_mission_is_said(mmrjax, capsys, monkeypatch):
     ends(
         mmrjax(capsys, monkeypatch, "simulate", *words), "battery empty", "the battery's capacity is used up", code=0
     )
-    result = read_json(mmrjax.folder / "empty" / "result.json")
+    result = read_json(mmrjax.folder / "empty/result.json")
     assert result["status"] == "battery_empty" and 2 < result["duration_s"] < 5
     assert result["endurance_s"] == pytest.approx(result["duration_s"])
     assert result["state_of_charge"] == pytest.approx(0, abs=1e-6)
-    segments = rows(mmrjax.folder / "empty" / "segments.csv")
+    segments = rows(mmrjax.folder / "empty/segments.csv")
     assert len(segments["status"]) < 7 and segments["status"][-1] == "battery_empty"
 
 
@@ -299,7 +299,7 @@ def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, 
 
     (mmrjax.folder / "plan.toml").write_text(PLAN)
     ends(mmrjax(capsys, monkeypatch, "sweep", "plan.toml", "--no-report", "--out", "swept"), code=0)
-    found = xr.open_zarr(mmrjax.folder / "swept" / "results.zarr")
+    found = xr.open_zarr(mmrjax.folder / "swept/results.zarr")
     one = read_json(done / "result.json")
     assert float(found.energy_Wh.sel(payload=0)) == pytest.approx(one["energy_Wh"], rel=1e-6)
     assert float(found.energy_Wh.sel(payload=8)) > one["energy_Wh"] and found.energy_Wh.attrs["units"] == "Wh"

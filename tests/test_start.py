@@ -38,7 +38,7 @@ def written(mmrjax, tmp_path):
         (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
         asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
         assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
-        return table(tmp_path / "d" / "history.csv"), read_json(tmp_path / "d" / "result.json")
+        return table(tmp_path / "d/history.csv"), read_json(tmp_path / "d/result.json")
 
     return left
 

@@ -581,7 +581,7 @@ def test_what_is_kept_is_there():
 
 
 def test_front_door_loads_nothing_heavy():
-    if not (ROOT / "sweeps" / "cli.py").exists():
+    if not (ROOT / "sweeps/cli.py").exists():
         pytest.skip("no command line yet")
     code = "import sys, sweeps.cli; print(sorted({m.partition('.')[0] for m in sys.modules} & set(sys.argv[1:])))"
     heavy = sorted({*HEAVY, "numpy"})
@@ -719,10 +719,10 @@ def test_no_module_imports_itself_by_way_of_others():
 @pytest.mark.parametrize("found", [True, False])
 def test_a_circle_of_imports_is_found(found, tmp_path):
     (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps" / "__init__.py").write_text("")
-    (tmp_path / "sweeps" / "a.py").write_text("def f():\n    from sweeps import b")
+    (tmp_path / "sweeps/__init__.py").write_text("")
+    (tmp_path / "sweeps/a.py").write_text("def f():\n    from sweeps import b")
     guard = "pass" if found else "if TYPE_CHECKING:\n    from sweeps.a import f"
-    (tmp_path / "sweeps" / "b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
+    (tmp_path / "sweeps/b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
     assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
 
 
@@ -749,8 +749,8 @@ def test_few_modules_import_for_annotations_alone(tmp_path):
     """A type that two modules need of one another belongs below both."""
     assert len(found := annotated(ROOT)) <= ANNOTATED, found
     (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps" / "a.py").write_text("if TYPE_CHECKING:\n    from sweeps.b import f")
-    (tmp_path / "sweeps" / "b.py").write_text("if not TYPE_CHECKING:\n    from sweeps.a import f")
+    (tmp_path / "sweeps/a.py").write_text("if TYPE_CHECKING:\n    from sweeps.b import f")
+    (tmp_path / "sweeps/b.py").write_text("if not TYPE_CHECKING:\n    from sweeps.a import f")
     assert annotated(tmp_path) == ["sweeps/a.py"]
 
 

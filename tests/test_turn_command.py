@@ -1,7 +1,6 @@
 """The command `simulate` of a robot whose sides are driven apart."""
 
 import dataclasses
-import json
 import types
 
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
 from sweeps.report import check_report, run_tables, turn_report
 from sweeps.report.words import turn_words
-from tests.commands import ends, rows, text_file
+from tests.commands import ends, read_json, rows, text_file
 
 
 @pytest.mark.slow
@@ -38,7 +37,7 @@ def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
     assert "Turns to the right: a circle of 442 mm radius at 642 mm/s ahead" in out
     folder = tmp_path / "run"
     (row,) = rows(folder / "runs.csv")
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     assert result["turn"]["turning_radius_mm"] == pytest.approx(float(row["turning_radius_mm"]))
     left, right = (float(row[f"motor_voltage_{side}_V"]) for side in ("left", "right"))
     assert (left, right) == (pytest.approx(33.0), pytest.approx(15.0))
@@ -54,11 +53,11 @@ def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
 def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
     told = "--left", "24", "--right", "10", "--model", "track", "--duration", "0.2", "--no-report"
     assert mmrjax("simulate", *told, "--out", str(tmp_path / "run"))[0] == 0
-    first, *_, last = rows(tmp_path / "run" / "history.csv")
+    first, *_, last = rows(tmp_path / "run/history.csv")
     assert float(last["yaw_deg"]) < -0.2 < float(first["yaw_deg"]) < 0
     assert float(last["motor_current_left_A"]) > float(last["motor_current_right_A"]) > 0.5
     assert float(last["x_mm"]) > 20
-    (row,) = rows(tmp_path / "run" / "runs.csv")
+    (row,) = rows(tmp_path / "run/runs.csv")
     assert 0.95 < float(row["guide_share"]) < 1
 
 
@@ -66,12 +65,12 @@ def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
 def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
     told = "--speed", "0.3", "--yaw-rate", "1", "--voltage", "24", "--no-report"
     assert mmrjax("simulate", *told, "--out", str(tmp_path / "asked"))[0] == 0
-    (asked,) = rows(tmp_path / "asked" / "runs.csv")
+    (asked,) = rows(tmp_path / "asked/runs.csv")
     assert float(asked["speed_mm_s"]) == pytest.approx(300.0, rel=1e-6)
     assert float(asked["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
     sides = [word for side in ("left", "right") for word in (f"--{side}", asked[f"motor_voltage_{side}_V"])]
     assert mmrjax("simulate", *sides, "--no-report", "--out", str(tmp_path / "driven"))[0] == 0
-    (driven,) = rows(tmp_path / "driven" / "runs.csv")
+    (driven,) = rows(tmp_path / "driven/runs.csv")
     assert float(driven["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
     code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
     assert code == 2
@@ -340,7 +339,7 @@ def test_a_sweep_over_duties_leaves_yaw_rates(tmp_path, mmrjax):
     (tmp_path / "plan.toml").write_text(PLAN)
     told = "sweep", str(tmp_path / "plan.toml"), "--export", "csv", "--no-report", "--out", str(tmp_path / "run")
     assert mmrjax(*told)[0] == 0
-    spot, straight = rows(tmp_path / "run" / "runs.csv")
+    spot, straight = rows(tmp_path / "run/runs.csv")
     assert float(spot["yaw_rate_rad_s"]) > 3 and float(spot["speed_mm_s"]) == pytest.approx(0.0, abs=1e-6)
     assert float(straight["yaw_rate_rad_s"]) == pytest.approx(0.0, abs=1e-9)
 
@@ -359,7 +358,7 @@ def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings
         f"{HEADER}total_mass_kg,{SIDED},total_current_A,{','.join(read)}\n6T2A,24,0,0,25,0.6,1,2.3,0.4,1.9,0.7\n"
     )
     assert mmrjax("compare", path, "--out", tmp_path / "out")[0] == 0
-    found = (tmp_path / "out" / "comparison.csv").read_text().splitlines()
+    found = (tmp_path / "out/comparison.csv").read_text().splitlines()
     row = dict(zip(*(line.split(",") for line in found), strict=True))
     assert [float(row[name]) for name in read] == [0.4, 1.9, 0.7]
     left, right, yaw_rate = (float(row[f"simulated_{name}"]) for name in read)

@@ -4,8 +4,8 @@ import dataclasses
 import types
 import warnings
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.data import effect_file
@@ -96,7 +96,7 @@ def test_unlike_sides_turn_as_those_that_are_driven_alike(tmp_path):
     file = of_file(tmp_path, SIDE_RADIUS)
     asked = mm.Conditions(["6T2A", "4W2T"], voltage=33.0, duty_left=1.0, duty_right=1.0)
     rates = mm.simulate(file.robot, asked).reading["yaw_rate"]
-    np.testing.assert_allclose(
+    assert_allclose(
         turning_figures.turns_under_equal_commands(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12
     )
     assert abs(rates[0]) < 1e-9 and rates[1] > 0.01  # the left side's radius is the smaller

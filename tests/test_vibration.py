@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vibration
+from numpy.testing import assert_allclose
 
 from calibration.data.runs import Runs
 from calibration.discovery.discover import discover
@@ -47,7 +48,7 @@ def test_the_equation_that_is_written_is_the_one_that_runs(place):
     got = effect.term(
         paper_robots.nominal(), Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed)
     )
-    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    assert_allclose(got, expected, rtol=1e-12)
     assert expected[6] / (0.03 * (speed / first) ** exponent * 19) < 0.72  # rounded off
 
 
