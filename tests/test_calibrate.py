@@ -370,8 +370,7 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
     assert np.isfinite(table["after_total_current_A"][2]) and np.isnan(table["error_total_current_sigma"][2])
 
 
-def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
-    robot = paper_robots.nominal()
+def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps, robot):
     coordinates = priors.parameter_coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
     sd = noise.noise_from_table(gaps, observers.observer_kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
     posed = observers.pose_problem(gaps, robot, coordinates, sd)

@@ -214,11 +214,11 @@ def test_a_controller_that_cannot_be_is_refused(actuator, case):
         actuator(old=old, new=new)
 
 
-def test_a_goal_and_a_controller_need_each_other(actuator):
+def test_a_goal_and_a_controller_need_each_other(actuator, robot):
     with pytest.raises(mm.UsageError, match="goal: not stated"):
         mm.simulate(actuator(), mm.Conditions(voltage=7.4), model="drive")
     with pytest.raises(mm.UsageError, match="the robot has no controller"):
-        mm.simulate(mm.nominal(), mm.Conditions(goal=1.0))
+        mm.simulate(robot, mm.Conditions(goal=1.0))
     with pytest.raises(mm.UsageError, match="a controller needs model='drive'"):
         mm.simulate(actuator(), mm.Conditions(voltage=7.4, goal=1.0))
 

@@ -26,7 +26,7 @@ from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observe_at
 from mmrjax.effects import BY_NAME
-from mmrjax.model import channels, paper_robots, params
+from mmrjax.model import channels, params
 
 
 @pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
@@ -356,11 +356,11 @@ def test_null_of_one_column_is_normal(clean):
 
 
 @pytest.mark.slow
-def test_bootstrap_of_the_measured_runs_settles():
+def test_bootstrap_of_the_measured_runs_settles(robot):
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
     sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.build_candidate_space(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
+    space = discover.build_candidate_space(runs, robot, sd, settings, {}, SETTLED.library)
     screened = screen_outliers(
         fit_base(space, settings, "measured"), lambda b: discover.bases_at_fit(runs, b), runs, settings
     )

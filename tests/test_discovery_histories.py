@@ -26,7 +26,7 @@ from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
 from mmrjax.effects import BY_NAME, UNNAMED
 from mmrjax.effects.curve import ordinate_weights
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 
 #: What these histories are searched for; the whole library is what the command and the campaign search.
 SEARCHED = ("rotating_inertia", "series_resistance", "churning", "grouser_polygon", "pulley_eccentricity")
@@ -273,10 +273,10 @@ def test_memory_tells_noise_from_what_remembers(seen):
 
 
 @pytest.mark.slow
-def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
+def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs, robot):
     short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))
-    observer = Histories.of(mixed, paper_robots.nominal())
+    observer = Histories.of(mixed, robot)
     times, names = mixed["time_s"], mixed["run_id"]
     for k, name in enumerate(np.unique(names)):
         there = times[np.asarray(observer.knots[k])]
@@ -290,12 +290,12 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
 
 
 @pytest.mark.slow
-def test_histories_that_do_not_start_from_rest_are_refused(runs):
+def test_histories_that_do_not_start_from_rest_are_refused(runs, robot):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32
     with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* begins at rest"):
-        Histories.check_start(late, known(late), paper_robots.nominal())
-    Histories.check_start(runs, known(runs), paper_robots.nominal())
+        Histories.check_start(late, known(late), robot)
+    Histories.check_start(runs, known(runs), robot)
 
 
 @pytest.mark.slow

@@ -47,8 +47,7 @@ def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
     assert np.diff(time_grid(np.array([0.0, 600.0]))).max() > LONGEST  # a long run: no more steps than it can have
 
 
-def test_histories_follow_drive():
-    robot = paper_robots.nominal()
+def test_histories_follow_drive(robot):
     times = jnp.asarray(np.concatenate([[0.0], TIMES]))
     s = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-9, max_steps=20000).signals))(RUNS)
     expected = np.stack([np.asarray(getattr(s, k)) for k in STATE], -1)[:, 1:]
@@ -95,8 +94,7 @@ def test_derivatives_are_those_of_what_is_computed(changes):
 
 
 @pytest.mark.slow
-def test_repeated_instants_change_nothing():
-    robot = paper_robots.nominal()
+def test_repeated_instants_change_nothing(robot):
     short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
     one = jax.tree.map(lambda x: x[0], RUNS)
     first, second = (
@@ -108,8 +106,8 @@ def test_repeated_instants_change_nothing():
     assert_allclose(last[120:], last[119], rtol=1e-12)
 
 
-def test_run_that_cannot_be_followed_is_not_finite():
-    robot = params.replace(paper_robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
+def test_run_that_cannot_be_followed_is_not_finite(robot):
+    robot = params.replace(robot, {"motor.resistance": jnp.asarray(jnp.nan)})
     assert not np.isfinite(seen_compiled(robot)).any()
 
 

@@ -154,10 +154,10 @@ def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
         assert power_figures.draw_chart_of_corners(robot, [corner]).axes
 
 
-def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox():
+def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox(robot):
     """Driving, the load needs 1/η of its torque, driven back it gives η of it, and `backdriving_loss` less. Readings of
     the same robot lie on its lines."""
-    robot = params.replace(paper_robots.nominal(), {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0})
+    robot = params.replace(robot, {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0})
     load, losing = (
         np.array([-4.0, 4.0]),
         dataclasses.replace(robot, effects=(effects.BY_NAME["backdriving_loss"](amplitude=0.25),)),

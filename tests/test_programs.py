@@ -68,8 +68,7 @@ def test_a_program_of_this_process_is_not_read_again(folder):
     assert kept.of(((3 * MATRIX,), {})) is first
 
 
-def test_results_come_back_with_what_is_no_array(folder):
-    robot = paper_robots.nominal()
+def test_results_come_back_with_what_is_no_array(folder, robot):
     for function in (for_equations, untraceable(for_equations)):
         found = programs.Programs(function).of(((robot,), {}))(((robot,), {}))
         assert found.configurations.names == robot.configurations.names and found.rig == robot.rig

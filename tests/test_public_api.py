@@ -94,9 +94,9 @@ def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
         mm.replace(robot, {"friction_coulomb": 0.5})
 
 
-def test_package_states_its_names_version_and_types():
+def test_package_states_its_names_version_and_types(robot):
     assert set(mm.__all__) <= set(dir(mm))
-    assert {"motor", "gearbox", "battery"} <= set(dir(mm.nominal())) and "within" not in dir(mm.nominal())
+    assert {"motor", "gearbox", "battery"} <= set(dir(robot)) and "within" not in dir(robot)
     for name in mm.__all__:
         assert getattr(mm, name) is not None
     with pytest.raises(AttributeError, match="module 'mmrjax' has no attribute 'simulat'"):
@@ -313,12 +313,10 @@ def test_derivative_by_conditions_and_through_bad_values_passes_the_door(robot):
 # --- wrong use --------------------------------------------------------------------------------------------
 
 
-def test_every_packaged_robot_is_within_its_bounds():
+def test_every_packaged_robot_is_within_its_bounds(robot):
     for build in paper_robots.ROBOTS.values():
         mm.simulate(build(), mm.Conditions())
-    mm.simulate(
-        dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in ALL)), mm.Conditions()
-    )
+    mm.simulate(dataclasses.replace(robot, effects=tuple(effect() for effect in ALL)), mm.Conditions())
 
 
 def with_value(name, value):

@@ -272,8 +272,8 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
 
 
 @pytest.mark.slow
-def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
-    clean = calibrate(measured_table(1, 0.0), paper_robots.nominal(), starts=2, profiles=False, blocks=())
+def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path, robot):
+    clean = calibrate(measured_table(1, 0.0), robot, starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
     document = calibration_report.calibration_document(clean, "nominal")
     page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")

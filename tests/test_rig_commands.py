@@ -12,7 +12,6 @@ from calibration.data.runs import Runs
 from calibration.inference.simulation_errors import relative_error, sized_error
 from mmrjax import fidelities
 from mmrjax.model import channels, params, quantities
-from mmrjax.model.paper_robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.points import imposed
@@ -480,8 +479,8 @@ def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):
     assert "bench.radius" not in {p[0] for p in capabilities.rig_parameters(robot_file.parse_robot_file(bench))}
 
 
-def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):
-    specs = {p.name: p.spec for p in params.walk_parameters(nominal())}
+def test_the_packaged_robots_parameters_keep_their_sources(tmp_path, robot):
+    specs = {p.name: p.spec for p in params.walk_parameters(robot)}
     assert "eq. (15)" in specs["motor.resistance"].meaning
     own_specs = {p.name: p.spec for p in params.walk_parameters(robot_file.read_robot(of_kind(tmp_path, "bench")))}
     assert "eq." not in own_specs["motor.resistance"].meaning

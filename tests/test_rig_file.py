@@ -16,7 +16,7 @@ from calibration.inference import priors
 from calibration.sensitivity import uncertain_inputs
 from mmrjax import effects
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Instrument
 from mmrjax.model.shaft import Shaft
@@ -436,8 +436,8 @@ def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
     assert said.startswith("rig.toml") and "\n" not in said
 
 
-def test_packaged_robot_is_as_it_was(tmp_path):
-    robot = robot_file.add_effects(paper_robots.nominal(), tuple(effects.BY_NAME))
+def test_packaged_robot_is_as_it_was(tmp_path, robot):
+    robot = robot_file.add_effects(robot, tuple(effects.BY_NAME))
     assert same(again(tmp_path, robot), robot) and "[rig]" not in (tmp_path / "again.toml").read_text()
 
 
@@ -638,9 +638,9 @@ def test_example_of_the_page_reads(tmp_path, text):
     assert same(again(tmp_path, robot), robot)
 
 
-def test_every_key_of_robot_files_is_in_the_reference():
+def test_every_key_of_robot_files_is_in_the_reference(robot):
     parameters = (ROBOT_FILES.parent / "parameters.md").read_text(encoding="utf-8")
-    own = {p.name for p in params.walk_parameters(paper_robots.nominal())}
+    own = {p.name for p in params.walk_parameters(robot)}
     fixed = {*robot_file.COUNTS, *robot_file.RATINGS, *robot_file.SWITCHES, *robot_file.CHOICES}
     lacking = {name for name in own | fixed if f"`{name}`" not in parameters}
     shaft = {field.name for field in dataclasses.fields(Shaft) if "spec" in field.metadata}

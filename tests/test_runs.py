@@ -9,7 +9,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
 from calibration.data.table import Runs
-from mmrjax.model import channels, paper_robots
+from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from sweeps.pages import loop_figures
 from sweeps.pages.time_overlay import time_overlay
@@ -400,20 +400,20 @@ def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
         records.read_runs(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 20])))
 
 
-def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path):
+def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path, robot):
     text = f"{HEADER}\n{ROW}\n".replace("slope_deg", "Slope_Deg").replace("6T2A", "6t2a")
-    found = records.read_runs(written(tmp_path, text), robot=paper_robots.nominal())
+    found = records.read_runs(written(tmp_path, text), robot=robot)
     assert found["slope_deg"].tolist() == [5.0] and found["configuration"].tolist() == ["6T2A"]
     assert found.notes == (
         "runs.csv: column Slope_Deg is read as slope_deg", "runs.csv: configuration 6t2a is read as 6T2A",
     )  # fmt: skip
 
 
-def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
+def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path, robot):
     header = f"{HEADER.replace(',motor_speed_rpm', '')},run_id"
     rows = [ROW.replace(",4800", "").replace("2.75", f"2.7{k}") + f",{run}" for k, run in enumerate("abac")]
     rows[1] = rows[1].replace("2.71", "")
-    found = records.read_runs(written(tmp_path, "\n".join([header, *rows])), robot=paper_robots.nominal())
+    found = records.read_runs(written(tmp_path, "\n".join([header, *rows])), robot=robot)
     assert found.notes == (
         "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2. They are ignored",
         "runs.csv: no column motor_speed_rpm, so this channel has no readings",

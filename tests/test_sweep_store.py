@@ -103,7 +103,7 @@ def whole(tmp_path_factory):
 # --- what is left -------------------------------------------------------------------------------------------
 
 
-def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
+def test_store_is_opened_by_xarray_with_units_and_long_names(whole, robot):
     found = xr.open_zarr(whole / zarr_store.STORE)
     assert dict(found.sizes) == {"configuration": 2, "slope_deg": 3, "sample": 50}
     assert found["configuration"].values.tolist() == ["6T2A", "4W2T"]
@@ -113,7 +113,7 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert units == {
         "total_current": "A", "motor_speed": "rpm", "speed": "mm/s", "status": None, "configuration": None,
         "slope_deg": "deg", "motor.resistance": "Ohm", "voltage": "V",
-    } | {"motor.resistance": next(p.spec.unit for p in params.walk_parameters(paper_robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
+    } | {"motor.resistance": next(p.spec.unit for p in params.walk_parameters(robot) if p.name == "motor.resistance")}  # fmt: skip
     assert all(found[name].attrs["long_name"] for name in units)
     meanings = dict(zip(found.status.attrs["flag_values"], found.status.attrs["flag_meanings"].split(), strict=True))
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
@@ -161,12 +161,12 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
 
 
 @pytest.mark.slow
-def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
+def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path, robot):
     grid = ["sweep", "--slopes", "0,5", "--payloads", "0", "--voltages", "24", "--no-report"]
     assert mmrjax(*grid, "--outputs", "slip, flags", "--out", "s")[0] == 0
     found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
     assert set(found.data_vars) == {"slip", "flags", "status"}
-    alone = steady(paper_robots.nominal(), Conditions(0, 24.0, 5.0, 0.0))
+    alone = steady(robot, Conditions(0, 24.0, 5.0, 0.0))
     assert_allclose(found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12)
     ends(mmrjax(*grid, "--outputs", "slipp", "--out", "t"), "outputs: got slipp; did you mean slip")
 
@@ -859,10 +859,9 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
     assert (tmp_path / "s.partial/thesis.txt").is_file() and (tmp_path / "t/thesis.txt").is_file()
 
 
-def test_layout_counts_its_bytes_without_writing(whole):
+def test_layout_counts_its_bytes_without_writing(whole, robot):
     """Without overhead for large chunks: 9 bytes a point of one output and its status."""
     config = Campaign(axes={"voltage": np.linspace(15, 33, 4_000_000).tolist()}, chunk=10**6, outputs=("speed",))
-    robot = paper_robots.nominal()
     job = prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x")
     assert store_layout(config, job).size == pytest.approx((9 + 8) * 4e6, rel=2e-3)
 

@@ -91,13 +91,13 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
     assert "overvoltage" not in out
 
 
-def test_a_cell_has_no_voltage_on_the_external_supply():
-    found = api.simulate(paper_robots.nominal(), api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
+def test_a_cell_has_no_voltage_on_the_external_supply(robot):
+    found = api.simulate(robot, api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
     assert (np.asarray(found.voltage_cell) > 0).tolist() == [False, True]
     assert np.isnan(found.to_dict()["supply_voltage_V"]).tolist() == [False, True]
 
 
-def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
+def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path, robot):
     blocked = ("--configuration", "4W2T", "--slope", 20, "--payload", 200, "--surface", "concrete")
     ends(mmrjax("simulate", *blocked, "--out", "a"), "none settles", code=0)
     text = (tmp_path / "a/result.json").read_text()
@@ -107,7 +107,7 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     notes = json.loads(text)["notes"]
     assert notes[1].startswith(said)
     time = float(row["permissible_time_s"])
-    permissible = jax.jit(lambda current: paper_robots.nominal().motor.time_permissible(current))
+    permissible = jax.jit(lambda current: robot.motor.time_permissible(current))
     assert time == pytest.approx(float(permissible(float(row["total_current_A"]) / 2)), rel=1e-4)
     assert notes[0].startswith(f"winding_hot: 125 °C are reached after {time:.3g} s at this current")
     assert row["winding_settled_C"] == "" and "winding_hot" in row["flags"]
@@ -115,8 +115,8 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     assert "none settles" in page and ">inf" not in page and "nan %" not in page
 
 
-def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance():
-    motor = paper_robots.nominal().motor
+def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance(robot):
+    motor = robot.motor
     assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
 
 
@@ -217,9 +217,9 @@ def climb():
 
 
 @pytest.mark.slow
-def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
+def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path, robot):
     _, found = climb
-    fine = drive_batch(paper_robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
+    fine = drive_batch(robot, api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
     _, out, _ = ends(mmrjax("simulate --model drive --slope", 10, "--no-report", "--out", "a"), code=0)
@@ -273,8 +273,8 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_may_last_a_day(mmrjax):
-    found = api.simulate(paper_robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
+def test_a_run_may_last_a_day(mmrjax, robot):
+    found = api.simulate(robot, api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
     ends(mmrjax("simulate --model drive --duration 86401"), "86400")
     ends(
@@ -283,9 +283,9 @@ def test_a_run_may_last_a_day(mmrjax):
     )
 
 
-def test_remarks_name_the_run_they_are_of():
-    found = api.simulate(paper_robots.nominal(), api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
-    shown = run_remarks(paper_robots.nominal(), found.to_dict())
+def test_remarks_name_the_run_they_are_of(robot):
+    found = api.simulate(robot, api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
+    shown = run_remarks(robot, found.to_dict())
     assert len(shown) == 2 and shown[0].startswith("run 2: winding_hot: 125 °C are reached after ")
     assert shown[1].startswith("run 2: winding, long running: none settles")
 
@@ -296,8 +296,8 @@ RATED = (
 )
 
 
-def test_rated_limits_and_switches_are_read_and_written(tmp_path):
-    nominal = paper_robots.nominal()
+def test_rated_limits_and_switches_are_read_and_written(tmp_path, robot):
+    nominal = robot
     assert nominal.gearbox.torque_limit == pytest.approx(3.0 * 25 / 12)
     robot = read_rig(tmp_path, RATED, "mine.toml")
     assert (robot.gearbox.torque_limit, robot.gearbox.mesh_theory, robot.driver.returns_current) == (4.5, True, False)
@@ -327,9 +327,9 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
         ({"battery.current_charge": True}, "battery.current_charge: got True; expected a number"),
     ],
 )
-def test_bad_limits_and_switches_are_refused(values, sentence):
+def test_bad_limits_and_switches_are_refused(values, sentence, robot):
     with pytest.raises(BadConfiguration, match=sentence):
-        robot_file.change_robot(paper_robots.nominal(), values, where="mine.toml")
+        robot_file.change_robot(robot, values, where="mine.toml")
 
 
 @pytest.mark.slow
@@ -340,8 +340,7 @@ def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
     ends(mmrjax("simulate --set gearbox.mesh_theory=2 --out b"), "expected true or false")
 
 
-def test_rated_limits_stand_in_the_report():
-    robot = paper_robots.nominal()
+def test_rated_limits_stand_in_the_report(robot):
     found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
     run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
     shown = {line["words"]: line for line in runs_report.limits_used(robot, run)}

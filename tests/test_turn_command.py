@@ -195,11 +195,11 @@ def row(**changes):
     return usual | sides | changes
 
 
-def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves():
+def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves(robot):
     """Beside a braked side it moves aside by a third of how it moves ahead, so its circle is the larger one."""
     reading = {"yaw_rate": [-2.0, 2.0, 0.0], "speed": [0.3, -0.3, 0.3], "lateral_speed": [0.1, 0.1, 0.0]}
     reading |= {f"motor_{what}_{side}": np.ones(3) for what in ("speed", "current", "voltage") for side in SIDES}
-    found = derived.turning_columns(paper_robots.nominal(), reading, np.full(3, 0.04))
+    found = derived.turning_columns(robot, reading, np.full(3, 0.04))
     size = 1000 * np.hypot(0.3, 0.1) / 2
     assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
     away = np.hypot(found["centre_x_mm"][:2], found["centre_y_mm"][:2])
@@ -269,9 +269,9 @@ def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
         )
 
 
-def test_one_imposed_speed_of_two_sides_is_refused():
+def test_one_imposed_speed_of_two_sides_is_refused(robot):
     with pytest.raises(mm.UsageError, match="motor_speed_left needs motor_speed_right too; give both"):
-        mm.simulate(paper_robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
+        mm.simulate(robot, mm.Conditions("6T2A", motor_speed_left=800.0))
 
 
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
@@ -307,8 +307,7 @@ def told(robot, name, ended=None):
     yield from (" | ".join(map(str, side)) for side in turn_report.sides_table(robot, turn).rows)
 
 
-def test_turns_are_told_as_recorded():
-    robot = paper_robots.nominal()
+def test_turns_are_told_as_recorded(robot):
     wide = params.replace(robot, {"6T2A.turning.width": 0.5})
     unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
     lines = [line for name in TOLD for line in told(robot, name)]
@@ -327,8 +326,7 @@ def test_turns_are_told_as_recorded():
 PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axes]\nduty_left = [-1, 1]\n'
 
 
-def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before():
-    robot = paper_robots.nominal()
+def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before(robot):
     assert showing_turns(robot, {"voltage", "slope_deg"}) is robot
     shown = showing_turns(robot, {"voltage", "duty_left"}).channels
     assert {"yaw_rate", "motor_current_left", "speed"} <= {c.name for c in shown}
@@ -366,12 +364,12 @@ def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings
     assert (row["duty_left"], row["duty_right"]) == ("0.6", "1")
 
 
-def test_simulate_in_python_refuses_turns_as_the_command_line_does():
-    alone = dataclasses.replace(mm.nominal(), sides=jnp.asarray(1.0))
+def test_simulate_in_python_refuses_turns_as_the_command_line_does(robot):
+    alone = dataclasses.replace(robot, sides=jnp.asarray(1.0))
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
     with pytest.raises(UsageError, match="duty cannot be combined with duty_left and duty_right"):
-        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
+        mm.simulate(robot, mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
 
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
@@ -406,8 +404,8 @@ def test_profiles_in_python_are_refused_before_they_are_followed(robot, told, sa
         mm.simulate(robot, mm.Conditions("6T2A"), **told)
 
 
-def test_tables_have_no_negative_zero():
-    straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
+def test_tables_have_no_negative_zero(robot):
+    straight = mm.simulate(robot, mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
     assert "-0" not in straight.table() and "0.00" in straight.table()
     table = {"slope_deg": np.array([-0.0]), "speed_mm_s": np.array([-0.01])}
     shown = run_tables.quantity_table("runs", table, table)
