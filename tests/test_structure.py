@@ -155,18 +155,18 @@ def observers_alone_know_the_kind_of_data(path, tree):
         return
     for node in walked(tree):
         if isinstance(node, ast.Call):
-            called = ast.unparse(node.func)
+            called = _dotted(node.func)
             if called in ("isinstance", "issubclass") and len(node.args) == 2:
                 asked = {n.id for n in walked(node.args[1]) if isinstance(n, ast.Name)}
                 asked |= {n.attr for n in walked(node.args[1]) if isinstance(n, ast.Attribute)}
                 if asked & OBSERVERS:
                     yield node.lineno, "asks for the class of an observer"
-            if called.endswith(".has") and any(
+            if getattr(node.func, "attr", "") == "has" and any(
                 isinstance(a, ast.Constant) and a.value == "time_s" for a in node.args
             ):
                 yield node.lineno, "asks whether a table has time_s"
         if isinstance(node, ast.Compare):
-            sides = {ast.unparse(x).rpartition(".")[2] for x in (node.left, *node.comparators)}
+            sides = {getattr(x, "attr", getattr(x, "id", "")) for x in (node.left, *node.comparators)}
             if sides & OBSERVERS:
                 yield node.lineno, "compares the class of an observer"
         if isinstance(node, ast.Attribute) and node.attr in ("series", "is_series"):
@@ -330,16 +330,16 @@ def _changed(node, inside):
         yield from node.names
     elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         made = (d.func if isinstance(d, ast.Call) else d for d in node.decorator_list)
-        yield from (node.name for d in made if ast.unparse(d).rpartition(".")[2] in CACHES)
-    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(CARRIERS):
-        yield ast.unparse(node.func)
+        yield from (node.name for d in made if _dotted(d).rpartition(".")[2] in CACHES)
+    elif isinstance(node, ast.Call) and _dotted(node.func).endswith(CARRIERS):
+        yield _dotted(node.func)
     elif isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del) and inside:
-        yield "globals" if ast.unparse(node).startswith("globals()[") else _dotted(node)
+        yield "globals" if "globals" in {getattr(n, "id", "") for n in ast.walk(node)} else _dotted(node)
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and inside:
         if node.func.attr in CHANGES:
             yield _dotted(node.func.value)
-    elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("setattr", "delattr") and inside:
-        yield f"{_dotted(node.args[0])}.{ast.unparse(node.func)}"
+    elif isinstance(node, ast.Call) and _dotted(node.func) in ("setattr", "delattr") and inside:
+        yield f"{_dotted(node.args[0])}.{_dotted(node.func)}"
 
 
 def modules_keep_no_state(path, tree):
@@ -398,7 +398,7 @@ def of_errors(tree):
         made = [
             n
             for n in inside
-            if isinstance(n, ast.Raise) or (isinstance(n, ast.Call) and ast.unparse(n.func).startswith("Bad"))
+            if isinstance(n, ast.Raise) or (isinstance(n, ast.Call) and _dotted(n.func).startswith("Bad"))
         ]
         taken = [n for error in made for n in walked(error)]
         names = {n.id for n in taken if isinstance(n, ast.Name)}
@@ -406,7 +406,7 @@ def of_errors(tree):
             if isinstance(n, ast.Assign) and {t.id for t in n.targets if isinstance(t, ast.Name)} & names:
                 taken += walked(n.value)
         found |= {id(n) for n in taken}
-        called |= {ast.unparse(n.func) for n in taken if isinstance(n, ast.Call)}
+        called |= {_dotted(n.func) for n in taken if isinstance(n, ast.Call)}
     return found | {id(n) for function in functions if function.name in called for n in walked(function)}
 
 
@@ -676,8 +676,21 @@ def test_one_preparation_serves_all():
     assert found == allowed
     for room in ("inference/calibration", "inference/foresight", "discovery/discover"):
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
-        calls = {ast.unparse(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
+        calls = {_dotted(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
         assert "prepare_input" in calls, room
+
+
+def statements(body, annotations=False):
+    """Statements at any depth of a body, either those for annotations alone, under `TYPE_CHECKING`, or all others."""
+    for node in body:
+        inner = [n for name in ("body", "handlers", "cases") for n in getattr(node, name, ())]
+        if isinstance(node, ast.If) and _dotted(node.test) == "TYPE_CHECKING":
+            yield from node.body if annotations else ()
+            inner = []
+        elif not annotations:
+            yield node
+        inner += [n for name in ("orelse", "finalbody") for n in getattr(node, name, ())]
+        yield from statements(inner, annotations)
 
 
 def circle(root):
@@ -686,10 +699,6 @@ def circle(root):
     Imports for annotations alone (under `TYPE_CHECKING`) are no part of it.
     """
 
-    class Runs(ast.NodeTransformer):
-        def visit_If(self, node):
-            return node.orelse or None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
-
     files = {}
     for file in (file for layer in LAYERS for file in sorted((root / layer).rglob("*.py"))):
         parts = file.relative_to(root).with_suffix("").parts
@@ -697,9 +706,10 @@ def circle(root):
     graph = {}
     for name, file in files.items():
         package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-        tree = Runs().visit(ast.parse(file.read_text(encoding="utf-8")))
         graph[name] = set()
-        for node in (n for n in walked(tree) if isinstance(n, ast.Import | ast.ImportFrom)):
+        for node in statements(ast.parse(file.read_text(encoding="utf-8")).body):
+            if not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
             imported = [module for module, _ in names_imported(ast.Module([node], []), package)]
             whole, *each = [m for m in imported if m in files] or [""]
             # What is imported from a package is its modules, and the package itself only where one is none of them.
@@ -737,10 +747,8 @@ def annotated(root):
         for layer in LAYERS
         for path in sorted((root / layer).rglob("*.py"))
         if any(
-            isinstance(node, ast.If)
-            and ast.unparse(node.test) == "TYPE_CHECKING"
-            and any(isinstance(x, ast.Import | ast.ImportFrom) for x in node.body)
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            isinstance(node, ast.Import | ast.ImportFrom)
+            for node in statements(ast.parse(path.read_text(encoding="utf-8")).body, annotations=True)
         )
     ]
 

@@ -20,6 +20,8 @@ from calibration.inference.identifiability import Z95
 
 #: Units of position, with radians in one of them (of a length: 0).
 UNITS = {"rotation": 2 * np.pi, "rad": 1.0, "degree": np.pi / 180, "m": 0.0}
+#: Constants of the law. Only a lift and an arm have the last one.
+CONSTANTS = "kS", "kV", "kA", "kG"
 #: Names of the four tests, and what a log without them calls them.
 TESTS = {
     "quasistatic-forward": "slow-forward", "quasistatic-reverse": "slow-backward",
@@ -170,8 +172,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         windows = {key: x[windows["demand"] < level] for key, x in windows.items()}
     values, covariance, _ = _fit_constants(windows, mechanism)
     sds = np.sqrt(np.diag(covariance))
-    names = ("kS", "kV", "kA", "kG")[: len(values)]
-    constants, spread = (dict(zip(names, numbers.tolist(), strict=True)) for numbers in (values, sds))
+    constants, spread = (dict(zip(CONSTANTS, x.tolist(), strict=False)) for x in (values, sds))
     if mechanism == "simple":
         remarks += _direction_remarks(windows)
     remarks += _battery_remarks(log)
@@ -191,14 +192,9 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         prompt = feedback_gains(constants["kV"], constants["kA"], dataclasses.replace(tolerances_used, delay=0.0))
         remarks.append(Remark("feedforward_gains_delayed", delay=tolerances_used.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
-    figures = {
-        "run": windows["run"],
-        "voltage_V": windows["u"] / windows["T"],
-        "velocity": windows["x"] / windows["T"],
-        "acceleration": windows["dv"] / windows["T"],
-        "direction": windows["s"] / windows["T"],
-        "quasistatic": windows["quasistatic"],
-    }
+    integrals = {"voltage_V": "u", "velocity": "x", "acceleration": "dv", "direction": "s"}
+    means = {name: windows[key] / windows["T"] for name, key in integrals.items()}
+    figures = {"run": windows["run"], **means, "quasistatic": windows["quasistatic"]}
     return Feedforward(
         mechanism, log.unit, constants, spread, gains, tolerances_used, delay, lag, missing, figures, tuple(remarks)
     )  # fmt: skip
