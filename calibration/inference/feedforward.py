@@ -178,10 +178,10 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
-    determined = 0 < Z95 * spread["kA"] < 0.5 * constants["kA"]
-    if not determined:
+    share = Z95 * spread["kA"] / constants["kA"]
+    if not (determined := 0 < share < 0.5):
         slow = [t for t in missing if t.startswith("dynamic")]
-        remarks.append(Remark("feedforward_no_kA", share=spread["kA"] * Z95 / abs(constants["kA"]), missing=slow))
+        remarks.append(Remark("feedforward_no_kA", share=abs(share), missing=slow))
     tolerances_used = tolerances or Tolerances()
     if tolerances_used.delay is None:
         tolerances_used = dataclasses.replace(tolerances_used, delay=delay + lag)
