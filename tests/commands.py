@@ -67,9 +67,9 @@ def read_rig(folder, text, name="rig.toml", **options):
     return robot_file.read_robot(text_file(folder / name, text), **options)
 
 
-def read_table(folder, text, robot, name="log.csv"):
+def read_table(folder, text, robot=None, name="log.csv", **options):
     """The runs of a new table with this text."""
-    return records.read_runs(text_file(folder / name, text), robot=robot)
+    return records.read_runs(text_file(folder / name, text), robot=robot, **options)
 
 
 def read_json(path):

@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config, options
 from sweeps.points import scale
-from tests.commands import ends, read_json
+from tests.commands import ends, read_json, text_file
 from tests.commands import rows as table
 from tests.pages import recorded
 
@@ -104,23 +104,25 @@ USAGE = {
     "duration without end": ("simulate --model track --duration inf", r"--duration: got inf"),
     "discharge without battery": ("sweep --discharge 100", r"--discharge has an effect only with --battery"),
     "duration of zero": ("simulate --duration 0", r"--duration: got 0"),
+    "a misspelt key": ("sweep --config grid.toml", r"grid\.toml, slops_deg: no such key; did you mean slopes_deg\?"),
+    "a bad value of a key": ("sweep --config bad.toml", r"bad\.toml, slopes_deg\.1: got 95; expected -45 to 45"),
+    "a table that is a number": ("sweep --config set.toml --set motor.resistance=0.8", r"set: got 3"),
 }
+
+
+FILES = {"grid.toml": "slops_deg = [5]\n", "bad.toml": "slopes_deg = [5, 95]\n", "set.toml": "set = 3\n"}
 
 
 @pytest.mark.parametrize("case", USAGE, ids=list(USAGE))
 def test_bad_usage_ends_with_2_and_one_sentence(mmrjax, tmp_path, case):
     arguments, sentence = USAGE[case]
+    for name, text in FILES.items():
+        text_file(tmp_path / name, text)
     code, out, err = mmrjax(arguments, "--out", "x") if arguments != "swep" else mmrjax(arguments)
     assert code == 2 and out == ""
     assert re.search(sentence, err), err
     assert len(err.strip().splitlines()) == 1
-    assert not any(tmp_path.iterdir())
-
-
-def test_empty_path_and_a_table_that_is_a_number_are_refused(mmrjax, tmp_path):
-    ends(mmrjax("sweep --out", ""), "--out: got '.'; expected the name of a folder")
-    (tmp_path / "grid.toml").write_text("set = 3\n")
-    ends(mmrjax("sweep --config grid.toml --set motor.resistance=0.8"), "set: got 3")
+    assert {p.name for p in tmp_path.iterdir()} == {*FILES}
 
 
 def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
@@ -214,29 +216,11 @@ def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["robot.png"]
 
 
-def test_bad_config_files_name_file_and_key(mmrjax, tmp_path):
-    (tmp_path / "grid.toml").write_text("slops_deg = [5]\n")
-    ends(mmrjax("sweep --config grid.toml"), "grid.toml, slops_deg: no such key; did you mean slopes_deg?")
-    (tmp_path / "grid.toml").write_text("slopes_deg = [5, 95]\n")
-    ends(mmrjax("sweep --config grid.toml"), "grid.toml, slopes_deg.1: got 95; expected -45 to 45")
-
-
 BAD_RUNS = {
-    "empty": ("", "runs.csv: the file is empty"),
-    "missing column": (
-        HEADER.replace(",slope_deg", "") + "\n6T2A,15,13.1,0,2.75,4800,400",
-        "column slope_deg is missing",
-    ),
-    "misspelt channel": (
-        HEADER.replace("speed_mm_s", "spede_mm_s") + "\n6T2A,15,13.1,0,5,2.75,4800,400",
-        "column speed_mm_s is missing; did you mean spede_mm_s?",
-    ),
-    "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column with readings"),
     "slope": (
         f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400",
         "runs.csv row 1, slope_deg: got 95; is it in percent? then name the column slope_percent; expected -45 to 45",
     ),
-    "NaN": (f"{HEADER}\n6T2A,15,13.1,0,5,inf,4800,400", "row 1, total_current_A: got inf"),
     "configuration": (f"{HEADER}\n5T,15,13.1,0,5,1,4800,400", "row 1, configuration: got 5T"),
 }
 
@@ -254,6 +238,7 @@ def test_unwritable_or_taken_folder_is_refused(mmrjax, tmp_path):
     (tmp_path / "file").write_text("")
     ends(mmrjax("sweep --out file/below"), "--out: file/below cannot be written")
     ends(mmrjax("sweep --out file"), "--out: file exists already")
+    ends(mmrjax("sweep --out", ""), "--out: got '.'; expected the name of a folder")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("years of work")
     ends(mmrjax("sweep --out mine --force"))
