@@ -24,16 +24,6 @@ def command(arguments):
     return end.value.code
 
 
-def command_in(folder, capsys, monkeypatch, *words):
-    """Run a command in a folder. Returns its exit code, stdout and stderr."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["mmrjax", *words])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    printed = capsys.readouterr()
-    return int(end.value.code or 0), printed.out, printed.err
-
-
 def rows(path):
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as stream:

@@ -50,7 +50,7 @@ def test_results_are_those_of_double_precision_where_jax_is_single(robot):
     runs = mm.Conditions(**RUNS)
     double = mm.simulate(robot, runs)
     with jax.enable_x64(False):
-        plain = robot
+        plain = mm.nominal()
         found = mm.simulate(plain, mm.Conditions(**RUNS))
         later = found.slip  # computed here
         each = [jax.tree.leaves(x) for x in (found, pickle.loads(pickle.dumps(found)))]
@@ -113,6 +113,6 @@ def test_gradients_in_single_precision_are_those_in_double():
     assert_allclose(rough, slope(), rtol=1e-5)
 
 
-def test_strong_numbers_keep_their_digits(single, robot):
-    robot = params.without_weak_types(mm.replace(robot, {"motor.resistance": 0.6113}))
+def test_strong_numbers_keep_their_digits(single):
+    robot = params.without_weak_types(mm.replace(mm.nominal(), {"motor.resistance": 0.6113}))
     assert robot.motor.resistance == 0.6113

@@ -89,19 +89,14 @@ def test_right_units_pass_in_silence(runs, histories, robot):
     assert check_ranges(records.read_runs("simulated_by_paper"), robot) == []
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(runs, case, robot):
+@pytest.mark.quick(1 + len(WRONG))
+@pytest.mark.parametrize(
+    ("data", "case"), [*(("runs", case) for case in WRONG), ("histories", "m/s"), ("histories", "rad/s")]
+)
+def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(request, data, case, robot):
     column, factor, says = WRONG[case]
     with pytest.raises(BadData, match=f"runs.csv, {says}"):
-        check_ranges(scaled(runs, column, factor), robot)
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("case", ["m/s", "rad/s"])
-def test_wrong_units_of_histories_are_refused(histories, case, robot):
-    column, factor, says = WRONG[case]
-    with pytest.raises(BadData, match=f"runs.csv, {says}"):
-        check_ranges(scaled(histories, column, factor), robot)
+        check_ranges(scaled(request.getfixturevalue(data), column, factor), robot)
 
 
 def test_histories_that_never_get_under_way_are_no_matter_of_units(histories, robot):
