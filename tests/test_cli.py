@@ -201,16 +201,14 @@ def test_shares_of_a_batch_add_up_to_its_runs():
 
 @pytest.mark.slow
 def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
-    ends(mmrjax("render robot.bmp"), "expected a name that ends in .png, .gif")
+    ends(mmrjax("render robot.bmp"), "expected a name that ends in .png")
     for words, message in (
-        (("robot.png", "--begin", "2"), "render: begin: got 2 s; expected times within the run, 0 to 1.5 s"),
-        (("robot.png", "--begin", "nan"), "render: begin: got nan s"),
-        (("robot.gif", "--begin", "0.2", "--end", "0.1"), "render: begin, end: got 0.2 to 0.1 s"),
-        (("robot.gif", "--slow", "inf"), "render: slow: got inf, a film of inf pictures; expected at most 10000"),
+        (("robot.png", "--time", "2"), "render: time: got 2 s; expected a time within the run, 0 to 1.5 s"),
+        (("robot.png", "--time", "nan"), "render: time: got nan s"),
     ):
         _, out, err = ends(mmrjax("render", *words), message)
         assert out == "" and len(err.strip().splitlines()) == 1
-    _, out, _ = ends(mmrjax("render robot.png --duration 0.05 --begin 0.04"), "not_settled", code=0)
+    _, out, _ = ends(mmrjax("render robot.png --duration 0.05 --time 0.04"), "not_settled", code=0)
     assert out.rstrip().endswith("robot.png")  # drawn as it was asked for
     assert (tmp_path / "robot.png").read_bytes().startswith(b"\x89PNG")
     assert [p.name for p in tmp_path.iterdir()] == ["robot.png"]
@@ -288,7 +286,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
 
     def interrupted(compiled, values, *told):
         if len(simulated) == 3:
-            while not any((tmp_path / "s.partial/chunks").glob("*.npz")):
+            while not any((tmp_path / "s.partial/chunks").glob("*.stage")):
                 time.sleep(0.001)  # the first is being written meanwhile
             raise KeyboardInterrupt
         simulated.append(len(values))
@@ -297,7 +295,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resumes the sweep after its last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
-    kept = len(list((tmp_path / "s.partial/chunks").glob("*.npz")))
+    kept = len(list((tmp_path / "s.partial/chunks").glob("*.stage")))
     assert 0 < kept <= 3
     simulated.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
@@ -318,7 +316,7 @@ def test_interrupt_before_anything_is_done_leaves_nothing(mmrjax, tmp_path, monk
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --chunk 60 --no-report --out"
     honest, calls = scale.Compiled.__call__, []
-    kept = tmp_path / "s.partial/chunks/chunk-000000.npz"
+    kept = tmp_path / "s.partial/chunks/chunk-000000.stage"
 
     def interrupted(*call):
         if calls:

@@ -162,7 +162,7 @@ def test_search_ends_within_a_millimetre_of_the_largest_that_is_got_over(limit):
 def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     ends(
         mmrjax(
-            "climb --gap 60 --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4 --film --out c",
+            "climb --gap 60 --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4 --out c",
         ),
         "The robot gets over: a gap of 60 mm.",
         code=0,
@@ -183,4 +183,3 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
     assert footing_coordinates({name: np.array([value]) for name, value in last.items()})[0, 4] == pytest.approx(
         np.radians(45), abs=2e-3
     )
-    assert (folder / "climb.gif").stat().st_size > 5000

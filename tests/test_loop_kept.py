@@ -77,7 +77,7 @@ def test_a_budget_has_a_unit(text, seconds):
 def test_a_budget_of_no_time_is_refused():
     assert config.LoopBeside().seconds == 600.0
     with pytest.raises(BadConfiguration, match="within: got '5 weeks'"):
-        config.resolve_further_options(config.LoopBeside, None, {"within": "5 weeks"})
+        config.resolve_further_options(config.LoopBeside, {"within": "5 weeks"})
 
 
 @pytest.fixture

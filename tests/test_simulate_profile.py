@@ -149,7 +149,7 @@ def test_runs_of_a_file_follow_the_same_profile(mmrjax, tmp_path):
     )
     words = ("--profile", "mission.csv", "--runs", "plan.csv", "--out", "several")
     _, _, err = ends(mmrjax("simulate", *words), code=0)
-    assert "plan.csv, slope_deg: not used, mission.csv states it" in err
+    assert "plan.csv, slope_deg: not used, because mission.csv gives it" in err
     folder = tmp_path / "several"
     result = read_json(folder / "result.json")
     assert [m["status"] for m in result["missions"]] == ["converged"] * 2

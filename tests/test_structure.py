@@ -279,7 +279,6 @@ KEPT = {
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
     ("sweeps/points/sampled_design.py", "_directions"): "pure, of hashable arguments",
-    ("sweeps/points/zarr_store.py", "_code"): "hashes of the files of this program",
 }
 #: Methods that change what they are called on, and decorators that remember what a function returned.
 CHANGES = {

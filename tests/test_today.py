@@ -351,19 +351,6 @@ def test_rated_limits_stand_in_the_report(robot):
     assert shown["voltage of a cell, charged"]["limit"] == "4.20 V"
 
 
-@pytest.mark.slow
-def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(mmrjax, monkeypatch):
-    from sweeps.commands import render
-
-    drawn = []
-    monkeypatch.setattr(render.rendering, "scene_of_run", lambda *a: None)
-    monkeypatch.setattr(
-        render.rendering, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
-    )
-    code, out, _ = mmrjax("render start.gif --slope", 10, "--duration", 0.1)
-    assert (code, drawn) == (0, [0.0]) and "not_settled" in out
-
-
 def test_a_run_without_current_is_drawn():
     """Nothing drives its motors: no scale of nothing."""
     time = np.linspace(0.0, 1.0, 30)

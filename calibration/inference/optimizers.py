@@ -1,6 +1,6 @@
 """Maximum a posteriori estimation: least squares with exact Jacobians, from many starts at once.
 
-Searches use solvers of optimistix. The default is ours (`levenberg_marquardt`).
+Every search uses the solver of optimistix in `levenberg_marquardt`.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ from mmrjax.numerics.linear_equations import solve_lower
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 #: Change of z (and of the residuals, relative) at which a search ends; the second for rollouts.
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
-#: Largest number of steps of a solver of optimistix: for least squares, and for a minimiser.
-MOST_STEPS = 256, 2000
 #: Multiple of the decrease predicted by its linearisation that a search of rollouts may still achieve.
 HOPELESS = 10.0
 #: Number of last steps that predict the further decrease of a search of rollouts. Share of the objective by which
@@ -111,8 +109,6 @@ def informative_residuals(data: Data) -> np.ndarray:
     return np.r_[: penalties.start, penalties.stop : penalties.stop + data.centre.size]
 
 
-#: Least-squares solvers and minimisers of optimistix.
-Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 #: A search between two steps: the best point so far and the solver's state.
 Progress = tuple[Z, SearchState]
 
@@ -482,7 +478,7 @@ def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observa
     r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
         problem, z, data
     )
-    return *_clip_penalties(r, jacobian, data), observation
+    return *clip_penalties(r, jacobian, data), observation
 
 
 def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
@@ -501,15 +497,13 @@ def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Ar
     return state.found.residual, state.found.jacobian, state.aux
 
 
+@functools.partial(compiled, options=SELDOM)
 def clip_penalties(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian with penalties clipped at 0, for solvers without one-sided residuals.
+    """Residuals and Jacobian with penalties clipped at 0, for a linearisation without one-sided residuals.
 
     A reading with a non-finite derivative counts as not computed.
     """
     return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), adhesion_penalty_slice(data))
-
-
-_clip_penalties = compiled(clip_penalties, options=SELDOM)
 
 
 def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
@@ -681,18 +675,15 @@ def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.nd
 
 
 def search_starts(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """Searches from each start: in batches by the solver of this package, one after another by another `solver`.
+    """Searches from each start, in batches.
 
     Batches of `AT_ONCE` rows limit the memory. An interrupt takes effect between them.
 
     Returns:
         The end of each search, and the status of each row at its start and at its end.
     """
-    if solver is not None:
-        optima, start, end = search_with_solver(problem, starts, data, solver)
-        return optima, start.status, end.status
     if not problem.observe.apart:
         size = min(len(starts), max(1, AT_ONCE // len(data.measured)))
         filled = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
@@ -715,34 +706,6 @@ def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> 
         return optimum, problem.observation(z).status, observation.status
 
     return jax.vmap(search)(starts)
-
-
-@eqx.filter_jit
-def search_with_solver(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
-) -> tuple[Optimum, Observation, Observation]:
-    """Searches with a solver of optimistix, one after another.
-
-    Such solvers call LAPACK, and batched calls of LAPACK have deadlocked (`linear_equations`).
-
-    Returns:
-        The end of each search, and the observations at its start and at its end.
-    """
-    step_limit = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
-
-    def residual(z: Z, args: Any) -> Array:
-        r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
-        return with_derivative(z, *clip_penalties(r, jacobian, data))
-
-    def search(start: Z) -> tuple[Optimum, Observation, Observation]:
-        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=step_limit, throw=False)
-        z, pin = solved.value, no_pin(start.size)
-        r, jacobian, observation = _evaluate_residuals(problem, data, pin, z)
-        r, jacobian = mask_uncomputed(r, jacobian, data)
-        optimum = _optimum_at(jacobian, r, z, data, pin, solved.stats["num_steps"])
-        return optimum, problem.observation(start), observation
-
-    return jax.lax.map(search, starts)
 
 
 def observe_robot(problem: Problem, robot: Robot) -> Observation:
