@@ -251,7 +251,7 @@ def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
     assert table(tmp_path / "r/runs.csv")[0]["slope_deg"] == "5"
 
 
-def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch):
+def test_full_disk_names_the_file_whichever_it_is(mmrjax, monkeypatch):
     """What the system says of a full disk names none."""
     honest = Path.write_text
 

@@ -490,7 +490,7 @@ def test_wrong_arguments_are_refused_in_a_sentence(case, robot, table):
     assert words in str(refusal.value) and len(str(refusal.value)) <= LONGEST
 
 
-def test_lazy_and_masked_tables_are_read_as_others(robot, table):
+def test_lazy_and_masked_tables_are_read_as_others(table):
     """A lazy frame is collected. A masked reading is missing."""
     wanted = mm.read_runs(table).columns
     lazy = mm.read_runs(pl.from_pandas(table).lazy()).columns
