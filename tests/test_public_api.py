@@ -356,10 +356,6 @@ WRONG_ROBOT = {
 WRONG_CALL = {
     "model: got fast; allowed: steady, drive, track": dict(model="fast"),
     "model: got stedy; did you mean steady? allowed: steady, drive, track": dict(model="stedy"),
-    "model steady, duration: got 5.0; this fidelity has no such option; its options: none": dict(duration=5.0),
-    "model drive, step: got 0.001; this fidelity has no such option; its options: duration": dict(
-        model="drive", step=1e-3
-    ),
     "model drive, patience: got 3; this fidelity has no such option; its options: duration": dict(
         model="drive", patience=3
     ),

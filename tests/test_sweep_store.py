@@ -825,7 +825,6 @@ REFUSED = {
     "output that varies": ('outputs = ["voltage"]\n' + CONFIG, [], "plan.toml, outputs: got voltage, which is varied"),
     "unknown key": ("axis = 3\n" + CONFIG, [], "plan.toml, axis: no such key; did you mean axes?"),
     "unknown storage": ('storage = "float16"\n' + CONFIG, [], "plan.toml, storage: got 'float16'"),
-    "unknown name": (CONFIG.replace("slope_deg", "slope"), [], "axes.slope: neither a parameter of the robot nor a"),
     "zero shares": (CONFIG, ["--shard", "1/0"], "--shard: got 1/0; expected i/n with i from 1 to n"),
     "share zero": (CONFIG, ["--shard", "0/3"], "--shard: got 0/3; expected i/n"),
     "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
