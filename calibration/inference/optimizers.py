@@ -582,18 +582,10 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 
 
 @functools.partial(compiled, options=SELDOM)
-def _step_searches(
-    at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array
-) -> tuple[Progress, Optimum]:
-    """Next step of each search, and its best point."""
-
-    solver, pin = _least_squares_solver(data, long=True), no_pin(at[0].shape[-1])
-
-    def step_search(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
-        new = _solver_step(solver, linear_residual_function(*found), at)
-        return new, _optimum_of_progress(new, dataclasses.replace(data, weight=weight), pin)
-
-    return jax.vmap(step_search)(at, found, weights)
+def _step_search(at: Progress, found: tuple[Array, Array, Any], data: Data) -> tuple[Progress, Optimum]:
+    """Next step of a search, and its best point."""
+    new = _solver_step(_least_squares_solver(data, long=True), linear_residual_function(*found), at)
+    return new, _optimum_of_progress(new, data, no_pin(at[0].shape[-1]))
 
 
 def search_rollouts(
@@ -626,32 +618,24 @@ def search_rollouts(
         The end of each search, and the observation there.
     """
     starts, weights, solver = np.asarray(starts), np.asarray(weights), _least_squares_solver(data, long=True)
-    assigned = SearchQueue(range(len(starts)), max(places, len(starts) * (within <= SAME)))
+    assigned = SearchQueue(range(len(starts)), len(starts) if within <= SAME else min(places, len(starts)))
     cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
     trail = np.full((2 * LATELY, len(assigned.member)), np.nan)
-    progress: Progress | None = None
+    searches: list[Any] = [None] * len(ahead)
     while assigned:
         fresh, going = assigned.fill(), np.flatnonzero(assigned.taken)
         # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
-        ahead = _with_values(ahead, fresh, starts[assigned.holds[fresh]])
+        ahead[fresh], trail[:, fresh] = starts[assigned.holds[fresh]], np.nan
         evaluated = evaluate(ahead[going], assigned.holds[going])
-        optima = jax.tree.map(
-            lambda x: _with_values(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x),  # noqa: B023
-            evaluated,
-        )
-        if len(fresh):
-            trail[:, fresh] = np.nan
-            aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), optima[2])
-            begin = functools.partial(_initial_progress, solver, size=optima[0].shape[1], aux=aux)
-            first_states = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
-            put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
-            progress = first_states if progress is None else jax.tree.map(put, progress, first_states)
-        assert progress is not None  # the first searches are fresh
-        progress, ends = jax.device_get(_step_searches(progress, optima, data, weights[assigned.member]))
-        state = progress[1]
-        ahead, observation = state.ahead, state.aux
+        for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
+            found = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
+            if k in fresh:
+                searches[k] = jax.device_get(_initial_progress(solver, ahead[k], found[0].size, found[2])), None
+            searches[k] = jax.device_get(_step_search(searches[k][0], found, data))
+        results = [(s.over, s.steps, s.ahead, s.aux, end) for (_, s), end in searches]
+        over, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        is_over = state.over | (state.steps >= max_steps) | (ends.decrement < small)
+        is_over = over | (steps >= max_steps) | (ends.decrement < small)
         is_over = is_over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
         if within < np.inf:
@@ -666,12 +650,6 @@ def search_rollouts(
         trail = np.concatenate([trail[1:], ends.cost[None]])
         assigned.leave(is_over, (ends, observation))
     return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))
-
-
-def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
-    x = np.array(x)
-    x[places] = values
-    return x
 
 
 def search_starts(
