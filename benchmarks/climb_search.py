@@ -1,7 +1,7 @@
 """The highest step that a robot climbs, found by a search over sequences of lever angles, and time of 1000 climbs.
 
     python benchmarks/climb_search.py --surface asphalt --members 1024 --generations 4 --out found.csv
-    mmrjax climb --step 400 --surface asphalt --sequence found.csv --film
+    mmrjax climb --step 400 --surface asphalt --sequence found.csv
 
 Members have angles of front and rear levers at times, and a step height. The best ones are parents of the next
 generation, with angles and height changed at random. One success may be luck, because the grouser

@@ -47,7 +47,7 @@ from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
 from calibration.inference.held_out import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
-from calibration.inference.population import MemberObservations, MemberRunner  # noqa: E402
+from calibration.inference.population import MemberObservations, simulate_members  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
 from mmrjax.effects.electrical_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
@@ -362,14 +362,14 @@ def begun(posed: Posed, arguments: argparse.Namespace, robot: Robot, table: Runs
     return searches
 
 
-def generations(posed: Posed, searches: list[Search], members: MemberRunner, arguments: argparse.Namespace) -> int:
+def generations(posed: Posed, searches: list[Search], together: int, arguments: argparse.Namespace) -> int:
     """Runs generations of all searches together, returns their number."""
     start = time.perf_counter()
     for number in range(arguments.generations):
         if time.perf_counter() - start > arguments.seconds:
             break
         drawn = [np.array([s.cma.ask() for _ in range(arguments.population)]) for s in searches]
-        found = members.run(np.concatenate(drawn))
+        found = simulate_members(posed.problem, np.concatenate(drawn), together=together)
         for k, (search, z) in enumerate(zip(searches, drawn, strict=True)):
             here = slice(k * arguments.population, (k + 1) * arguments.population)
             cost = posed.cost(z, MemberObservations(*(x[here] for x in found)), search)
@@ -458,7 +458,7 @@ def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     def advance(done: int) -> None:
         print(f"{done} members, {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
 
-    found = MemberRunner(problem, arguments.members).run(points, advance)
+    found = simulate_members(problem, points, advance)
     took = time.perf_counter() - start
     statuses = dict(zip(*map(np.ndarray.tolist, np.unique(found.status, return_counts=True)), strict=True))
     run = {"gears": len(points), "rows": len(table), "run_s": DURATION, "step": STEP}
@@ -492,7 +492,6 @@ def main() -> None:
     )
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--state", type=Path, help="file to store and continue the searches; use only your own")
-    options.add_argument("--members", type=Path, help="for `time`: file for the members of the run")
     arguments = options.parse_args()
     if arguments.what == "time":
         print(json.dumps({"machine": machine(), **timed(arguments)}), flush=True)
@@ -507,14 +506,17 @@ def main() -> None:
         searches = begun(posed, arguments, robot, table)
         if arguments.only:
             searches = [s for s in searches if re.search(arguments.only, s.name)]
-    members = MemberRunner(posed.problem, together=arguments.population * len(searches))
+    together = arguments.population * len(searches)
     start = time.perf_counter()
-    count = generations(posed, searches, members, arguments)
+    count = generations(posed, searches, together, arguments)
     took = time.perf_counter() - start
     finalists = min(FINALISTS, count * arguments.population)
     best = [search.best(finalists) for search in searches]
     points = np.concatenate(best)
-    steps = [members.run(points) if parts == 1 else finer(posed, points, parts) for parts in arguments.parts]
+    steps = [
+        simulate_members(posed.problem, points, together=together) if parts == 1 else finer(posed, points, parts)
+        for parts in arguments.parts
+    ]
     print(json.dumps({
         "machine": machine(), "what": posed.what, "generations": count, "seconds": round(took, 1),
         "members": count * len(searches) * arguments.population, "names": posed.problem.coordinates.names,

@@ -79,7 +79,7 @@ def _command(
 
     Args:
         kind: the configuration.
-        beside: type of the options that change no number. A file may state its `[solver]` only.
+        beside: type of the options that change no number.
         group: heading in `--help`.
         common: options that `--help` shows, in this order. `--help-all` shows all.
         room: the module, if it has another name.
@@ -100,9 +100,9 @@ def _command(
             if "plan" in given:
                 given["plan"] = file
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
-            aside = config.resolve_further_options(beside, file, others, trust)
+            aside = config.resolve_further_options(beside, others)
             if resolve is None:
-                resolved = config.resolve_configuration(kind, file, stated, beside, trust)
+                resolved = config.resolve_configuration(kind, file, stated, trust)
             else:
                 resolved = resolve(file, stated, trust)
             with report_working(name):
@@ -116,7 +116,7 @@ def _command(
             keyword("config_file", annotation=_Config, default=None),
             keyword("trust", annotation=_Trust, default=False),
             keyword("no_cache", annotation=_NoCache, default=False),
-            *made.help_all((kind, beside)),
+            made.help_all(),
         ]
         lines_joined = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(described) or "")
         run.__name__, run.__doc__ = name, lines_joined
@@ -234,11 +234,11 @@ def reproduce() -> None:
     config.Render,
     config.Picture,
     group=MODEL,
-    common="robot configuration voltage slope payload begin end slow",
-    example="mmrjax render start.gif --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
+    common="robot configuration voltage slope payload time",
+    example="mmrjax render start.png --slope 10 --payload 5 --time 0.4",
 )
 def render() -> None:
-    """Draw a picture or film of the track model.
+    """Draw a picture of the track model.
 
     The picture shows the robot on its slope, its track and the contact forces. The run starts from standstill. The
     command works without a display.
@@ -671,6 +671,8 @@ def _report_failure(error: BaseException) -> int:
         advice = "no run folder was written"
         if "sweep" in sys.argv[1:2]:
             advice = "the same command with the same --out resumes the sweep after its last complete chunk"
+        if "calibrate" in sys.argv[1:2]:
+            advice = "the same command with the same --out resumes a population after its last generation"
         if "loop" in sys.argv[1:2]:
             advice = "the same command with the same --out resumes the loop after its last complete stage"
         return _print_failure(f"interrupted; {advice}", INTERRUPTED)

@@ -15,7 +15,6 @@ from calibration.data import Json, Names, presets_file
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words
 from calibration.data.input_files import toml_content, toml_text
-from calibration.inference import solvers
 from mmrjax import fidelities
 from mmrjax.model import channels
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
@@ -57,7 +56,6 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
         default: value if not stated.
         description: meaning without the unit (the name ends with the unit).
         extra: `usual`, the meaning of a default of None, in words. `flag`, its option, if it differs from its name.
-            `solver`, how its command solves: a key of `[solver]`.
             `verbatim`, a list each of whose texts may have commas. `metavar` of an argument. `format`, such as path.
             `minimum`, where the command asks for more than the field. `executes`, whose value is code that is run,
             or leads to such: a file may state it with `--trust` only. `argument`, if it is no option.
@@ -151,13 +149,6 @@ def _check_fidelity(model: str) -> str:
     if model not in fidelities.TABLE:
         raise PydanticCustomError("unknown", f"input should be {_join_with_or(map(repr, fidelities.TABLE))}")
     return model
-
-
-def _check_solver(name: str) -> str:
-    """The name of a solver for fits. Unknown names are rejected."""
-    if name not in solvers.NAMES:
-        raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
-    return name
 
 
 def _join_with_or(names: Iterable[str]) -> str:
@@ -314,12 +305,8 @@ class GivenRuns(OneRun, FolderPart):
 class Picture(OneRun):
     """File of `render`, and the run that it shows."""
 
-    file: Path = option_field(..., "Output file, ending in .png or .gif", argument=True)
-    begin: float | None = option_field(
-        None, "Time of the picture or start of the film (s)", usual="0; for a picture 0.8"
-    )
-    end: float | None = option_field(None, "End of the film (s)", usual="begin + 0.1")
-    slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
+    file: Path = option_field(..., "Output file, ending in .png", argument=True)
+    time: float = option_field(0.8, "Time of the picture (s)")
     force: bool = option_field(False, "Replace an existing file")
 
 
@@ -378,13 +365,7 @@ class InferencePart(Part):
     seed: Seed = option_field(0, "Random seed")
 
 
-class MembersPart(Part):
-    """Folder in which a population keeps its runs. It changes no number."""
-
-    members: Path | None = option_field(None, "File for the runs of the population, to resume from", solver=True)
-
-
-class FittedRuns(MembersPart, Measured, VerbosePart):
+class FittedRuns(Measured, VerbosePart):
     """Options of `calibrate` that change no number."""
 
 
@@ -611,9 +592,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         "Also compute derivatives with respect to these, comma-separated: any parameter, adhesion, payload, voltage "
         "(with --battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
-    film: bool = option_field(False, "Write climb.gif")
     duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
-    time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step", solver=True)
+    time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step")
 
     @model_validator(mode="after")
     def _one_obstacle(self) -> Self:
@@ -636,9 +616,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
             raise PydanticCustomError("idle", "`nose_mm` has an effect only with steps and stairs")
         if self.battery and self.supply_voltage_V is not None:
             raise PydanticCustomError("idle", "`supply_voltage_V` cannot be combined with `battery`")
-        for name in ("film", "derivatives"):
-            if getattr(self, name) and self.find is not None:
-                raise PydanticCustomError("idle", f"`{name}` cannot be combined with `find`")
+        if self.derivatives and self.find is not None:
+            raise PydanticCustomError("idle", "`derivatives` cannot be combined with `find`")
         return self
 
 
@@ -688,17 +667,9 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
         None,
         "Members of each generation of the gradient-free search",
         usual="256 if the running gear is fitted, else 0",
-        solver=True,
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Largest number of generations of the population", usual="30", solver=True
-    )
-    solver: Annotated[str, AfterValidator(_check_solver)] | None = option_field(
-        None,
-        f"Solver of the searches, of optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
-        f"({', '.join(solvers.OF_OPTAX)})",
-        usual="Levenberg-Marquardt of mmrjax",
-        solver=True,
+        None, "Largest number of generations of the population", usual="30"
     )
     profiles: bool | None = option_field(
         None, "Compute the profile likelihood of each parameter", usual="for steady, except turns"
@@ -745,7 +716,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of the closed loop."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = option_field(
-        500, "Number of bootstrap tables. Time histories use at least 333", solver=True
+        500, "Number of bootstrap tables. Time histories use at least 333"
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
@@ -760,10 +731,10 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
         "minutes",
     )
     population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
-        None, "Members of each generation of the search for --resolve", usual="128", solver=True
+        None, "Members of each generation of the search for --resolve", usual="128"
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Largest number of generations for --resolve", usual="20", solver=True
+        None, "Largest number of generations for --resolve", usual="20"
     )
     model: Path | None = option_field(
         None,
@@ -862,65 +833,35 @@ def read_toml(file: Path) -> Json:
     return toml_content(toml_text(file, file), file)
 
 
-def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """Names of the fields whose `option_field` has a given property, such as `solver` (the keys of `[solver]` in a
-    file).
-    """
-    return [name for name, facts in schema_facts(kind).items() if facts.get(fact)]
-
-
-def _file_keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
-    """The keys of a file for a configuration, those of its table `[solver]` among them."""
-    values = read_toml(file)
-    table = values.pop("solver", {})
-    if not isinstance(table, dict):
-        raise BadConfiguration(f"{file.name}, solver: got {table!r}; expected a table, [solver]")
-    own_fields, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
-    for key in table:
-        if key not in own_fields + others:
-            allowed = allowed_words(key, own_fields + others) if own_fields + others else "this command has none"
-            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {allowed}")
-        if key in values:
-            raise BadConfiguration(f"{file.name}, solver.{key}: {key} is in the file twice; give it once")
-    return {**values, **{key: value for key, value in table.items() if key in own_fields}}
-
-
-def resolve_further_options(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
-    """Options of a command that are not part of its configuration. A file may state only their `[solver]` keys.
-
-    Args:
-        trust: as in `resolve_configuration`.
+def resolve_further_options(kind: type[C], options: Json) -> C:
+    """Options of a command that are not part of its configuration.
 
     Raises:
         BadConfiguration: for the same reasons as `resolve_configuration`.
     """
-    table = {} if file is None else read_toml(file).get("solver", {})
-    solver_options = {key: table[key] for key in fields_with(kind, "solver") if key in table}
-    return _check_values(kind, file, solver_options, options, trust)
+    return _check_values(kind, None, {}, options, trust=False)
 
 
 def resolve_configuration(
     kind: type[C],
     file: Path | None,
     options: Json,
-    beside: type[Part] | None = None,
     trust: bool = False,
 ) -> C:
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Args:
-        beside: further options of the command. The file's table `[solver]` may state them too.
         trust: true if the file may state code to execute, otherwise only options may.
 
     Raises:
         BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.
     """
-    return _check_values(kind, file, {} if file is None else _file_keys(kind, file, beside), options, trust)
+    return _check_values(kind, file, {} if file is None else read_toml(file), options, trust)
 
 
 def _check_values(kind: type[C], file: Path | None, values: Json, options: Json, trust: bool) -> C:
     option_values = {k: v for k, v in options.items() if v is not None}
-    for name in fields_with(kind, "executes"):
+    for name in (name for name, facts in schema_facts(kind).items() if facts.get("executes")):
         if file is not None and values.get(name) and name not in option_values and not trust:
             option = options_of_fields(kind)[name]
             raise BadConfiguration(

@@ -103,13 +103,11 @@ class StoreOptions(FolderPart):
         (), "Also write the store as csv or parquet. May be repeated"
     )
     shard: str | None = option_field(
-        None, "Simulate the i-th of n shares, such as 3/8, in one process of a job array", solver=True
+        None, "Simulate the i-th of n shares, such as 3/8, in one process of a job array"
     )
     scheduler: str | None = option_field(
         None,
         "Address of a dask scheduler, such as tcp://host:8786",
-        solver=True,
-        executes=True,
     )
 
     @model_validator(mode="after")
@@ -159,10 +157,8 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
                     f"{options_of_fields(Sweep)[name]}: has an effect only with a grid given by options; put it "
                     f"into the axes or conditions of {file.name}"
                 )
-        return resolve_configuration(
-            Campaign, file, {k: v for k, v in options.items() if k not in GRID}, StoreOptions, trust
-        )
-    return resolve_configuration(Sweep, file, options, StoreOptions, trust)
+        return resolve_configuration(Campaign, file, {k: v for k, v in options.items() if k not in GRID}, trust)
+    return resolve_configuration(Sweep, file, options, trust)
 
 
 def campaign_of_grid(grid: Sweep) -> Campaign:

@@ -153,15 +153,12 @@ def _parse_option(name: str, fact: Json, value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
+def help_all() -> inspect.Parameter:
     """The option that shows every option of a command."""
-    in_table = [option_of_field(n, f) for kind in kinds for n, f in schema_facts(kind).items() if f.get("solver")]
-    table = f" \\[solver] of --config may contain {', '.join(in_table)}." * bool(in_table)
-    option = typer.Option(
-        "--help-all", is_eager=True, callback=_show_full_help, help=f"Show all options and exit.{table}"
+    option = typer.Option("--help-all", is_eager=True, callback=_show_full_help, help="Show all options and exit.")
+    return inspect.Parameter(
+        "help_all", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, option]
     )
-    kind = inspect.Parameter.KEYWORD_ONLY
-    yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
 
 
 def _show_full_help(context: typer.Context, wanted: bool) -> None:

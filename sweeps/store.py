@@ -19,8 +19,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
-import numpy as np
-
 from calibration.data import Columns, Json, Names, robot_file, writing
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
@@ -89,8 +87,8 @@ LOCK, CHUNKS = "lock", "chunks"
 STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "writing"
 #: Names in an unfinished folder, before the results are written.
 PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
-#: Endings of the files in `CHUNKS`.
-KEPT = (".npz", ".stage")
+#: Ending of the files in `CHUNKS`.
+ENDING = ".stage"
 #: File with the loop's ranking by regression, before any confirmation.
 SCREENING_FILE = "screening.json"
 #: Key of the lock file with the names of foreign files.
@@ -196,7 +194,7 @@ class Folder:
         foreign_names = _json(self.partial / LOCK).get(FOREIGN)
         chunk_files = (self.partial / CHUNKS).glob("*")
         return (foreign & set(map(str, foreign_names)) if isinstance(foreign_names, list) else foreign) | {
-            f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix not in KEPT
+            f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix != ENDING
         }
 
     def _begin_results(self) -> None:
@@ -321,7 +319,7 @@ def lock_text(command: str, identity: str = "") -> str:
 
 def holds_work(partial: Path) -> bool:
     """True if a run that ended early stored anything: chunks, stages, journal lines, or a result."""
-    patterns = (*(f"{CHUNKS}/[!.]*{ending}" for ending in KEPT), f"{JOURNAL}/*.jsonl", "manifest.json")
+    patterns = (f"{CHUNKS}/[!.]*{ENDING}", f"{JOURNAL}/*.jsonl", "manifest.json")
     return any(file.stat().st_size for pattern in patterns for file in partial.glob(pattern))
 
 
@@ -464,51 +462,43 @@ class RunFolder(Folder):
             self._lock.close()
             self._lock = None
 
-    def chunk(self, name: str) -> Columns | None:
-        """Chunk from an interrupted run. None if missing or unreadable."""
+    def chunk(self, name: str) -> Any:
+        """Chunk from an interrupted run. None if missing or damaged, which is reported."""
         from sweeps import stage_files
 
-        file = self.partial / CHUNKS / f"{name}.npz"
-        if not file.is_file():
-            return None
+        file = self._chunk_file(name)
         try:
-            return stage_files.read_arrays(file)
-        except Exception:  # a damaged file can make the reader raise anything
+            return stage_files.read_stage(file) if file.is_file() else None
+        except stage_files.Unreadable:
             print_message(f"{file}: damaged, so it is computed again")
             return None
 
-    def keep_chunk(self, name: str, columns: Columns) -> None:
+    def keep_chunk(self, name: str, content: Any) -> None:
         """Stores a finished chunk, for continuing an interrupted run."""
-        file = self.partial / CHUNKS / f"{name}.npz"
-        with writing.replacing(file) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **columns)
+        from sweeps import stage_files
+
+        with writing.replacing(self._chunk_file(name)) as temporary:
+            stage_files.write_stage(temporary, content)
 
     def stage(self, name: str, make: Callable[[], T]) -> T:
         """Result of a stage: read if an interrupted run of the same identity stored it, otherwise computed and
-        stored.
-
-        A damaged file is reported, and the stage is computed again. A result that cannot be written is not stored.
+        stored. A result that cannot be written is not stored.
         """
         from sweeps import stage_files
 
-        file = self._of_stage(name)
-        if file.is_file():
-            try:
-                stored_result: T = stage_files.read_stage(file)
-                return stored_result
-            except stage_files.Unreadable:
-                print_message(f"{file}: damaged, so it is computed again")
-        result = make()
-        with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as temporary:
-            stage_files.write_stage(temporary, result)
-        return result
+        stored: tuple[T] | None = self.chunk(name)  # in a tuple, since a result may be None
+        if stored is None:
+            stored = (make(),)
+            with contextlib.suppress(OSError, stage_files.Unwritable):
+                self.keep_chunk(name, stored)
+        return stored[0]
 
     def keeps(self, name: str) -> bool:
-        """True if the result of a stage is stored."""
-        return self._of_stage(name).is_file()
+        """True if a chunk or the result of a stage is stored."""
+        return self._chunk_file(name).is_file()
 
-    def _of_stage(self, name: str) -> Path:
-        return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
+    def _chunk_file(self, name: str) -> Path:
+        return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}{ENDING}"
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
         """As in `Folder`, with the identity of the run in the manifest."""

@@ -272,7 +272,7 @@ OPTIONS = {
     ("calibrate", "measured"): ["--free", "--fix", "--starts", "--population", "--members"],
     ("sensitivity",): ["--method", "--parameters", "--vary", "--evaluations", "--candidates"],
     ("climb",): ["--step", "--stairs", "--gap", "--terrain", "--sequence", "--find"],
-    ("render", "x.png"): ["--begin", "--end", "--slow"],
+    ("render", "x.png"): ["--time"],
     ("check",): ["--robot", "--set"],
     ("size",): ["--objective", "--pareto", "--motors"],
 }  # fmt: skip

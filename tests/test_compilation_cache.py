@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from sweeps import compilation_cache
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Solves two runs with derivatives; `{more}` is put in before. Prints the answer and what the cache was asked.
 PROGRAM = """
 import json, sys
@@ -56,13 +56,14 @@ def first(tmp_path_factory):
 
 
 @pytest.mark.nightly
-def test_second_process_compiles_nothing_and_answers_the_same(first):
+def test_second_process_compiles_nothing_and_answers_the_same(first, monkeypatch):
     cache, began = first
     again = process(cache)
     assert began["kept"] > 2 and began["read"] == 0
     assert again["kept"] == 0 and again["read"] == began["kept"]
     assert again["answer"] == began["answer"]
-    described = compilation_cache.describe_cache(cache)
+    monkeypatch.setenv("MMRJAX_CACHE", str(cache))
+    described = compilation_cache.describe_cache()
     assert described.startswith(f"{began['folder']}: {began['kept']} programs, ")
     assert float(described.split()[-2]) > 0.0
 
@@ -107,7 +108,7 @@ def test_place_is_the_users_by_default(monkeypatch, tmp_path):
     for ignored in ("", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", ignored)
         monkeypatch.setenv("HOME", str(tmp_path))
-        assert compilation_cache.cache_location().parent == tmp_path / ".cache" / "mmrjax"
+        assert compilation_cache.cache_location().parent == tmp_path / ".cache/mmrjax"
     import jaxlib
 
     assert f"-{jaxlib.__version__}-" in compilation_cache.cache_location().name
@@ -126,8 +127,8 @@ def test_oldest_entries_are_dropped(tmp_path, monkeypatch):
         entry.parent.mkdir(exist_ok=True)
         entry.write_bytes(bytes(10))
         os.utime(entry, (k, k))
-    (tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir").mkdir()  # XLA's own, where there is a GPU
-    os.utime(tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir", (0, 0))
+    (tmp_path / "xla-0/xla_gpu_per_fusion_autotune_cache_dir").mkdir()  # XLA's own, where there is a GPU
+    os.utime(tmp_path / "xla-0/xla_gpu_per_fusion_autotune_cache_dir", (0, 0))
     compilation_cache._delete_oldest(tmp_path)
     left = sorted(int(path.name.rpartition("-")[2]) for path in tmp_path.rglob("program-*"))
     assert left == [7, 8, 9, 10, 11]

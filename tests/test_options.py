@@ -17,8 +17,8 @@ KINDS = {
     "compare": (config.Compare, config.ComparedRuns),
     "reproduce": (config.Reproduce,),
     "render": (config.Render, config.OneRun),
-    "calibrate": (config.Calibrate, config.MembersPart),
-    "loop": (config.Loop, config.MembersPart),
+    "calibrate": (config.Calibrate, config.FittedRuns),
+    "loop": (config.Loop, config.LoopBeside),
     "export": (config.Export,),
     "settle": (config.Settle,),
     "sensitivity": (config.Sensitivity,),
@@ -105,43 +105,24 @@ def _file(folder, text):
     return folder / "c.toml"
 
 
-def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
-    file = _file(tmp_path, 'seed = 3\n[solver]\nreplicates = 300\npopulation = 8\nmembers = "kept.npz"\n')
-    found = config.resolve_configuration(config.Loop, file, {}, config.MembersPart)
+def test_keys_of_a_file_are_read_and_options_win(tmp_path):
+    file = _file(tmp_path, "seed = 3\nreplicates = 300\npopulation = 8\n")
+    found = config.resolve_configuration(config.Loop, file, {})
     assert (found.seed, found.replicates, found.population) == (3, 300, 8)
-    assert config.resolve_configuration(config.Loop, file, {"population": 16}, config.MembersPart).population == 16
-    assert config.resolve_further_options(config.MembersPart, file, {}).members == Path("kept.npz")
-    assert config.resolve_further_options(config.MembersPart, file, {"members": "other"}).members == Path("other")
-    # what a former version left, whose keys all stand at the top, says the same
-    flat = _file(tmp_path, "seed = 3\nreplicates = 300\npopulation = 8\n")
-    assert config.resolve_configuration(config.Loop, flat, {}) == found
+    assert config.resolve_configuration(config.Loop, file, {"population": 16}).population == 16
 
 
 @pytest.mark.parametrize(
-    ("kind", "text", "message"),
+    ("text", "message"),
     [
-        (config.Loop, "[solver]\nreplicate = 300\n", r"c.toml, solver.replicate: no such key; did you mean replicates"),
-        (config.Loop, "[solver]\nseed = 3\n", r"c.toml, solver.seed: no such key; allowed: replicates, population"),
-        (config.Check, "[solver]\nmembers = 3\n", r"c.toml, solver.members: no such key; this command has none"),
-        (config.Loop, "solver = 3\n", r"c.toml, solver: got 3; expected a table, \[solver\]"),
-        (config.Loop, "replicates = 400\n[solver]\nreplicates = 300\n", r"solver.replicates: replicates is in the file twice"),
-        (config.Loop, "[solver]\nreplicates = 3\n", r"c.toml, replicates: got 3; expected 250 to 100000"),
+        ("replicate = 300\n", r"c.toml, replicate: no such key; did you mean replicates"),
+        ("replicates = 3\n", r"c.toml, replicates: got 3; expected 250 to 100000"),
+        ("members = 'kept.npz'\n", r"c.toml, members: no such key; "),
     ],
-)  # fmt: skip
-def test_solver_tables_that_cannot_be_are_refused_in_a_sentence(kind, text, message, tmp_path):
+)
+def test_keys_of_a_file_that_cannot_be_are_refused_in_a_sentence(text, message, tmp_path):
     with pytest.raises(BadConfiguration, match=message):
-        config.resolve_configuration(kind, _file(tmp_path, text), {})
-
-
-def test_command_takes_its_solver_table(tmp_path, monkeypatch, said):
-    monkeypatch.chdir(tmp_path)
-    _file(tmp_path, '[solver]\nshard = "0/3"\n')
-    assert said("sweep", "--config", "c.toml").startswith("mmrjax: c.toml: shard: got 0/3; expected i/n")
-    _file(tmp_path, "[solver]\nshards = 3\n")
-    assert said("sweep", "c.toml").startswith("mmrjax: c.toml, solver.shards: no such key; did you mean shard?")
-    _file(tmp_path, "[solver]\npopulation = 3\n")
-    assert said("loop", "--config", "c.toml").startswith("mmrjax: c.toml, population: got 3; expected 4 to 1000000")
-    assert [p.name for p in tmp_path.iterdir()] == ["c.toml"]
+        config.resolve_configuration(config.Loop, _file(tmp_path, text), {})
 
 
 def test_configuration_of_one_command_names_what_another_lacks(tmp_path, monkeypatch, said):
@@ -170,25 +151,22 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
 
 HARM = "import pathlib\npathlib.Path('harmed').touch()\n"
 ASKED = [
-    (("simulate",), 'effects = ["own.py"]', "--effects"),
-    (("loop", "measured"), 'effects = ["own.py"]', "--effects"),
-    (("sweep", "--dry-run"), 'effects = ["own.py"]\n[axes]\nvoltage = [24]', "--effects"),
-    (("sweep", "--dry-run"), "[solver]\nscheduler = 'tcp://127.0.0.1:1'\n[axes]\nvoltage = [24]", "--scheduler"),
-    (("sweep",), "[solver]\nscheduler = 'tcp://127.0.0.1:1'", "--scheduler"),
+    (("simulate",), 'effects = ["own.py"]'),
+    (("loop", "measured"), 'effects = ["own.py"]'),
+    (("sweep", "--dry-run"), 'effects = ["own.py"]\n[axes]\nvoltage = [24]'),
 ]
 
 
-@pytest.mark.parametrize(("command", "text", "option"), ASKED)
-def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, text, option):
+@pytest.mark.parametrize(("command", "text"), ASKED)
+def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, text):
     (tmp_path / "own.py").write_text(HARM)
     (tmp_path / "plan.toml").write_text(text)
     asks = (*command, "--config", "plan.toml", "--out", "x")
-    _, out, _ = ends(mmrjax(*asks), f"would run code, which a file may not request; give {option} on the command")
+    _, out, _ = ends(mmrjax(*asks), "would run code, which a file may not request; give --effects on the command")
     assert not out and sorted(p.name for p in tmp_path.iterdir()) == ["own.py", "plan.toml"]
-    if option == "--effects":
-        for how in (("--trust",), ("--effects", "own.py")):
-            ends(mmrjax(*asks, *how), "own.py: contains no effect")
-            (tmp_path / "harmed").unlink()
+    for how in (("--trust",), ("--effects", "own.py")):
+        ends(mmrjax(*asks, *how), "own.py: contains no effect")
+        (tmp_path / "harmed").unlink()
 
 
 def test_an_empty_list_of_effects_asks_for_nothing(tmp_path):

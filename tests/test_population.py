@@ -1,8 +1,6 @@
 """Searches by generations: what they find, what is kept, what the members say of derivatives, bad files."""
 
 import dataclasses
-import errno
-import os
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,15 +10,16 @@ from numpy.testing import assert_array_equal
 
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
-from calibration.inference import identifiability, multistart, noise, observers, population, priors
+from calibration.data.writing import json_value
+from calibration.inference import identifiability, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import ReachedBound, Remark
 from calibration.inference.observers.settled import SettledRuns
-from calibration.inference.population import MemberObservations, MemberRunner
+from calibration.inference.population import MemberObservations
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
-from tests.commands import ends
+from sweeps.store import RunFolder
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -63,12 +62,11 @@ def posed(runs, truth, known):
     )
 
 
-def evolve(posed, known, generations=30, file=None, seed=3):
-    members = MemberRunner(posed, file)
+def evolve(posed, known, generations=30, seed=3, keep=lambda name, make: make()):
     size = len(NAMES)
     return population.run_evolution(
-        members, population.member_objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
-        generations=generations,
+        posed, population.member_objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
+        generations=generations, keep=keep,
     )  # fmt: skip
 
 
@@ -149,79 +147,20 @@ def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(pos
 
 
 @pytest.mark.slow
-def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known, found, tmp_path, monkeypatch):
-    file = tmp_path / "members.npz"
-    evolve(posed, known, 2, file)
+def test_kept_generations_are_not_run_again_and_an_ended_search_goes_on(posed, known, found, tmp_path, monkeypatch):
     run = []
     true = population._observe_points
     monkeypatch.setattr(population, "_observe_points", lambda *a: run.append(1) or true(*a))
-    whole = evolve(posed, known, len(found.generations), file)
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "x", {"command": "calibrate"}) as folder:
+        evolve(posed, known, 2, keep=folder.stage)
+        raise KeyboardInterrupt
+    run.clear()
+    with RunFolder(tmp_path / "x", {"command": "calibrate"}) as folder:
+        whole = evolve(posed, known, len(found.generations), keep=folder.stage)
     assert_array_equal(whole.z, found.z)
     assert_array_equal(whole.cost, found.cost)
     together = population.TOGETHER[0]
     assert len(run) == (len(found.generations) - 2) * -(-SIZE // together)
-    run.clear()
-    evolve(posed, known, len(found.generations), file)
-    assert not run
-    assert [p.name for p in tmp_path.iterdir()] == ["members.npz"]
-
-
-@pytest.mark.slow
-def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
-    file = tmp_path / "members.npz"
-    evolve(posed, known, 1, file)
-    other = dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=posed.data.measured * 1.01))
-    with pytest.raises(BadConfiguration, match="its members belong to another calibration"):
-        MemberRunner(other, file)
-    noisier = dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=2 * posed.data.sd))
-    assert len(MemberRunner(noisier, file)._kept) == SIZE  # the noise is none of what was run
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("content", [b"", b"no file of members", b"PK\x03\x04 cut off"], ids=["empty", "text", "cut"])
-def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
-    file = tmp_path / "members.npz"
-    file.write_bytes(content)
-    with pytest.raises(BadConfiguration, match="not a readable file of members"):
-        MemberRunner(posed, file)
-
-
-def never(*_, **__):
-    raise AssertionError("searched")
-
-
-def test_damaged_members_are_refused_before_the_first_search(tmp_path, monkeypatch, mmrjax):
-    (tmp_path / "kept.npz").write_bytes(b"cut")
-    monkeypatch.setattr(multistart, "search_from_starts", never)
-    with pytest.raises(BadConfiguration, match="not a readable file of members"):
-        calibrate(
-            records.read_runs("measured"),
-            paper_robots.nominal(),
-            model="track",
-            population=8,
-            members=tmp_path / "kept.npz",
-        )
-    monkeypatch.setattr("sweeps.commands.loop.discover", never)
-    ends(
-        mmrjax("loop measured --resolve --members kept.npz --out x"),
-        "--members kept.npz: not a readable file of members",
-    )
-    assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
-
-
-@pytest.mark.slow
-def test_full_disk_is_said_and_leaves_what_was_there(posed, known, tmp_path, monkeypatch):
-    file = tmp_path / "members.npz"
-    evolve(posed, known, 1, file)
-    before = file.read_bytes()
-
-    def full(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(BadConfiguration, match="cannot be written: No space left"):
-        evolve(posed, known, 2, file)
-    assert file.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["members.npz"]
 
 
 # --- derivatives and differences -----------------------------------------------------------------------------------
@@ -233,8 +172,7 @@ def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, foun
     about = identifiability.analyse_identifiability(posed, jnp.asarray(found.z[at]))
     slope, left = population.local_regression(posed, found, at)
     assert np.linalg.norm(slope - about.jacobian) < 0.15 * np.linalg.norm(about.jacobian) and left < 1.0
-    members = MemberRunner(posed)
-    assert not population.unreliable_derivatives(posed, members, found.z[at], about.jacobian, about.sd).any()
+    assert not population.unreliable_derivatives(posed, found.z[at], about.jacobian, about.sd).any()
 
 
 @pytest.mark.slow
@@ -244,9 +182,7 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
         lambda p: p.observe, posed, Stepped(posed.observe.conditions, "steady"), is_leaf=lambda x: x is posed.observe
     )
     about = identifiability.analyse_identifiability(stepped, jnp.zeros(len(NAMES)))
-    off = population.unreliable_derivatives(
-        stepped, MemberRunner(stepped), np.zeros(len(NAMES)), about.jacobian, about.sd
-    )
+    off = population.unreliable_derivatives(stepped, np.zeros(len(NAMES)), about.jacobian, about.sd)
     assert off.tolist() == [True, False, False, False]
 
 
@@ -261,7 +197,8 @@ def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found)
         dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4
     )
     assert not torn.remarks()[0].settled and torn.apart == ("a",)
-    assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
+    assert json_value(calm.to_json())["regression_rms_sd"] is None
+    assert json_value(torn.to_json())["derivatives_apart"] == ["a"]
 
 
 def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
@@ -294,7 +231,7 @@ def test_what_members_did_is_counted_and_said(found):
 
 
 @pytest.mark.slow
-def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
+def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, robot):
     true = population._observe_points
 
     def broken(posed, points):
@@ -306,26 +243,26 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     monkeypatch.setattr(population, "_observe_points", broken)
     name = "6T2A.ground.rolling_resistance"
     with pytest.raises(BadConfiguration, match=r"none of \d+ members can be run in every row .*: \d+ tips"):
-        calibrate(runs, paper_robots.nominal(), model="drive", free=(name,), population=4, generations=1)
+        calibrate(runs, robot, model="drive", free=(name,), population=4, generations=1)
 
 
 @pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (dict(generations=3), "have an effect only with --population"),
+        (dict(generations=3), "--generations: has an effect only with --population"),
         (dict(population=50), "a population search needs settled rows and --model drive or track"),
         (dict(population=2, model="drive"), "at least 4 members"),
-        (dict(generations=3, population=0, model="track"), "have an effect only with --population"),
+        (dict(generations=3, population=0, model="track"), "--generations: has an effect only with --population"),
     ],
 )
-def test_options_of_a_population_that_cannot_be_are_refused(options, says):
+def test_options_of_a_population_that_cannot_be_are_refused(options, says, robot):
     with pytest.raises(BadConfiguration, match=says):
-        calibrate(records.read_runs("measured"), paper_robots.nominal(), **options)
+        calibrate(records.read_runs("measured"), robot, **options)
 
 
 @pytest.mark.nightly
-def test_running_gear_is_found_through_the_track_model(tmp_path):
+def test_running_gear_is_found_through_the_track_model():
     """Readings of a shaking gear. The population comes near its slip, which the flush gear does not."""
     table = records.read_runs("measured")
     table = table.where(
@@ -348,7 +285,6 @@ def test_running_gear_is_found_through_the_track_model(tmp_path):
     found = calibrate(
         data, paper_robots.nominal(), model="track", noise="current=2%,motor_speed=0.5%,speed=0.5%", population=48,
         free=("default", "running_gear.guide_recess", "running_gear.contact_damping"), generations=5,
-        members=tmp_path / "m.npz",
     )  # fmt: skip
     assert found.errors_after["speed"].rms_percent < 0.6 * found.errors_before["speed"].rms_percent
     assert found.searched is not None and len(found.searched.found.z) > 48

@@ -152,7 +152,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     assert "regression only, not confirmed by simulation: perhaps a loss torque that changes" in err
-    left = read_json(tmp_path / "found.partial" / "screening.json")
+    left = read_json(tmp_path / "found.partial/screening.json")
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
 
@@ -290,15 +290,18 @@ def test_a_row_without_weight_does_not_change_a_linear_fit(space, linear):
     assert_allclose(other.z, without.z, atol=1e-9)
 
 
-@pytest.mark.parametrize(("remain", "chosen"), [((False, False), "b"), ((True, False), "a c"), ((True, True), "a c")])
-def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen, monkeypatch):
-    """The linear readings prefer `a`, the simulation `b`."""
+@pytest.mark.parametrize(
+    ("remain", "room", "chosen"),
+    [((False, False), "", "b"), ((True, False), "", "a c"), ((True, True), "", "a c"), ((False,), "ac", "a")],
+)
+def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, chosen, monkeypatch):
+    """The linear readings prefer `a`, the simulation `b`, unless it has room for `a` and `c` alone."""
 
     def one(*effects, cost):
         return SimpleNamespace(effects=effects, z=0, cost=cost, plausible=True)
 
     def diagnosis(rejected):
-        return SimpleNamespace(test=SimpleNamespace(rejected_with_margin=rejected, null=None))
+        return SimpleNamespace(test=SimpleNamespace(rejected_with_margin=rejected, null=None), linear=None)
 
     ladder = [one("a", cost=10.0), one("b", cost=11.0), one("a", "c", cost=5.0)]
     simulated = {("a",): 9.0, ("b",): 6.0, ("a", "c"): 5.0}
@@ -307,7 +310,7 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, chosen,
     )
     rest = iter(remain)
     monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: diagnosis(next(rest)))
-    space = SimpleNamespace(room=())
+    space = SimpleNamespace(room=tuple(room))
     space.with_noise = space.with_room = lambda *_: space
     screened = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(weight=None)), bases=())
     searched = search.SearchResult(tuple(ladder), ladder[2], diagnosis(False))

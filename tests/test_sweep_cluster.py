@@ -19,7 +19,7 @@ from test_sweep_store import CONFIG, arrays
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import paper_robots
 from sweeps.config_campaign import Campaign
-from sweeps.points import axes, cluster, scale, zarr_store
+from sweeps.points import axes, cluster, scale
 from sweeps.points.job import prepare_job
 
 pytest.importorskip("distributed")
@@ -86,7 +86,7 @@ def test_worker_killed_in_the_middle_changes_nothing(tmp_path, two_workers):
     killed = []
 
     def kill():
-        journal = tmp_path / "there.partial" / "journal" / "1-of-1.jsonl"
+        journal = tmp_path / "there.partial/journal/1-of-1.jsonl"
         while not journal.exists() or journal.read_text().count("\n") < 100:
             time.sleep(0.01)
         two_workers.workers[0].send_signal(signal.SIGKILL)
@@ -138,10 +138,8 @@ def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_worker_with_another_program_is_refused(two_workers, monkeypatch):
-    honest = zarr_store._code()
-    changed = tuple((f, "0" * 16 if f == "mmrjax/model/motor.py" else h) for f, h in honest)
-    monkeypatch.setattr(zarr_store, "_code", lambda: changed)
-    with pytest.raises(BadConfiguration, match=r"runs different software; it differs in code \(mmrjax/motor\.py\)"):
+    monkeypatch.setattr(cluster, "source_hash", lambda: "other")
+    with pytest.raises(BadConfiguration, match=r"runs different software; it differs in code \(source\)"):
         connect_when_up(two_workers.address)
     monkeypatch.undo()
     pool = cluster.connect_workers(two_workers.address)

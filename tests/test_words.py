@@ -6,7 +6,6 @@ import dataclasses
 import inspect
 import re
 import string
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,8 +37,8 @@ from calibration.words.note_words import NOTES
 from mmrjax.model import channels
 from sweeps import console
 from sweeps.pages.words import FILES
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Notes of every kind; their sentences are in `tests/record/pages/notes.txt`, which `python tests/test_words.py` writes.
 SAMPLES = [
     Remark("feedforward_sign"),
@@ -240,7 +239,7 @@ SAMPLES = [
 ]
 
 
-RECORD = ROOT / "tests" / "record" / "pages" / "notes.txt"
+RECORD = ROOT / "tests/record/pages/notes.txt"
 
 
 def as_text():
@@ -318,13 +317,13 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
 
 
 def test_every_reason_and_every_doubt_has_its_words():
-    text = (ROOT / "calibration" / "discovery" / "standing.py").read_text(encoding="utf-8")
+    text = (ROOT / "calibration/discovery/standing.py").read_text(encoding="utf-8")
     assert all(f'"{why}"' in text for why in loop_words.REASONS if why)
     whys = {a.value for c in ast.walk(ast.parse(text)) if isinstance(c, ast.Call) for a in c.args[1:2]
             if ast.unparse(c.func) == "NameSupport" and isinstance(a, ast.Constant)}  # fmt: skip
     assert whys <= set(loop_words.REASONS)
     worst = NameTest("a", 0.0, 3.0, (), -99.0, 1, 0.0, 0.0, ("b",), True, varies=4.0, over="speed", offset=0.01)
-    schema = (ROOT / "docs" / "schemas" / "loop.schema.json").read_text(encoding="utf-8")
+    schema = (ROOT / "docs/schemas/loop.schema.json").read_text(encoding="utf-8")
     assert all(f'"{doubt}"' in schema for doubt in loop_words.DOUBTS)
     rests = dataclasses.replace(worst, root=4.0)  # below chance with all its rows it rests on none
     assert {*worst.fails, *rests.fails} == set(loop_words.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
@@ -684,7 +683,7 @@ def test_what_would_measure_is_found_by_either_end_of_a_name():
     assert table_words.would_measure("x.y") == "runs under conditions in which it has an effect"
 
 
-def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monkeypatch, capsys):
+def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(capsys):
     text = "- " + "a sentence that goes on " * 8 + "\n" + "x" * 100
     lines = console.wrap_for_terminal(text).split("\n")
     assert all(len(line) <= 80 for line in lines[:-1]) and lines[-1] == "x" * 100 and lines[1].startswith("  ")

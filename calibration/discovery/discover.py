@@ -301,7 +301,9 @@ class LoopInput:
             return None
         space = known.screened.base.space
         equations = space.with_noise(self.noise.sd, space.weight)
-        confirm = functools.partial(_smallest_confirmed, run.space, self.settings)
+        # By the programs of the first verdict, if it needed one: another would be compiled for half a minute.
+        simulated = known.searched is not None and known.searched.room
+        confirm = functools.partial(_smallest_confirmed, run.space, self.settings) if simulated else None
         traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
         refuted = run.contradicts and traced.verdict != "none"
         return dataclasses.replace(traced, verdict="place") if refuted else traced
@@ -817,7 +819,7 @@ def _smallest_confirmed(
     would explain.
 
     Args:
-        space: space of the simulated log.
+        space: space of the simulated log. If it has room for effects, only sets of these are simulated.
         screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
         noise: noise of the readings.
     """
@@ -828,12 +830,13 @@ def _smallest_confirmed(
         return searched
     alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
     sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
+    sizes = [[c for c in sets if not space.room or {*c.effects} <= {*space.room}] for sets in sizes]
     space = space.with_noise(noise.sd, screened.base.space.weight)
-    space = space.with_room([name for sets in sizes for c in sets for name in c.effects])
+    space = space.with_room([*space.room, *(name for sets in sizes for c in sets for name in c.effects)])
     for sets in filter(None, sizes):
         fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
         k = min(range(len(fits)), key=lambda k: fits[k].cost)
-        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings, left.linear)
         searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
         if not diagnosis.test.rejected_with_margin:
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Any
@@ -17,6 +18,7 @@ from calibration.discovery.candidates import Candidate, candidate_of_fit
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.observers.time_histories import HistoriesLinearization
+from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import channels
 
 #: Most Gauss-Newton steps of a simulated model from its regression.
@@ -59,18 +61,21 @@ class LogSimulation:
         linear = HistoriesLinearization(
             jnp.asarray(residual), jnp.asarray(jacobian), jnp.zeros((rows * count, 0)), jnp.zeros(0),
             problem.data.weight / problem.data.sd, no_signals, observe.rows_of, observe.knots, observe.time,
-            jnp.zeros(rows), channels=channels.channel_names(problem.channels),
+            jnp.zeros(rows), balances=(), channels=channels.channel_names(problem.channels),
             magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
         test, count = windows.test, len(windows.test.null.single)
         chance = jnp.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
         null = dataclasses.replace(test.null, white=chance)
-        strongest = dataclasses.replace(test.found, white=linear.memory())
+        strongest = dataclasses.replace(test.found, white=_memory(linear))
         shares = {**test.settings.shares, "white": min(test.settings.shares.values())}
         settings = dataclasses.replace(test.settings, shares=shares)
         return Diagnosis(
             linear, windows.scores, dataclasses.replace(test, found=strongest, null=null, settings=settings)
         )
+
+
+_memory = functools.partial(compiled, options=SELDOM)(HistoriesLinearization.memory)
 
 
 def refine_by_simulation(

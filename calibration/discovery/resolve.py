@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.special import chdtrc
@@ -22,7 +21,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark, progress_remark
-from calibration.inference.population import saved_members
+from calibration.inference.population import StoreStage
 from calibration.inference.result import CalibrationResult
 from mmrjax.effects import UNNAMED
 from mmrjax.model import channels
@@ -60,16 +59,14 @@ def enters_gear_balance(name: str, found: DiscoveryResult) -> bool:
     return any(s.name == name and s.balance in BALANCES for s in found.scores)
 
 
-def check_resolvable(runs: Runs, members: Path | None = None) -> None:
+def check_resolvable(runs: Runs) -> None:
     """Rejects input that `fit_track_model` cannot use, before the loop starts.
 
     Raises:
-        BadConfiguration: the data are histories, or the file of members cannot be read.
+        BadConfiguration: the data are histories.
     """
     if not observers.observer_kind(runs).rows_tell:
         raise BadConfiguration("--resolve: the track model needs settled rows; got time histories")
-    if members is not None and members.exists():
-        saved_members(members)
 
 
 def fit_track_model(
@@ -78,7 +75,7 @@ def fit_track_model(
     noise: str | None = None,
     population: int | None = None,
     generations: int | None = None,
-    members: Path | None = None,
+    keep: StoreStage = lambda name, make: make(),
     seed: int = 0,
     tell: Callable[[Remark | str], None] = lambda note: None,
 ) -> TrackModelResult | None:
@@ -88,7 +85,7 @@ def fit_track_model(
     Args:
         found: result of the loop, from settled rows.
         noise: noise option as given to the loop.
-        population, generations, members, seed: options of the search, see `calibrate`.
+        population, generations, keep, seed: options of the search, see `calibrate`.
         tell: callback for progress messages.
 
     Returns:
@@ -116,16 +113,17 @@ def fit_track_model(
     size = POPULATION if population is None else population
     most = GENERATIONS if generations is None else generations
 
-    def fit(free: Names, file: Path | None = None) -> CalibrationResult:
+    def fit(free: Names, which: str) -> CalibrationResult:
         return calibrate(
-            rows, robot, free=free, noise=sds, model="track", population=size, generations=most, members=file,
+            rows, robot, free=free, noise=sds, model="track", population=size, generations=most,
+            keep=lambda name, make: keep(f"gear {which}, {name}", make),
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
     tell(progress_remark("gear stated"))
-    fitted_robot = fit(friction)
+    fitted_robot = fit(friction, "stated")
     tell(progress_remark("gear free"))
-    free = fit((*friction, *gear), members)
+    free = fit((*friction, *gear), "free")
     fall = 2 * (fitted_robot.objective - free.objective)
     return TrackModelResult(
         asked=reason,

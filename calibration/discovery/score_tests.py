@@ -116,7 +116,7 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     leverage = jnp.sum(fit.half**2, 0)
     row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
-    scores = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
+    scores = [basis.of_signatures(linear, functools.partial(_curve_score, fit)) for basis in bases]
     deviate, explained = (jnp.concatenate([f[k] for f in scores] or [jnp.zeros(0)]) for k in (0, 1))
     amplitude = jnp.where(is_visible, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
@@ -189,9 +189,19 @@ def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Strongest
 Diagnosed = tuple[Linearization, ScoreTable, StrongestStatistics]
 
 
-def diagnose_fit(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
-    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics."""
-    if problem.observe.long:  # by separate programs
+def diagnose_fit(
+    problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
+) -> Diagnosed:
+    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics.
+
+    Args:
+        near: linearization of another fit. Its changes of the readings by effects and curves are used. None: they are
+            computed at this fit, which for a log takes a program.
+    """
+    if near is not None:
+        residual, jacobian, _ = problem.observe.at(problem, z)
+        linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
+    elif problem.observe.over_time:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
         linear = _linearised(with_solved_rows(problem, z), z, effects)
@@ -204,13 +214,13 @@ def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -
 
 
 def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, StrongestStatistics]:
-    """Scores of a fit and the strongest of them, by a program that serves any number of coordinates.
+    """Scores of a fit and the strongest of them, by a program that serves any number of coordinates and any signals.
 
     The coordinates are padded with ones that do not influence the readings, so that only a few sizes are compiled.
     """
     filled = np.zeros((linear.readings, -linear.jacobian.shape[1] % FILLED))
     jacobian, residual = augment_with_columns(linear, filled)
-    wide: Any = {"jacobian": jacobian, "residual": residual}
+    wide: Any = {"jacobian": jacobian, "residual": residual, "signals": None}
     return _scores_and_strongest(dataclasses.replace(jax.tree.map(np.asarray, linear), **wide), bases)
 
 
@@ -320,6 +330,7 @@ def bootstrap_statistics(
         draws_of_part = jax.tree.map(lambda x: x[k], draws)
         return jax.device_get(_replicate_batch(problem, linear, effects, bases, draws_of_part))
 
+    linear = jax.tree.map(jnp.asarray, linear)  # else each batch has a copy
     # The first batch compiles the program of the others; a batch keeps one core busy.
     with Threads(CORES) as cores:
         parts = [statistics_of_batch(0), *cores.map(statistics_of_batch, range(1, count))]

@@ -23,6 +23,7 @@ from calibration.discovery.score_tests import ScoreTable, StrongestStatistics, d
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Remark, progress_remark
+from calibration.inference.linearization import Linearization
 
 #: Largest number of pairs of instances that are examined for pairs of effects.
 PAIRS = 4000
@@ -46,11 +47,12 @@ class SearchResult:
 
 
 def diagnose_candidate(
-    space: CandidateSpace, fitted: Candidate, bases: Bases, null: StrongestStatistics, settings: Settings
-) -> Diagnosis:
-    """Linearises a candidate's fit and tests its residuals."""
+    space: CandidateSpace, fitted: Candidate, bases: Bases, null: StrongestStatistics, settings: Settings,
+    near: Linearization | None = None,
+) -> Diagnosis:  # fmt: skip
+    """Linearises a candidate's fit and tests its residuals. `near`: as in `diagnose_fit`."""
     z = jnp.asarray(fitted.z)
-    diagnosis = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
+    diagnosis = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases, near)
     linear, scores, statistics = jax.device_get(diagnosis)
     return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -22,6 +23,8 @@ from mmrjax.model import channels
 from mmrjax.model.balances import absent_balances
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
+
+T = TypeVar("T")
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
 #: also loads the contact. And the balances that each represents, because a defect has the same shape in them.
@@ -97,15 +100,16 @@ class Basis(eqx.Module):
         """
         return dataclasses.replace(self, variables=())
 
-    def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
-        """Change of the whitened readings per unit of each column.
+    def of_signatures(self, linear: Linearization, function: Callable[[Array], T]) -> T:
+        """Function of the change of the whitened readings per unit of each column, shape (readings, terms), for each
+        family.
 
         Families are computed one at a time to save memory.
         """
         of_channels = is_channel_place(self.places[0])
         places_known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
         places = jnp.asarray([places_known.index(place) for place in self.places])
-        return jax.lax.map(lambda family: change(*family), (places, self.columns))
+        return jax.lax.map(lambda family: function(change(*family)), (places, self.columns))
 
 
 Bases = tuple[Basis, ...]

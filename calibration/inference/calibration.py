@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +29,6 @@ from calibration.inference import (
     population,
     priors,
     scans,
-    solvers,
 )
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, progress_remark, remarks_with_codes
@@ -38,7 +36,7 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
-from calibration.inference.population import GENERATIONS, LEAST
+from calibration.inference.population import GENERATIONS, LEAST, StoreStage
 from calibration.inference.preparation import PreparedInput, prepare_input
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import calibration_remarks, row_numbers
@@ -72,12 +70,11 @@ def calibrate(
     starts: int | None = None,
     population: int | None = None,
     generations: int | None = None,
-    members: Path | None = None,
+    keep: StoreStage = lambda name, make: make(),
     seed: int = 0,
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
     rows: int = ROWS,
-    solver: str | optimizers.Solver | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Fits parameters of `robot` to measured runs.
@@ -95,21 +92,18 @@ def calibrate(
         population: number of members of each generation of a search without gradients, which precedes the search with
             a rollout. None: `POPULATION` if parameters are free that `steady` does not use, otherwise 0.
         generations: largest number of generations. None: `population.GENERATIONS`.
-        members: file in which the members are stored, so that the same calibration can resume.
+        keep: storage of the population's generations, so that the same calibration can resume.
         seed: random seed of the starts and all other draws.
         profiles: True to compute a profile likelihood of each parameter.
         blocks: kinds of blocks to hold out. True: all that are informative for such data. Defaults of these two
             depend on the kind of data and the fidelity.
         rows: largest number of rows. Larger tables are thinned evenly: logs in time, tables over their conditions. A
             note reports it.
-        solver: solver of optimistix, or its name (`solvers.NAMES`), for the searches from the starts. None: the
-            solver of this package, which also serves all fits that begin at the optimum (profiles, blocks). Other
-            solvers ignore adhesion penalties below zero.
         tell: callback for progress messages.
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check_data`.
-        BadConfiguration: an unknown fidelity, parameter or solver. A number that is not allowed. An invalid prior or
+        BadConfiguration: an unknown fidelity or parameter. A number that is not allowed. An invalid prior or
             noise, or a prior of a mass that the table states. Rows that no robot near the priors reaches, or a call
             inside `jax.jit` while JAX uses single precision.
     """
@@ -124,7 +118,6 @@ def calibrate(
     for name, (value, low) in counts.items():
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
-    solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
     runs, progress = used_rows(runs, robot, rows), report_in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
@@ -140,16 +133,15 @@ def calibrate(
     base, of_product = _with_guide_priors(runs, ready, fidelity)
     coordinates = priors.parameter_coordinates(base, ready.names, {**of_product, **ready.stated})
     posed = observers.pose_problem(runs, base, coordinates, ready.noise.sd, fidelity)
-    has_population_options = members is not None or generations is not None
     evolved = (
-        _population_size(posed, ready.names, runs, population, has_population_options),
+        _population_size(posed, ready.names, runs, population, generations is not None),
         generations or GENERATIONS,
-        members,
+        keep,
     )
-    search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress, solver)
+    search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress)
     setting = _CalibrationInput(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
     if not free and priors.DELAY not in (*fix, *ready.names):
-        setting, search = _free_delay_if_needed(setting, search, progress, solver)
+        setting, search = _free_delay_if_needed(setting, search, progress)
     return _calibration_result(setting, search, beside, seed, progress)
 
 
@@ -234,7 +226,6 @@ def _free_delay_if_needed(
     setting: _CalibrationInput,
     found: MultistartResult,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None,
 ) -> tuple[_CalibrationInput, MultistartResult]:
     """Repeats the search with a free delay, if the error of a log is concentrated in the samples after steps.
 
@@ -254,7 +245,7 @@ def _free_delay_if_needed(
     start = np.zeros((1, len(coordinates)))
     start[0, index] = found.best.z
     start = scans.place_at_minimum(posed, start)
-    found = multistart.search_one_by_one(posed, ready.noise, start, found.shares, tell, solver)
+    found = multistart.search_one_by_one(posed, ready.noise, start, found.shares, tell)
     return dataclasses.replace(setting, ready=ready), found
 
 
@@ -263,15 +254,15 @@ def _population_size(posed: Problem, names: Sequence[str], runs: Runs, populatio
 
     Args:
         population: argument of `calibrate`.
-        more: True if other options of that search are given.
+        more: True if its number of generations is given.
 
     Raises:
-        BadConfiguration: options are given but there is no population, or the data do not support such a search.
+        BadConfiguration: a number of generations without a population, or the data do not support such a search.
     """
     if population is None:
         population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if more and not population:
-        raise BadConfiguration("--generations, --members: have an effect only with --population; give it too")
+        raise BadConfiguration("--generations: has an effect only with --population; give it too")
     if population and not posed.observe.starts_from_steady:
         raise BadConfiguration(
             f"--population: got {population}; a population search needs settled rows and --model drive or track"
@@ -289,10 +280,9 @@ def _search(
     starts: int,
     size: int,
     generations: int,
-    members_file: Path | None,
+    keep: StoreStage,
     seed: int,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None,
 ) -> tuple[MultistartResult, np.ndarray | None]:
     """Searches for the optimum. Also returns the optimum of `steady` if the searches started there."""
     rng, all_members = np.random.default_rng(seed), None
@@ -301,33 +291,30 @@ def _search(
         all_members = observers.pose_problem(runs.log, base, posed.coordinates, sd)
     points = posed.observe.starts(posed, rng, starts, all_members)
     if not posed.observe.long:
-        return multistart.search_from_starts(posed, known, points, solver), None
+        return multistart.search_from_starts(posed, known, points), None
     if not posed.observe.starts_from_steady:
         shares = multistart.initial_noise_shares(known)
-        return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
+        return multistart.search_one_by_one(posed, known, points, shares, tell), None
     tell(progress_remark("steady"))
-    if size:
-        population.MemberRunner(posed, members_file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
-        observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws, solver
+        observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws
     )
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.starts_from_posterior(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
     if not size:
-        return multistart.search_one_by_one(posed, known, points, easy.shares, tell, solver), beside
+        return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
     # The first generation has the posterior of `steady`, but the prior for friction of contacts, which has another
     # meaning there.
     covariance = identifiability.analyse_identifiability(easy.problem, jnp.asarray(beside)).covariance.copy()
     friction = np.array([FRICTION in name for name in easy.problem.coordinates.names])
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
-    members = population.MemberRunner(posed, members_file)
     everyone = population.run_evolution(
-        members, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
-        seed=seed, beside=points, tell=tell,
+        posed, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
+        seed=seed, beside=points, tell=tell, keep=keep,
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
@@ -341,13 +328,13 @@ def _search(
     tell(progress_remark("derivatives"))
     identifiability_there = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
     unreliable = population.unreliable_derivatives(
-        posed, members, everyone.z[best_member], identifiability_there.jacobian, identifiability_there.sd
+        posed, everyone.z[best_member], identifiability_there.jacobian, identifiability_there.sd
     )
     names = tuple(n for n, apart in zip(posed.coordinates.names, unreliable, strict=True) if apart)
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
     edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
     searched = population.PopulationSearch(everyone, best_member, names, slope, left, edge)
-    return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
+    return multistart.optimum_of_population(posed, known, shares, searched, tell), beside
 
 
 def _calibration_result(

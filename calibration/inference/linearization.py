@@ -224,10 +224,10 @@ class Linearization(eqx.Module):
 
     def rescaled(self, factor: Array) -> Self:
         """Copy with the scale of the readings times a factor, shape (rows, channels)."""
-        by_reading = jnp.concatenate([jnp.ravel(factor), jnp.ones(self.residual.shape[0] - self.readings)])
+        by_reading = np.concatenate([np.ravel(factor), np.ones(self.residual.shape[0] - self.readings)])
         return dataclasses.replace(
             self, residual=self.residual * by_reading, jacobian=self.jacobian * by_reading[:, None],
-            signatures=self.signatures * jnp.ravel(factor)[:, None], scale=self.scale * factor,
+            signatures=self.signatures * np.ravel(factor)[:, None], scale=self.scale * factor,
         )  # fmt: skip
 
     @property

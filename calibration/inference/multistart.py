@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -100,22 +99,18 @@ def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
-def search_from_starts(
-    posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None
-) -> MultistartResult:
+def search_from_starts(posed: Problem, noise: Noise, points: np.ndarray) -> MultistartResult:
     """Searches from all points in one batch. Unknown noise is estimated and the search repeated until the noise
     settles.
 
     The best optimum so far is one more start, so that every round runs the same compiled program.
-
-    Args:
-        solver: solver of optimistix. None: the solver of this package.
     """
-    search_function = functools.partial(optimizers.search_starts, solver=solver)
     z = points[0]
     shares = initial_noise_shares(noise)
     for _ in range(ROUNDS):
-        posed, optima, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), search_function)
+        posed, optima, feasible = _search_until_feasible(
+            posed, np.concatenate([points, z[None]]), optimizers.search_starts
+        )
         best = _pick_member(optima, int(np.nanargmin(optima.cost)))
         z = np.asarray(best.z)
         new = _reestimate_shares(posed, noise, z, shares)
@@ -134,7 +129,6 @@ def search_one_by_one(
     points: np.ndarray,
     shares: np.ndarray,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None,
 ) -> MultistartResult:
     """Searches from several points as `search_from_starts`, but one after another.
 
@@ -145,7 +139,6 @@ def search_one_by_one(
         posed: problem with the initial noise.
         shares: initial noise, relative to the readings.
         tell: callback for progress after every step.
-        solver: solver of optimistix. None: the solver of this package.
     """
     start_time = time.perf_counter()
 
@@ -154,8 +147,6 @@ def search_one_by_one(
 
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
-            if solver is not None:
-                return _pick_member(optimizers.search_with_solver(posed, jnp.asarray(z)[None], data, solver), 0)
             return optimizers.search_rollout(
                 posed,
                 jnp.asarray(z),
@@ -225,14 +216,13 @@ def optimum_of_population(
     shares: np.ndarray,
     searched: PopulationSearch,
     tell: Callable[[Remark], None],
-    solver: optimizers.Solver | None,
 ) -> MultistartResult:
     """Result of a population, after a further search by gradients from its best member where gradients are
     reliable.
     """
     z = searched.found.z[searched.at]
     if searched.slope is None:
-        optima = search_one_by_one(posed, noise, z[None], shares, tell, solver)
+        optima = search_one_by_one(posed, noise, z[None], shares, tell)
         return dataclasses.replace(optima, searched=searched)
     observation = Observation(*(jnp.asarray(x[searched.at]) for x in (
         searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,

@@ -1,6 +1,6 @@
 """Maximum a posteriori estimation: least squares with exact Jacobians, from many starts at once.
 
-Searches use solvers of optimistix. The default is ours (`levenberg_marquardt`).
+Every search uses the solver of optimistix in `levenberg_marquardt`.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ from mmrjax.numerics.linear_equations import solve_lower
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 #: Change of z (and of the residuals, relative) at which a search ends; the second for rollouts.
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
-#: Largest number of steps of a solver of optimistix: for least squares, and for a minimiser.
-MOST_STEPS = 256, 2000
 #: Multiple of the decrease predicted by its linearisation that a search of rollouts may still achieve.
 HOPELESS = 10.0
 #: Number of last steps that predict the further decrease of a search of rollouts. Share of the objective by which
@@ -111,8 +109,6 @@ def informative_residuals(data: Data) -> np.ndarray:
     return np.r_[: penalties.start, penalties.stop : penalties.stop + data.centre.size]
 
 
-#: Least-squares solvers and minimisers of optimistix.
-Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 #: A search between two steps: the best point so far and the solver's state.
 Progress = tuple[Z, SearchState]
 
@@ -482,7 +478,7 @@ def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observa
     r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
         problem, z, data
     )
-    return *_clip_penalties(r, jacobian, data), observation
+    return *clip_penalties(r, jacobian, data), observation
 
 
 def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
@@ -501,15 +497,13 @@ def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Ar
     return state.found.residual, state.found.jacobian, state.aux
 
 
+@functools.partial(compiled, options=SELDOM)
 def clip_penalties(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian with penalties clipped at 0, for solvers without one-sided residuals.
+    """Residuals and Jacobian with penalties clipped at 0, for a linearisation without one-sided residuals.
 
     A reading with a non-finite derivative counts as not computed.
     """
     return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), adhesion_penalty_slice(data))
-
-
-_clip_penalties = compiled(clip_penalties, options=SELDOM)
 
 
 def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
@@ -588,18 +582,10 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 
 
 @functools.partial(compiled, options=SELDOM)
-def _step_searches(
-    at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array
-) -> tuple[Progress, Optimum]:
-    """Next step of each search, and its best point."""
-
-    solver, pin = _least_squares_solver(data, long=True), no_pin(at[0].shape[-1])
-
-    def step_search(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
-        new = _solver_step(solver, linear_residual_function(*found), at)
-        return new, _optimum_of_progress(new, dataclasses.replace(data, weight=weight), pin)
-
-    return jax.vmap(step_search)(at, found, weights)
+def _step_search(at: Progress, found: tuple[Array, Array, Any], data: Data) -> tuple[Progress, Optimum]:
+    """Next step of a search, and its best point."""
+    new = _solver_step(_least_squares_solver(data, long=True), linear_residual_function(*found), at)
+    return new, _optimum_of_progress(new, data, no_pin(at[0].shape[-1]))
 
 
 def search_rollouts(
@@ -632,32 +618,24 @@ def search_rollouts(
         The end of each search, and the observation there.
     """
     starts, weights, solver = np.asarray(starts), np.asarray(weights), _least_squares_solver(data, long=True)
-    assigned = SearchQueue(range(len(starts)), max(places, len(starts) * (within <= SAME)))
+    assigned = SearchQueue(range(len(starts)), len(starts) if within <= SAME else min(places, len(starts)))
     cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
     trail = np.full((2 * LATELY, len(assigned.member)), np.nan)
-    progress: Progress | None = None
+    searches: list[Any] = [None] * len(ahead)
     while assigned:
         fresh, going = assigned.fill(), np.flatnonzero(assigned.taken)
         # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
-        ahead = _with_values(ahead, fresh, starts[assigned.holds[fresh]])
+        ahead[fresh], trail[:, fresh] = starts[assigned.holds[fresh]], np.nan
         evaluated = evaluate(ahead[going], assigned.holds[going])
-        optima = jax.tree.map(
-            lambda x: _with_values(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x),  # noqa: B023
-            evaluated,
-        )
-        if len(fresh):
-            trail[:, fresh] = np.nan
-            aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), optima[2])
-            begin = functools.partial(_initial_progress, solver, size=optima[0].shape[1], aux=aux)
-            first_states = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
-            put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
-            progress = first_states if progress is None else jax.tree.map(put, progress, first_states)
-        assert progress is not None  # the first searches are fresh
-        progress, ends = jax.device_get(_step_searches(progress, optima, data, weights[assigned.member]))
-        state = progress[1]
-        ahead, observation = state.ahead, state.aux
+        for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
+            found = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
+            if k in fresh:
+                searches[k] = jax.device_get(_initial_progress(solver, ahead[k], found[0].size, found[2])), None
+            searches[k] = jax.device_get(_step_search(searches[k][0], found, data))
+        results = [(s.over, s.steps, s.ahead, s.aux, end) for (_, s), end in searches]
+        over, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        is_over = state.over | (state.steps >= max_steps) | (ends.decrement < small)
+        is_over = over | (steps >= max_steps) | (ends.decrement < small)
         is_over = is_over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
         if within < np.inf:
@@ -674,25 +652,16 @@ def search_rollouts(
     return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))
 
 
-def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
-    x = np.array(x)
-    x[places] = values
-    return x
-
-
 def search_starts(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """Searches from each start: in batches by the solver of this package, one after another by another `solver`.
+    """Searches from each start, in batches.
 
     Batches of `AT_ONCE` rows limit the memory. An interrupt takes effect between them.
 
     Returns:
         The end of each search, and the status of each row at its start and at its end.
     """
-    if solver is not None:
-        optima, start, end = search_with_solver(problem, starts, data, solver)
-        return optima, start.status, end.status
     if not problem.observe.apart:
         size = min(len(starts), max(1, AT_ONCE // len(data.measured)))
         filled = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
@@ -715,34 +684,6 @@ def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> 
         return optimum, problem.observation(z).status, observation.status
 
     return jax.vmap(search)(starts)
-
-
-@eqx.filter_jit
-def search_with_solver(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
-) -> tuple[Optimum, Observation, Observation]:
-    """Searches with a solver of optimistix, one after another.
-
-    Such solvers call LAPACK, and batched calls of LAPACK have deadlocked (`linear_equations`).
-
-    Returns:
-        The end of each search, and the observations at its start and at its end.
-    """
-    step_limit = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
-
-    def residual(z: Z, args: Any) -> Array:
-        r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
-        return with_derivative(z, *clip_penalties(r, jacobian, data))
-
-    def search(start: Z) -> tuple[Optimum, Observation, Observation]:
-        solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=step_limit, throw=False)
-        z, pin = solved.value, no_pin(start.size)
-        r, jacobian, observation = _evaluate_residuals(problem, data, pin, z)
-        r, jacobian = mask_uncomputed(r, jacobian, data)
-        optimum = _optimum_at(jacobian, r, z, data, pin, solved.stats["num_steps"])
-        return optimum, problem.observation(start), observation
-
-    return jax.lax.map(search, starts)
 
 
 def observe_robot(problem: Problem, robot: Robot) -> Observation:

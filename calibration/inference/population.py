@@ -9,22 +9,18 @@ near the best one.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import os
+import functools
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data import Json, Names
-from calibration.data.input_errors import BadConfiguration
-from calibration.data.writing import entries_of, replacing
+from calibration.data.writing import entries_of
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
@@ -111,104 +107,37 @@ class MemberObservations(NamedTuple):
     flags: Int[np.ndarray, "members rows"]
 
 
-#: Arrays in a file of members.
-KEPT = ("z", *MemberObservations._fields)
 Objective = Callable[[np.ndarray, MemberObservations], Float[np.ndarray, " members"]]
+#: Function that returns the stored result of a stage by its name, or else computes and stores it.
+StoreStage = Callable[[str, Callable[[], Any]], Any]
 
 
-def problem_hash(posed: Problem) -> str:
-    """Hash of the data, base robot, coordinates and model of a problem."""
-    arrays, static_parts = eqx.partition(posed, eqx.is_array_like)
-    digest = hashlib.sha256(str(static_parts).encode())
-    for leaf in jax.tree.leaves(arrays):
-        digest.update(np.asarray(leaf).tobytes())
-    return digest.hexdigest()[:16]
-
-
-def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
-    """Contents of a file of members: hash of its problem, and arrays in the order of `KEPT`.
-
-    Raises:
-        BadConfiguration: it is not a file of members, or it is damaged.
-    """
-    try:
-        with file.open("rb") as bytes_, np.load(bytes_, allow_pickle=False) as saved:
-            own_identity, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
-        if len({len(array) for array in arrays}) != 1:
-            raise ValueError("its arrays have different lengths")
-    except Exception as error:  # a damaged file can make the reader raise anything
-        raise BadConfiguration(
-            f"--members {file}: not a readable file of members ({type(error).__name__}); remove it, or name "
-            "another file"
-        ) from error
-    return own_identity, arrays
-
-
-class MemberRunner:
-    """Simulates members and stores their results, optionally in a file, so that a search can resume.
+def simulate_members(
+    posed: Problem,
+    points: np.ndarray,
+    advance: Callable[[int], None] = lambda _: None,
+    together: int | None = None,
+) -> MemberObservations:
+    """Simulates the rows for each point.
 
     Args:
-        posed: the problem.
-        file: file of members.
+        advance: callback for the number of simulated members.
         together: number of members in one batch. None: `TOGETHER`.
-
-    Raises:
-        BadConfiguration: the file is not a file of members, belongs to another problem, or cannot be written.
     """
+    together = together or TOGETHER[jax.default_backend() != "cpu"]
+    batches = []
+    for first in range(0, len(points), together):
+        part = points[first : first + together]
+        filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
+        observed = jax.device_get(_observe_points(posed, jnp.asarray(filled)))
+        batches.append([getattr(observed, name)[: len(part)] for name in MemberObservations._fields])
+        advance(first + len(part))
+    return MemberObservations(*map(np.concatenate, zip(*batches, strict=True)))
 
-    def __init__(self, posed: Problem, file: Path | None = None, together: int | None = None) -> None:
-        self._together = together or TOGETHER[jax.default_backend() != "cpu"]
-        # The noise is excluded, because it may be estimated again during the search.
-        data_without_noise = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
-        self._posed, self._file, self._own = (
-            posed,
-            file,
-            problem_hash(dataclasses.replace(posed, data=data_without_noise)),
-        )
-        self._kept: dict[bytes, tuple[np.ndarray, ...]] = {}
-        if file is not None and file.exists():
-            self._load(file)
 
-    def _load(self, file: Path) -> None:
-        own_identity, arrays = saved_members(file)
-        if own_identity != self._own:
-            raise BadConfiguration(
-                f"--members {file}: its members belong to another calibration (data, robot, parameters or model); "
-                "remove it, or name another file"
-            )
-        self._kept = {row[0].tobytes(): row[1:] for row in zip(*arrays, strict=True)}
-
-    def _save(self) -> None:
-        if self._file is None:
-            return
-        z = np.array([np.frombuffer(key) for key in self._kept])
-        arrays: Json = dict(zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True))
-        try:
-            with replacing(self._file) as temporary, temporary.open("wb") as stream:
-                np.savez(stream, **arrays, identity=np.array(self._own))
-                stream.flush()
-                os.fsync(stream.fileno())
-        except OSError as error:
-            raise BadConfiguration(f"--members {self._file}: cannot be written: {error.strerror}") from None
-
-    def lost(self, seen: MemberObservations) -> Bool[np.ndarray, "members rows"]:
-        """True for measured rows that the model does not reach."""
-        return self._posed.observe.unreachable(seen.status) & (np.asarray(self._posed.data.weight).max(1) > 0)
-
-    def run(self, points: np.ndarray, advance: Callable[[int], None] = lambda _: None) -> MemberObservations:
-        """Simulates the rows for each point."""
-        keys = [np.ascontiguousarray(z, float).tobytes() for z in points]
-        new = [z for key, z in zip(keys, points, strict=True) if key not in self._kept]
-        together = self._together
-        for first in range(0, len(new), together):
-            part = np.array(new[first : first + together])
-            filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
-            observed = jax.device_get(_observe_points(self._posed, jnp.asarray(filled)))
-            for z, *row in zip(part, *(getattr(observed, name) for name in MemberObservations._fields), strict=False):
-                self._kept[z.tobytes()] = tuple(map(np.asarray, row))
-            self._save()
-            advance(len(points) - len(new) + first + len(part))
-        return MemberObservations(*map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True)))
+def lost_rows(posed: Problem, seen: MemberObservations) -> Bool[np.ndarray, "members rows"]:
+    """True for measured rows that the model does not reach."""
+    return posed.observe.unreachable(seen.status) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
 @compiled
@@ -248,14 +177,14 @@ def member_objective(posed: Problem, noise: Noise) -> Objective:
                 squares += 2 * count * np.log(shares[..., k])
             else:
                 squares += np.sum(weight[:, k] * (error[..., k] / sd[:, k]) ** 2, -1)
-        cost = 0.5 * squares + LOST * (posed.observe.unreachable(seen.status) & (weight.max(1) > 0)).sum(-1)
+        cost = 0.5 * squares + LOST * lost_rows(posed, seen).sum(-1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     return of
 
 
 def run_evolution(
-    members: MemberRunner,
+    posed: Problem,
     objective: Objective,
     centre: np.ndarray,
     covariance: np.ndarray,
@@ -265,11 +194,12 @@ def run_evolution(
     generations: int,
     beside: np.ndarray | None = None,
     tell: Callable[[Remark], None] = lambda step: None,
+    keep: StoreStage = lambda name, make: make(),
 ) -> Population:
     """Searches by generations: each is drawn around the best members of the generations before.
 
     Args:
-        members: runner of members.
+        posed: the problem.
         objective: objective of members.
         centre, covariance: centre and covariance of the first generation, in coordinates z.
         size: number of members in a generation.
@@ -277,6 +207,7 @@ def run_evolution(
         generations: largest number of generations.
         beside: further points to simulate with the first generation.
         tell: callback for progress after every batch.
+        keep: storage of the generations, so that a search can resume.
     """
     from cmaes import CMA
 
@@ -292,7 +223,8 @@ def run_evolution(
             minutes = (time.perf_counter() - start_time) / 60
             tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
-        generation = members.run(points, advance)
+        simulate = functools.partial(simulate_members, posed, points, advance)
+        generation: MemberObservations = keep(f"generation {number}", simulate)
         z = points if rows is None else np.concatenate([z, points])
         rows = (
             generation
@@ -307,7 +239,7 @@ def run_evolution(
                 for d, c in zip(sample, np.where(np.isfinite(own_cost), own_cost, MISSING**2), strict=True)
             ]
         )
-        failed = int(np.sum(members.lost(generation).any(-1)))
+        failed = int(np.sum(lost_rows(posed, generation).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
         tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
         population = Population(z, *rows, cost, tuple(progress))
@@ -344,7 +276,7 @@ def local_regression(
 
 
 def unreliable_derivatives(
-    posed: Problem, members: MemberRunner, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
+    posed: Problem, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
 ) -> Bool[np.ndarray, " parameters"]:
     """True for parameters whose derivatives of a run disagree with finite differences, shape (parameters,).
 
@@ -352,7 +284,7 @@ def unreliable_derivatives(
     exceeds both `APART` of its size and one data sd per posterior sd.
     """
     steps = STEP * np.diag(sd)
-    rows = members.run(np.concatenate([z + steps, z - steps]))
+    rows = simulate_members(posed, np.concatenate([z + steps, z - steps]))
     scale = np.asarray(posed.data.weight / posed.data.sd)
     ahead, behind = np.split(np.where(scale > 0, rows.reading * scale, 0.0), 2)
     differences = ((ahead - behind) / (2 * STEP)).reshape(len(z), -1)  # per posterior sd

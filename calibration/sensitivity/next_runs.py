@@ -30,51 +30,26 @@ def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def choose_runs(information: np.ndarray, count: int) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Runs that together are most informative. Each candidate is chosen at most once.
+    """Informative runs, chosen one at a time: each adds most to those before it. No candidate is chosen twice.
+
+    Exchanges of chosen runs gained nothing at the usual noise, and 0.2 of 43 bit at a tenth of it.
 
     Args:
         information: Fisher information of each candidate, from `fisher_information`.
         count: number of runs.
 
     Returns:
-        Indices of the chosen candidates, the most informative first. Information that each adds to those before it
-        [bit]. Covariance of the scores after each number of runs, from none to all, shape (runs + 1, inputs, inputs).
+        Indices of the chosen candidates. Information that each adds to those before it [bit]. Covariance of the
+        scores after each number of runs, from none to all, shape (runs + 1, inputs, inputs).
     """
-    candidates, size, _ = information.shape
-    count = min(count, candidates)
-    run_indices: list[int] = []
-    for _ in range(count):
-        run_indices.append(_best_candidate(information, run_indices))
-    improved = True
-    while improved:
-        improved = False
-        for place in range(count):
-            other_runs = run_indices[:place] + run_indices[place + 1 :]
-            best = _best_candidate(information, other_runs)
-            if _log_determinant(information, [*other_runs, best]) > _log_determinant(information, run_indices) + 1e-9:
-                run_indices = [*other_runs, best]
-                improved = True
-    ordered: list[int] = []
-    for _ in range(count):  # chosen runs, the most informative first
-        unordered = [k for k in run_indices if k not in ordered]
-        ordered.append(max(unordered, key=lambda k: _log_determinant(information, [*ordered, k])))
-    values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
-    eye = np.eye(size)
-    covariances = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
-    return ordered, np.diff(values) / (2 * np.log(2)), np.stack(covariances)
-
-
-def _log_determinant(information: np.ndarray, rows: list[int]) -> float:
-    total = np.eye(information.shape[1]) + information[rows].sum(0)
-    return float(np.linalg.slogdet(total)[1])
-
-
-def _best_candidate(information: np.ndarray, rows: list[int]) -> int:
-    """Index of the candidate outside `rows` that adds most information."""
-    total = np.eye(information.shape[1]) + information[rows].sum(0)
-    value = np.linalg.slogdet(total + information)[1]
-    value[rows] = -np.inf
-    return int(np.argmax(value))
+    totals, chosen, gains = [np.eye(information.shape[1])], list[int](), list[float]()
+    for _ in range(min(count, len(information))):
+        gain = np.linalg.slogdet(totals[-1] + information)[1] - np.linalg.slogdet(totals[-1])[1]
+        gain[chosen] = -np.inf
+        chosen.append(int(np.argmax(gain)))
+        gains.append(gain[chosen[-1]])
+        totals.append(totals[-1] + information[chosen[-1]])
+    return chosen, np.array(gains) / (2 * np.log(2)), np.linalg.inv(np.stack(totals))
 
 
 # --- the next runs --------------------------------------------------------------------------------

@@ -728,7 +728,7 @@ def track_model_answer(found: TrackModelResult) -> str:
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
-    on = "" if found.settled else ". The search has not converged: repeat it with more --generations (see --members)"
+    on = "" if found.settled else ". The search has not converged: repeat it with more --generations"
     slip = f"rms slip error of the {found.rows} rows on tracks {before:.2g} → {after:.2g} percentage points"
     if not found.gear_explains_discrepancy:
         why = f". Outside their priors: {', '.join(found.outside)}" if found.outside else ""

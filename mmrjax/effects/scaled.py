@@ -64,9 +64,9 @@ def _field(parameter: Parameter, factor: float, limits: float) -> Any:
 def _reduced(effect: Effect) -> tuple[Any, ...]:
     values = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect) if f.init}
     kind = type(effect)
-    return _restore_effect, (kind.plain, kind.factors, values)
+    return restore_effect, (kind.plain, kind.factors, values)
 
 
-def _restore_effect(kind: type[Effect], factors: Factors, values: Mapping[str, Any]) -> Effect:
+def restore_effect(kind: type[Effect], factors: Factors, values: Mapping[str, Any]) -> Effect:
     """Restores an effect from its pickled values, because its class cannot be found by name."""
     return scaled_effect(kind, factors)(**values)

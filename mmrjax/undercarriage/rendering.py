@@ -1,4 +1,4 @@
-"""Pictures and video of the track model: the robot on its slope with running track and drawn forces, headless."""
+"""Pictures of the track model: the robot on its slope with running track and drawn forces, headless."""
 
 from __future__ import annotations
 
@@ -19,10 +19,7 @@ from mmrjax.undercarriage.belt import BeltPath, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.undercarriage.side_contacts import lever_tips
 
-FORMATS = (".png", ".gif")
 FORCE = 1 / 800  # length of an arrow [m/N]
-RATE = 20  # frames per second
-FRAMES = 10_000  # most frames of a film; each takes about a third of a second to draw
 
 _INK, _BODY, _BELT, _GROUND = "#1f2933", "#5b8db8", "#2f3437", "#b8a98f"
 _NORMAL, _TRACTION, _RESISTANCE, _GUIDE, _WEIGHT = "#d1495b", "#2e933c", "#b07d12", "#7048a8", "#1f2933"
@@ -241,70 +238,30 @@ def figure_of_sample(view: RunScene, k: int) -> Any:
     return sheet
 
 
-def frame_times(
-    file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
-) -> Float[np.ndarray, " frames"]:
-    """Times [s] of the pictures that `render` draws of a run of `length` [s]. Called before a run, it reports errors
+def check_picture(file: File, time: float, length: float) -> None:
+    """Rejects a picture that `render` cannot draw of a run of `length` [s]. Called before a run, it reports errors
     early.
 
     Raises:
-        ValueError: the suffix is not one of `FORMATS`, no time of the run is between `begin` and `end`, the film has
-            more than `FRAMES` pictures.
+        ValueError: the suffix is not .png, or `time` is not within the run.
     """
-    if file.suffix not in FORMATS:
-        raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
-    if file.suffix == ".png" and end is not None:
-        raise ValueError(f"end: got {end:g} s for {file.name}; a PNG shows only the time `begin`; leave `end` out")
-    film, last_time = file.suffix != ".png", length if end is None else end
-    until = min(last_time, length)
-    if not 0 <= begin <= length or (film and not begin < until):
-        received = f"begin, end: got {begin:g} to {last_time:g} s" if film else f"begin: got {begin:g} s"
-        raise ValueError(f"{received}; expected times within the run, 0 to {length:g} s")
-    if not film:
-        return np.asarray([begin])
-    pictures = (until - begin) * rate * slow
-    if not 0 < pictures <= FRAMES:
-        raise ValueError(f"slow: got {slow:g}, a film of {pictures:.0f} pictures; expected at most {FRAMES}")
-    return np.arange(begin, until, 1 / (rate * slow))
+    if file.suffix != ".png":
+        raise ValueError(f"file: got {file.name}; expected a name that ends in .png")
+    if not 0 <= time <= length:
+        raise ValueError(f"time: got {time:g} s; expected a time within the run, 0 to {length:g} s")
 
 
-def render(
-    view: Any,
-    file: str | File,
-    begin: float = 0.0,
-    end: float | None = None,
-    slow: float = 10.0,
-    rate: int = RATE,
-) -> File:
-    """Writes a picture (.png, at time `begin`) or a film (.gif) of a scene.
-
-    Args:
-        view: view with `time`, the times of the samples [s], and `sheet`, which returns the figure of a sample. See
-            `scene_of_run`.
-        file: its suffix decides the format.
-        begin, end: part of the run to film [s]. None: to its end.
-        slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.
-        rate: frames per second.
+def render(scene: RunScene, file: str | File, time: float = 0.0) -> File:
+    """Writes a picture (.png) of a scene at a time [s].
 
     Raises:
-        ValueError: as for `frame_times`.
+        ValueError: as for `check_picture`.
     """
     file = File(file)
-    times = frame_times(file, begin, end, slow, float(view.time[-1]), rate)
-    frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
+    check_picture(file, time, float(scene.time[-1]))
     import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # a file matplotlibrc of the working folder could run LaTeX
-        if file.suffix == ".png":
-            view.sheet(frames[0]).savefig(file)
-            return file
-        images = []
-        for k in frames:
-            canvas = FigureCanvasAgg(view.sheet(k))
-            canvas.draw()
-            images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(256))
-    images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
+        scene.sheet(int(np.argmin(np.abs(scene.time - time)))).savefig(file)
     return file

@@ -29,8 +29,8 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
         result = run(
             runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=prior_options,
             noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
-            generations=config.generations, members=beside.members, seed=config.seed,
-            profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
+            generations=config.generations, keep=folder.stage, seed=config.seed,
+            profiles=config.profiles, blocks=config.hold_out, tell=heard,
         )  # fmt: skip
         result.save(folder.results(), config.robot, folder.tables)
         report = calibration_report.calibration_document(result, config.robot, feedforward_fit.voltage_fit(runs))

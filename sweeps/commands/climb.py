@@ -69,10 +69,6 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         if rows := climbed.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
         folder.write_json("result.json", climbed.to_json())
-        if config.film:
-            from sweeps.pages import climb_figures
-
-            climb_figures.render_climb(climbed, folder.results() / "climb.gif")
         document = print_report(climb_report.climb_document(climbed, file), file)
         manifest = {"seed": None, "verdict": climbed.verdict}
         return finish_run_folder(

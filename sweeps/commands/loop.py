@@ -72,7 +72,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
     began, time_budget = time.monotonic(), beside.seconds
     prior_options = priors.parse_priors(config.prior)
     if config.resolve:
-        check_resolvable(runs, beside.members)
+        check_resolvable(runs)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
     stages: dict[str, Any] = {}
@@ -123,7 +123,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             # Does a different running gear explain the misfit?
             resolved = fit_track_model(
                 verdict, noise=config.noise or None, population=config.population, generations=config.generations,
-                members=beside.members, seed=config.seed, tell=report_in_words(progress),
+                keep=folder.stage, seed=config.seed, tell=report_in_words(progress),
             )  # fmt: skip
             verdict = dataclasses.replace(verdict, resolved=resolved)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))

@@ -1,4 +1,4 @@
-"""The command `render`: a picture or a film of a run of the track model."""
+"""The command `render`: a picture of a run of the track model."""
 
 from __future__ import annotations
 
@@ -18,17 +18,12 @@ from sweeps.store import DONE, SOLVER_FAILED
 
 
 def execute(config: configuration.Render, picture: configuration.Picture) -> int:
-    """Draws a run from standstill as a picture or film. Returns the exit code: 0 if the run settles or is still
+    """Draws a run from standstill as a picture. Returns the exit code: 0 if the run settles or is still
     accelerating, otherwise 3.
     """
-    file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
-    is_picture, columns = file.suffix == ".png", picture.stated
-    slow = 20.0 if slow is None else slow
-    begin = (0.8 if is_picture else 0.0) if begin is None else begin
-    end = begin + 0.1 if end is None and not is_picture else end
-    options = config.options
+    file, options = picture.file, config.options
     try:
-        rendering.frame_times(file, begin, end, slow, options["duration"])
+        rendering.check_picture(file, picture.time, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
     if file.exists() and not picture.force:
@@ -37,7 +32,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
-    conditions = run.conditions_of_runs(robot, one_run(robot, columns, config.battery), config)
+    conditions = run.conditions_of_runs(robot, one_run(robot, picture.stated, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(1, quiet=False) as advance:
         counter = scale.share_counter(advance, 1)
@@ -49,7 +44,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
 
     with replacing(file) as temporary, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:
-            rendering.render(rendering.scene_of_run(robot, conditions, trajectory), temporary, begin, end, slow)
+            rendering.render(rendering.scene_of_run(robot, conditions, trajectory), temporary, picture.time)
         except ValueError as error:
             raise BadConfiguration(f"render: {error}".replace(temporary.name, file.name)) from error
         advance(1)

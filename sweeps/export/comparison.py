@@ -13,7 +13,6 @@ import numpy as np
 import optimistix as optx
 
 from calibration.data import Names
-from calibration.inference import solvers
 from calibration.inference.simulation_errors import share_of_measured
 from sweeps.export.joint import DriveJoint, channels_of
 from sweeps.export.situation import ComparisonRuns, JointResult
@@ -183,7 +182,7 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
         errors = [(a - b) / s for a, b, s in zip(solution, (current, speed), sizes, strict=True)]
         return jnp.concatenate([*errors, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
 
-    solver: Any = solvers.solver_by_name("lm")
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
     solution: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)
     misfit = lambda z: jnp.sqrt(jnp.mean(residual(z, None) ** 2))  # noqa: E731
     exact, better = misfit(jnp.sqrt(law.start) / scale) < EXACT, misfit(solution.value) <= misfit(start)

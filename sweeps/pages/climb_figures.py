@@ -1,10 +1,8 @@
-"""Figures of a climb: silhouettes at decisive instants, currents and margin over time, and the film."""
+"""Figures of a climb: silhouettes at decisive instants, and currents and margin over time."""
 
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +13,6 @@ from matplotlib.patches import Polygon
 from mmrjax.climbing import belt_loop, footing
 from mmrjax.climbing.footing import PITCH, SHAFT
 from mmrjax.model.paper_tables import BODY_HEIGHT
-from mmrjax.undercarriage import rendering
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -24,15 +21,14 @@ from sweeps.pages.figure_style import (
     ORANGE,
     PURPLE,
     VERMILION,
-    figure_settings,
     is_narrow,
     new_figure,
 )
 from sweeps.report.climb_report import ClimbResult, footing_coordinates
 
 _GROUND = "#b8a98f"
-#: Most silhouettes on a page. Frames of a film per second, and slow-motion factor.
-SHOWN, RATE, SLOW = 6, 12, 2.0
+#: Most silhouettes on a page.
+SHOWN = 6
 #: Numbers of silhouettes closer than this share of the time are joined, in wide and narrow figures.
 NEAR = (0.03, 0.09)
 
@@ -67,7 +63,7 @@ def _draw_ground(axes: Any, found: ClimbResult, begin: float, end: float) -> Non
     axes.plot(*points.T, color=INK, lw=1.2)
 
 
-def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
+def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray) -> None:
     outlines = _belt_outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
@@ -76,9 +72,9 @@ def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE
     top = under + BODY_HEIGHT
     box = np.array([(-half, under), (half, under), (half + 0.01, top), (-half - 0.01, top)])
     box = box @ np.array([[cos, sin], [-sin, cos]]) + q[:2]
-    axes.add_patch(Polygon(box, facecolor=colour, edgecolor=INK, lw=0.8, alpha=0.55))
+    axes.add_patch(Polygon(box, facecolor=BLUE, edgecolor=INK, lw=0.8, alpha=0.55))
     for path, tips in outlines:
-        axes.add_patch(Polygon(path, facecolor=colour, edgecolor=INK, lw=1.4, alpha=0.35))
+        axes.add_patch(Polygon(path, facecolor=BLUE, edgecolor=INK, lw=1.4, alpha=0.35))
         axes.add_patch(Polygon(path, fill=False, edgecolor=INK, lw=1.2))
         if len(tips):
             axes.plot(*tips.T, ".", color=INK, ms=2.5)
@@ -150,23 +146,3 @@ def draw_climb_course(found: ClimbResult) -> Figure:
     above.tick_params(length=0)
     axes[-1, 0].set_xlabel("time [s]")
     return fig
-
-
-def render_climb(found: ClimbResult, file: Path) -> Path:
-    """Writes the run as a film in slow motion."""
-    time, q = found.table["time_s"], footing_coordinates(found.table)
-
-    def sheet(k: int) -> Figure:
-        low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
-        with figure_settings():
-            picture = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
-            ax = picture.subplots()
-            _draw_ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
-            _draw_robot(ax, found, q[k])
-            ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
-            current = found.table["traction_current_A"][k]
-            ax.set_title(f"{found.obstacle}, {time[k]:.2f} s, motors {current:.1f} A")
-            ax.axis("off")
-        return picture
-
-    return rendering.render(SimpleNamespace(time=time, sheet=sheet), file, slow=SLOW, rate=RATE)

@@ -19,8 +19,9 @@ from typing import Any
 
 from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration, InputError
+from mmrjax.compile.programs import source_hash
 from sweeps.points.scale import Job, Produced
-from sweeps.points.zarr_store import identity_differences, installed_versions, module_hashes
+from sweeps.points.zarr_store import identity_differences, installed_versions
 from sweeps.store import PACKAGES
 
 #: Longest wait for an answer of the scheduler, and for its first worker [s].
@@ -257,8 +258,8 @@ _compiled: dict[str, Any] = {}
 
 
 def program_identity() -> dict[str, dict[str, str]]:
-    """Hash of each module, and versions of the packages that affect results."""
-    return {"code": module_hashes(), "versions": installed_versions(PACKAGES)}
+    """Hash of the source, and versions of the packages that affect results."""
+    return {"code": {"source": source_hash()}, "versions": installed_versions(PACKAGES)}
 
 
 @functools.cache

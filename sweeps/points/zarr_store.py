@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
-import functools
 import importlib.metadata
 import json
 import math
@@ -29,6 +28,7 @@ import numpy as np
 from calibration.data import Columns, Json, Names
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.writing import naming_file
+from mmrjax.compile.programs import source_hash
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
@@ -74,7 +74,7 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
     return {
         "configuration": configuration,
         "data": {file: _hash(file) for file in files},
-        "code": module_hashes(),
+        "code": {"source": source_hash()},
         "versions": {"python": platform.python_version(), **installed_versions((*PACKAGES, *FURTHER))},
         "device": {"device": device},
     }
@@ -82,18 +82,6 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in packages}
-
-
-@functools.cache
-def _code() -> tuple[tuple[str, str], ...]:
-    root = Path(__file__).resolve().parents[2]
-    files = sorted(file for package in ("mmrjax", "calibration", "sweeps") for file in (root / package).rglob("*.py"))
-    return tuple((str(file.relative_to(root)), sha256_hex(file.read_bytes())[:16]) for file in files)
-
-
-def module_hashes() -> dict[str, str]:
-    """Hash of each module of this program."""
-    return dict(_code())
 
 
 def _hash(file: str) -> str:

@@ -334,12 +334,12 @@ class Observer(eqx.Module):
         """
         if not self.long:
             return self.at(problem, z, active)[2]
-        problem = _with_effects(problem, active)
+        problem = with_effects(problem, active)
         return observe_robot(problem, problem.robot(jnp.asarray(z)))
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, their Jacobian and the observation at z. Arguments as in `observation_at`."""
-        return linearise(_with_effects(problem, active), jnp.asarray(z), problem.data)
+        return linearise(with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
     def bases(self, columns: Columns, included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
@@ -369,7 +369,8 @@ def linear_replicate(data: Data, linear: Linearization, key: Array) -> Lineariza
     return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
 
-def _with_effects(problem: Problem, active: Numbers | None) -> Problem:
+def with_effects(problem: Problem, active: Numbers | None) -> Problem:
+    """Problem with these effects in its slots. None: unchanged."""
     if active is None:
         return problem
     return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(jnp.asarray(active)))

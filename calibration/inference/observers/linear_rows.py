@@ -62,9 +62,9 @@ class LinearRows(Observer):
         return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * own * share, 0)
 
     def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Any:
-        r, jacobian, _ = _evaluate(self, problem.coordinates, data, z)
-        linear = self.linear.rescaled(data.weight / data.sd)
-        return dataclasses.replace(linear, residual=r, jacobian=jacobian)
+        evaluated, linear = jax.device_get((_evaluated(self, problem.coordinates, data, z), self.linear))
+        linear = linear.rescaled(np.asarray(data.weight) / np.asarray(data.sd))
+        return dataclasses.replace(linear, residual=evaluated[0], jacobian=evaluated[1])
 
     @property
     def long(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import operator
 import re
 import threading
@@ -50,7 +51,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.noise import Noise
 from calibration.inference.observers import settled_ends
-from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate
+from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate, with_effects
 from calibration.inference.optimizers import (
     CORES,
     SAME,
@@ -109,8 +110,6 @@ DELAYS, SCANNED = (256, 2048), 32
 #: Time up to which a first sample has to show a robot at rest [s]; largest allowed reading there, as a share of the
 #: largest speed and in sds.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
-#: Members of a search that one call of its program evaluates; calls for others run in parallel.
-TOGETHER = 1
 #: Differences between neighbouring residuals, over their median, above which they are jumps rather than noise [-].
 JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
@@ -168,10 +167,11 @@ NEAR = 3.0
 class HistoriesLinearization(Linearization):
     """Linearization of time histories.
 
-    `defects` has shape (balances, runs, knots, samples, channels): the error of a balance has a value at each knot of
-    a run.
+    `defects` [SI] has shape (balances, runs, knots, samples, channels): the error of a balance has a value at each
+    knot of a run. Copies with other scales share it, because it is large.
 
     Attributes:
+        balances: indices of the balances of `defects`.
         rows_of: indices of each run's rows in order of time, padded with -1, shape (runs, samples).
         knots: rows between which an error is linear, shape (runs, knots).
         time: time of each row since the start of its run [s].
@@ -182,14 +182,13 @@ class HistoriesLinearization(Linearization):
     knots: Int[Array, "runs knots"]
     time: Float[Array, " rows"]
     angle: Float[Array, " rows"]
-
-    def rescaled(self, factor: Array) -> HistoriesLinearization:
-        by_sample = jnp.asarray(factor)[self.rows_of][:, None]
-        return dataclasses.replace(super().rescaled(factor), defects=self.defects * by_sample)
+    balances: tuple[int, ...] = eqx.field(static=True, kw_only=True)
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        changes = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        return _to_rows(changes, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+        place = jnp.argmax(jnp.asarray([*self.balances, balance]) == balance)
+        defects = jnp.take(self.defects, place, 0, mode="fill")
+        changes = jnp.einsum("rksc,rkt->rsct", defects, shapes[self.knots])
+        return (_to_rows(changes, self.rows_of, self.rows) * self.scale[:, :, None]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -466,7 +465,7 @@ class Histories(Observer):
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def changes(
-        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
+        self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...], kind: Any = float
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
         """Changes of the readings by an error of the balance of each probe [unit of the balance], and by each effect
         at each point of its grid. A probe has amplitude 1. The error is 1 at a knot of a run and falls linearly to 0
@@ -474,7 +473,7 @@ class Histories(Observer):
 
         An effect with one amplitude enters one balance. So it changes a run as an error of that balance would, with
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
-        linear.
+        linear. `kind`: type of the numbers.
         """
         probed = _ProbedRobot.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
@@ -483,7 +482,9 @@ class Histories(Observer):
         assert followed_signals is not None
         # One run at a time: each has a wide array, by its knots.
         inputs = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
-        knots, by_effects = jax.lax.map(lambda of_run: probed.changes(*of_run, delayed=self.delayed), inputs)
+        knots, by_effects = jax.lax.map(
+            lambda of_run: probed.changes(*of_run, kind=kind, delayed=self.delayed), inputs
+        )
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def with_simulated_runs(self, robot: Robot) -> Histories:
@@ -658,13 +659,11 @@ class Histories(Observer):
         are computed along its runs.
         """
         problem = dataclasses.replace(problem, data=data)
-        active_set = getattr(problem.coordinates, "active", None)
-        twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(data.weight), None if active_set is None else twice(active_set)
-        r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
-        residual, jacobian = zero_inactive_residuals(r, jacobian, adhesion_penalty_slice(data))
+        residual, jacobian, _, simulated = _evaluate_at(problem, z)
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
-        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
+        places = {*bases_room.balances_of(problem.base), *itertools.chain(*bases_room.STANDS_FOR.values())}
+        probed = tuple(k for k, b in enumerate(PROBED) if b in places)
+        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd, probed)
         return HistoriesLinearization(
             residual,
             jacobian,
@@ -676,17 +675,14 @@ class Histories(Observer):
             self.knots,
             self.time,
             angle,
+            balances=probed,
             channels=channels.channel_names(problem.channels),
             magnitudes=robot.rig.magnitudes,
         )
 
     def at_fit(self, problem: Problem, z: Numbers) -> Histories:
         """Observer with its runs as simulated at coordinates z, by the program of the searches."""
-        active_set = getattr(problem.coordinates, "active", None)
-        twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(problem.data.weight), None if active_set is None else twice(active_set)
-        simulated = _evaluate(problem, *members)[3]
-        return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
+        return dataclasses.replace(self, known=_evaluate_at(problem, z)[3])
 
     def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
@@ -793,19 +789,15 @@ class Histories(Observer):
         best = scans.search_lower_minima(
             problem, result_of_member(optima, k), scan_data, search_again, lambda _: None
         )
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, best)
+        put = lambda every, mine: np.concatenate([every[:k], np.asarray(mine)[None], every[k + 1 :]])  # noqa: E731
+        return jax.tree.map(put, optima, best)
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, Jacobian and observation, see `Observer.at`, by the program of the searches."""
-        active_sets = None if active is None else np.asarray(active)[None]
-        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], active_sets)
-        r, jacobian, observation = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *zero_inactive_residuals(
-            jnp.asarray(r), jnp.asarray(jacobian), adhesion_penalty_slice(problem.data)
-        ), observation
+        return _evaluate_at(with_effects(problem, active), z)[:3]
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Bases of curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
@@ -1217,8 +1209,7 @@ def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Arr
 
 
 def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
-    """Function that evaluates the model for members of a search. A call takes `TOGETHER` of them, calls run in
-    parallel.
+    """Function that evaluates the model for members of a search, in parallel.
 
     Args:
         weights, active: values for each member, see `Histories.search`.
@@ -1226,17 +1217,15 @@ def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | No
 
     weights, made = np.asarray(weights), threading.Event()
 
-    def evaluate_together(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-        filled = np.resize(np.arange(len(members)), TOGETHER)
-        slots = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], slots)[:3])
+    def evaluate_one(z: np.ndarray, member: int) -> tuple[np.ndarray, np.ndarray, Observation]:
+        slots = None if active is None else np.asarray(active)[member][None]
+        return jax.device_get(_evaluate(problem, z[None], weights[member][None], slots)[:3])
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-        parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
         with Threads(CORES if made.is_set() else 1) as cores:
-            results = list(cores.map(lambda part: evaluate_together(*part), parts))
+            results = list(cores.map(evaluate_one, z, members))
         made.set()  # the first call has compiled the program
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *results)
+        return jax.tree.map(lambda *x: np.concatenate(x), *results)
 
     return evaluate
 
@@ -1256,14 +1245,24 @@ def _evaluate(
         observe: Histories = problem.observe.with_simulated_runs(problem_there.robot(z))  # type: ignore[attr-defined]
         problem_there = dataclasses.replace(problem_there, observe=observe)
         assert observe.known is not None
-        return *linearise_rollout(problem_there, z, dataclasses.replace(problem.data, weight=weight)), observe.known
+        data = dataclasses.replace(problem.data, weight=weight)
+        r, jacobian, observation = linearise_rollout(problem_there, z, data)
+        penalties = adhesion_penalty_slice(data)  # negative, because adhesion is not penalised
+        return *zero_inactive_residuals(r, jacobian, penalties), observation, observe.known
 
     return jax.vmap(evaluate_member)(z, weights, active)
 
 
+def _evaluate_at(problem: Problem, z: Numbers) -> tuple[Numbers, Numbers, Observation, LinearisedRun]:
+    """Result of `_evaluate` at one point, for the effects in the slots of the problem, as NumPy arrays."""
+    at = z, problem.data.weight, getattr(problem.coordinates, "active", None)
+    evaluated = _evaluate(problem, *jax.tree.map(lambda x: np.asarray(x)[None], at))
+    return jax.tree.map(lambda x: x[0], jax.device_get(evaluated))
+
+
 @functools.partial(compiled, options=SELDOM)
 def _responses(
-    observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array
+    observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array, probed: tuple[int, ...]
 ) -> tuple[Array, Array, Signals, Array]:
     """Signatures and balance errors for `HistoriesLinearization`, signals of each row, and the angle of the shaft
     there.
@@ -1271,10 +1270,11 @@ def _responses(
     Args:
         observe: observer with simulated runs.
         scale: scale of the readings [1/SI], shape (rows, channels).
+        probed: indices of the balances with errors.
     """
-    defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
+    probes = tuple(balance_probe(PROBED[k]) for k in probed)
+    defects, by_effects = observe.changes(robot, probes, effects, jnp.float32)  # hundreds of megabytes for a long log
     rows_of, rows = observe.rows_of, len(scale)
-    defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
     signatures = _to_rows(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
@@ -1331,6 +1331,7 @@ class _ProbedRobot(NamedTuple):
         times: Array,
         time: Array,
         *,
+        kind: Any,
         delayed: bool,
     ) -> tuple[Array, Array]:
         """Changes of a run's readings by an error at each knot, and by each effect.
@@ -1342,6 +1343,7 @@ class _ProbedRobot(NamedTuple):
             along: the simulated run.
             times: times of the instants [s].
             time: times of the samples [s].
+            kind: type of the numbers.
             delayed: True if readings are delayed.
         """
         robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))
@@ -1371,16 +1373,17 @@ class _ProbedRobot(NamedTuple):
             by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
             term = terms(t, y, held)
             shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), self.at_sensor * term], 1)
-            return by_state @ dy + both(at_once, t, term) + shows
+            return (by_state @ dy + both(at_once, t, term) + shows).astype(kind)
 
         first, begins = first_conditions_and_state(robot, conditions)
         by_probes = jax.jacfwd(lambda a: first_conditions_and_state(self.at(a), conditions)[1])(none)
         begin_changes = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
         unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begin_changes], 1)
         changed = run_response(conditions, along, source, seen, unmoved)
-        state_changes = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
-        knots = state_changes[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
-        own_changes = state_changes[:, :, size * len(clock) :]
+        wide, at_begin = size * len(clock), seen(clock[0], begins, unmoved, first)
+        knots = jnp.where(instants[:, None, None] > 0, changed[instants - 1, :, :wide], at_begin[:, :wide])
+        knots = knots.reshape(len(instants), -1, size, len(clock))
+        own_changes = jnp.concatenate([at_begin[None, :, wide:], changed[:, :, wide:]])
         if delayed:
             step, share = robot.rig.before(times, time)
             by_effects = own_changes[step] + share[:, None, None] * (own_changes[step + 1] - own_changes[step])
