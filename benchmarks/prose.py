@@ -33,7 +33,9 @@ EMPTY_NAMES = frozenset([
     "which", "what", "by", "where", "over", "whole", "mine", "theirs", "here", "chosen", "lost", "turned", "ended",
     "begun", "wanted", "taken", "asked", "named", "listed", "used", "seen",
 ])  # fmt: skip
-ERRORS = re.compile(r"(\w+\.)*(Bad\w+|\w*Error)$")
+ERRORS = re.compile(r"(Bad\w+|\w*Error)$")
+#: A syntax tree as the list of its nodes.
+Nodes = list[ast.AST]
 SEMICOLON = re.compile(r";(?=\s)")
 #: Largest figures. They only fall.
 CEILINGS = {
@@ -61,24 +63,23 @@ def _texts(content: Any) -> Iterator[str]:
         yield from _texts(item)
 
 
-def _docstrings(tree: ast.AST) -> Iterator[str]:
+def _docstrings(tree: Nodes) -> Iterator[str]:
     kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    yield from (text for node in ast.walk(tree) if isinstance(node, kinds) and (text := ast.get_docstring(node)))
+    yield from (text for node in tree if isinstance(node, kinds) and (text := ast.get_docstring(node)))
 
 
-def _strings(trees: Iterable[ast.AST], aside: Collection[int] = ()) -> Iterator[str]:
+def _strings(trees: Iterable[Nodes], aside: Collection[int] = ()) -> Iterator[str]:
     for tree in trees:
-        for node in ast.walk(tree):
+        for node in tree:
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in aside:
                 yield node.value
 
 
-def program_texts(tree: ast.AST) -> list[str]:
+def program_texts(tree: Nodes) -> list[str]:
     """Strings outside docstrings and errors. An error is one sentence with semicolons: what came, what is allowed."""
-    errors = (n for n in ast.walk(tree) if isinstance(n, ast.Call) and ERRORS.match(ast.unparse(n.func)))
-    aside = {id(x) for n in errors for x in ast.walk(n)} | {
-        id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)
-    }
+    calls = ((n, getattr(n.func, "attr", getattr(n.func, "id", ""))) for n in tree if isinstance(n, ast.Call))
+    aside = {id(x) for call, name in calls if ERRORS.match(name) for x in ast.walk(call)}
+    aside |= {id(n.value) for n in tree if isinstance(n, ast.Expr)}
     return [*_strings([tree], aside)]
 
 
@@ -88,17 +89,22 @@ def semicolons(texts: Iterable[str]) -> float:
     return 1000 * sum(len(SEMICOLON.findall(t)) for t in every) / max(sum(len(t.split()) for t in every), 1)
 
 
-def empty_names(trees: Iterable[ast.AST]) -> float:
+def empty_names(trees: Iterable[Nodes]) -> float:
     """Share of assignments to a name of `EMPTY_NAMES` [%]."""
-    nodes = (node for tree in trees for node in ast.walk(tree))
+    nodes = (node for tree in trees for node in tree)
     names = [node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
     return 100 * sum(name in EMPTY_NAMES for name in names) / max(len(names), 1)
 
 
-def texts_by_kind(root: Path) -> dict[str, list[str]]:
+def nodes_by_file(root: Path) -> dict[Path, Nodes]:
+    """Nodes of the syntax tree of each source file."""
+    files = (p for name in PACKAGES for p in sorted((root / name).rglob("*.py")))
+    return {p: [*ast.walk(ast.parse(p.read_text("utf-8")))] for p in files}
+
+
+def texts_by_kind(root: Path, sources: dict[Path, Nodes]) -> dict[str, list[str]]:
     """Texts of the docs, of help, of templates, and of the other strings of the source."""
     docs = [p for p in sorted((root / "docs").rglob("*.md")) if "lab" not in p.parts]
-    sources = {p: ast.parse(p.read_text("utf-8")) for name in PACKAGES for p in sorted((root / name).rglob("*.py"))}
     help_files = {p for p in sources if p.parent.name == "sweeps" and p.name.startswith(("config", "cli"))}
     pages = root / "sweeps" / "pages" / "templates"
     catalogue = tomllib.loads((pages / "catalogue.toml").read_text("utf-8"))
@@ -112,16 +118,17 @@ def texts_by_kind(root: Path) -> dict[str, list[str]]:
 
 def figures(root: Path = ROOT) -> dict[str, float]:
     """Each figure of `CEILINGS`."""
-    result, by_kind = {}, texts_by_kind(root)
+    sources = nodes_by_file(root)
+    result, by_kind = {}, texts_by_kind(root, sources)
     for kind, texts in by_kind.items():
         every = [sentence for text in texts for sentence in sentences(text)]
         result[kind] = 100 * sum(map(is_flagged, every)) / max(len(every), 1)
-    trees = {name: [ast.parse(p.read_text("utf-8")) for p in (root / name).rglob("*.py")] for name in PACKAGES}
-    written = [text for each in trees.values() for tree in each for text in _docstrings(tree)]
-    result["semicolons"] = semicolons(written)
-    programs = (s for each in trees.values() for tree in each for s in program_texts(tree))
+    result["semicolons"] = semicolons(text for tree in sources.values() for text in _docstrings(tree))
+    programs = (text for tree in sources.values() for text in program_texts(tree))
     result["chains"] = semicolons([*by_kind["templates"], *programs])
-    return result | {name: empty_names(each) for name, each in trees.items()}
+    for name in PACKAGES:
+        result[name] = empty_names(tree for p, tree in sources.items() if p.is_relative_to(root / name))
+    return result
 
 
 def main() -> None:
@@ -131,7 +138,7 @@ def main() -> None:
     most = parser.parse_args().most
     for name, figure in figures().items():
         print(f"{name:12s} {figure:6.2f} of {CEILINGS[name]:g}")
-    for kind, texts in texts_by_kind(ROOT).items():
+    for kind, texts in texts_by_kind(ROOT, nodes_by_file(ROOT)).items():
         flagged = {s for text in texts for s in sentences(text) if is_flagged(s)}
         for sentence in sorted(flagged, key=len, reverse=True)[:most]:
             print(f"{kind}: {sentence[:240]}")

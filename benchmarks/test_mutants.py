@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import subprocess
 import sys
+import textwrap
 from collections import Counter
 from pathlib import Path
 
@@ -67,10 +68,13 @@ def test_mutants_are_many_and_of_every_kind(command):
 
 def test_mutants_apply_once_and_parse(command):
     sources = {m.file: (ROOT / m.file).read_text(encoding="utf-8") for m in command.mutants()}
-    trees = {file: ast.dump(ast.parse(source)) for file, source in sources.items()}
     for mutant in command.mutants():
         source = sources[mutant.file]
-        assert ast.dump(ast.parse(mutant.applied(source))) != trees[mutant.file], mutant.name
+        begin, end = command.functions(source)[mutant.function]
+        wrong = mutant.applied(source)
+        texts = source[begin:end], wrong[begin : end + len(wrong) - len(source)]
+        right, wrong = (ast.dump(ast.parse(textwrap.dedent(text))) for text in texts)
+        assert right != wrong, mutant.name
     with pytest.raises(ValueError, match=rf"{mutant.name}: its text occurs \d+ times in .*; expected once"):
         dataclasses.replace(mutant, function="").applied(2 * source)
 

@@ -15,7 +15,8 @@ def test_prose_is_counted_as_by_hand(tmp_path):
     long = " ".join(["word"] * (prose.LONG + 1)) + "."
     assert [prose.is_flagged(s) for s in prose.sentences(f"{plain} {clause} {long}")] == [False, True, True]
     assert len(prose.sentences(f"{plain[:-1]}; {clause}")) == 1  # a semicolon ends no sentence
-    assert prose.empty_names([ast.parse("found = 1\nroot = found\nf(at=root)\nother = 2\nat, last = 3, 4")]) == 40.0
+    nodes = [*ast.walk(ast.parse("found = 1\nroot = found\nf(at=root)\nother = 2\nat, last = 3, 4"))]
+    assert prose.empty_names([nodes]) == 40.0
     for name in prose.PACKAGES:
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.py").write_text(f'"""{clause} {plain[:-1]}; {plain}"""\n')

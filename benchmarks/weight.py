@@ -47,7 +47,7 @@ def texts_of(root: Path) -> dict[str, str]:
 def weigh(texts: Mapping[str, str]) -> Weight:
     """Weight of source files and templates, given by path."""
     weight: Weight = {path.partition("/")[0]: dict.fromkeys(FIGURES, 0) for path in texts}
-    trees = {path: _without_docstrings(ast.parse(text)) for path, text in texts.items() if path.endswith(".py")}
+    trees = {path: _nodes(text) for path, text in texts.items() if path.endswith(".py")}
     names: Counter[str] = Counter()
     for path, text in texts.items():
         figures = weight[path.partition("/")[0]]
@@ -55,7 +55,7 @@ def weigh(texts: Mapping[str, str]) -> Weight:
             figures["words"] += _words(_MARKUP.sub(" ", text))
             continue
         figures["modules"] += 1
-        for node in ast.walk(trees[path]):
+        for node in trees[path]:
             figures["nodes"] += 1
             figures["functions"] += isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             figures["records"] += isinstance(node, ast.ClassDef) and _is_record(node)
@@ -63,13 +63,14 @@ def weigh(texts: Mapping[str, str]) -> Weight:
                 figures["words"] += _words(node.value)
             elif isinstance(node, ast.Name | ast.Attribute):
                 names[_name(node)] += 1
-    for path, tree in trees.items():
-        plain = [n.name for n in tree.body if isinstance(n, ast.FunctionDef) and not n.decorator_list]
+    for path, (tree, *_) in trees.items():
+        top = ast.iter_child_nodes(tree)
+        plain = [n.name for n in top if isinstance(n, ast.FunctionDef) and not n.decorator_list]
         weight[path.partition("/")[0]]["once"] += sum(names[name] == 1 for name in plain)
     return weight | {"circle": {"modules": largest_circle(trees)}}
 
 
-def largest_circle(trees: Mapping[str, ast.Module]) -> int:
+def largest_circle(trees: Mapping[str, Iterable[ast.AST]]) -> int:
     """Size of the largest set of modules that import each other, tests left out."""
     paths = [path for path in trees if not path.startswith("tests/")]
     number = {_module(path): k for k, path in enumerate(paths)}
@@ -118,14 +119,17 @@ def write_ceilings(weight: Weight, path: Path = CEILINGS, reason: str = "") -> N
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def _without_docstrings(tree: ast.Module) -> ast.Module:
-    for node in ast.walk(tree):
+def _nodes(text: str) -> list[ast.AST]:
+    """Nodes of a module, first the module itself, without docstrings."""
+    nodes: list[ast.AST] = [ast.parse(text)]
+    for node in nodes:  # which become more
         body = getattr(node, "body", None)
         if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
-            text = body[0].value
-            if isinstance(text, ast.Constant) and isinstance(text.value, str):
+            text_node = body[0].value
+            if isinstance(text_node, ast.Constant) and isinstance(text_node.value, str):
                 body[0] = ast.Pass()
-    return tree
+        nodes += ast.iter_child_nodes(node)
+    return nodes
 
 
 def _is_record(node: ast.ClassDef) -> bool:
@@ -145,10 +149,10 @@ def _module(path: str) -> str:
     return path.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
 
 
-def _imported(tree: ast.Module, path: str) -> Iterable[str]:
+def _imported(nodes: Iterable[ast.AST], path: str) -> Iterable[str]:
     """Names of modules that a file may import, other than itself."""
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ImportFrom):
             above = path.removesuffix(".py").split("/")[: -node.level] if node.level else []
             base = ".".join([*above, *([node.module] if node.module else [])])

@@ -24,16 +24,6 @@ def command(arguments):
     return end.value.code
 
 
-def command_in(folder, capsys, monkeypatch, *words):
-    """Run a command in a folder. Returns its exit code, stdout and stderr."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["mmrjax", *words])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    printed = capsys.readouterr()
-    return int(end.value.code or 0), printed.out, printed.err
-
-
 def rows(path):
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as stream:
@@ -67,9 +57,9 @@ def read_rig(folder, text, name="rig.toml", **options):
     return robot_file.read_robot(text_file(folder / name, text), **options)
 
 
-def read_table(folder, text, robot, name="log.csv"):
+def read_table(folder, text, robot=None, name="log.csv", **options):
     """The runs of a new table with this text."""
-    return records.read_runs(text_file(folder / name, text), robot=robot)
+    return records.read_runs(text_file(folder / name, text), robot=robot, **options)
 
 
 def read_json(path):
@@ -79,7 +69,7 @@ def read_json(path):
 
 def schema_of(command):
     """Schema of a command's result.json."""
-    return read_json(ROOT / "docs" / "schemas" / f"{command}.schema.json")
+    return read_json(ROOT / "docs/schemas" / f"{command}.schema.json")
 
 
 def motor_on_bench(torque_constant, resistance):

@@ -10,7 +10,7 @@ from pathlib import Path
 from sweeps.report.document import Figure, Note, Section
 
 #: Texts of documents and sentences as they are; `MMRJAX_RECORD=1 pytest FILE` writes those of a file anew.
-RECORD = Path(__file__).parent / "record" / "pages"
+RECORD = Path(__file__).parent / "record/pages"
 
 
 def recorded(name, text):

@@ -21,6 +21,7 @@ import pyarrow as pa
 import pytest
 import samples
 import xarray as xr
+from numpy.testing import assert_allclose
 from pyarrow import feather, parquet
 from test_more_formats import sysid_log, wpilog, write_xlsx
 
@@ -483,7 +484,7 @@ def test_a_masked_reading_is_missing_in_every_container(tmp_path, robot):
         sound = np.flatnonzero(np.isfinite(found))
         if not np.array_equal(sound, np.delete(np.arange(len(found)), lost)):
             failures.append(f"{kind}: {np.flatnonzero(np.isnan(found))}")
-        np.testing.assert_allclose(found[sound], table["rpm"][sound], atol=1)  # of integers
+        assert_allclose(found[sound], table["rpm"][sound], atol=1)  # of integers
     assert not failures, failures
 
 

@@ -122,7 +122,7 @@ def test_the_page_of_settled_runs_can_be_read_everywhere(browser, tmp_path):
 
 
 def test_the_page_of_the_loop_can_be_read_everywhere(browser):
-    assert wrong(browser, commanded().folder / "found" / "report.html") == {}
+    assert wrong(browser, commanded().folder / "found/report.html") == {}
 
 
 def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
@@ -138,12 +138,12 @@ def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
 def test_the_page_of_histories_can_be_read_everywhere(browser, tmp_path):
     with few_effects():
         assert starts_churning(tmp_path).answer.code == 0
-    assert wrong(browser, tmp_path / "found" / "report.html") == {}
+    assert wrong(browser, tmp_path / "found/report.html") == {}
 
 
 def test_a_page_from_disk_has_a_worker(browser, tmp_path):
     """As the search of the docs' site needs one, and browsers refuse it."""
-    shutil.copy(ROOT / "docs" / "assets" / "iframe-worker.js", tmp_path)
+    shutil.copy(ROOT / "docs/assets/iframe-worker.js", tmp_path)
     (tmp_path / "double.js").write_text('addEventListener("message", e => postMessage(2 * e.data))')
     browser.open(text_file(tmp_path / "page.html", '<body><script src="iframe-worker.js"></script></body>'), 1280)
     answer = """new Promise(done => {
@@ -155,7 +155,7 @@ def test_a_page_from_disk_has_a_worker(browser, tmp_path):
 
 
 def test_a_table_is_sorted_by_its_headings_and_a_figure_says_its_values(browser, folder):
-    page = folder / "sweep" / "report.html"
+    page = folder / "sweep/report.html"
     browser.open(page if page.exists() else made(folder, "sweep", PAGES["sweep"]), 1280)
     texts = "[...document.querySelectorAll('#extremes tr td:nth-child(2)')].map(c => parseFloat(c.textContent))"
     head = "document.querySelector('#extremes th:nth-child(2)')"

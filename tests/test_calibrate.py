@@ -93,12 +93,12 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
     found.save(tmp_path / "fitted")
     files = ["posterior.nc", "result.json", "robot.toml", "rows.csv"]
     assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == files
-    jsonschema.validate(read_json(tmp_path / "fitted" / "result.json"), SCHEMA)
-    again = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
+    jsonschema.validate(read_json(tmp_path / "fitted/result.json"), SCHEMA)
+    again = robot_file.read_robot(tmp_path / "fitted/robot.toml")
     answer = steady_batch(again, measured.conditions(again))
     assert_array_equal(answer.status, 0)
     assert_allclose(answer.speed, found.readings["speed"].after, rtol=1e-9)
-    table = rows_of(tmp_path / "fitted" / "rows.csv")
+    table = rows_of(tmp_path / "fitted/rows.csv")
     assert len(table) == 20 and table[0]["status"] == "converged"
     assert float(table[3]["after_speed_mm_s"]) == pytest.approx(1e3 * found.readings["speed"].after[3], rel=1e-8)
 
@@ -370,8 +370,7 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
     assert np.isfinite(table["after_total_current_A"][2]) and np.isnan(table["error_total_current_sigma"][2])
 
 
-def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
-    robot = paper_robots.nominal()
+def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps, robot):
     coordinates = priors.parameter_coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
     sd = noise.noise_from_table(gaps, observers.observer_kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
     posed = observers.pose_problem(gaps, robot, coordinates, sd)

@@ -98,9 +98,9 @@ def discovered(runs):
 # --- a robot, a table, a result
 
 
-def test_a_robot_has_the_channels_of_its_rig(bench):
+def test_a_robot_has_the_channels_of_its_rig(bench, robot):
     assert channels.channel_names(bench.channels) == TORQUE
-    assert channels.channel_names(mm.nominal().channels) == channels.USUAL  # whatever was read before
+    assert channels.channel_names(robot.channels) == channels.USUAL  # whatever was read before
     assert channels.channel_index("output_torque", bench.channels) == 2
     with pytest.raises(KeyError, match="no channel speed; there are total_current, motor_speed, output_torque"):
         channels.channel_index("speed", bench.channels)
@@ -137,7 +137,7 @@ def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
         noise.noise_from_table(runs, sizes, "speed=1%")
 
 
-def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_path):
+def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_path, robot):
     usual = {
         "configuration": ["6T2A"] * 12,
         "total_mass_kg": [13.1] * 12,
@@ -152,7 +152,7 @@ def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_
     assert_allclose(runs.measured()[:, 3], FIRST + np.arange(12.0), rtol=1e-12)
     assert np.isnan(runs.measured()[:, 1:3]).all() and len(runs.missing()) == 2
     # Of a robot without that channel, read so or used so, its columns are said to be left out.
-    for left in (calibration.read_runs(path, robot=mm.nominal()), runs.of(mm.nominal())):
+    for left in (calibration.read_runs(path, robot=robot), runs.of(robot)):
         assert left.channels == channels.usual_channels() and not left.has("output_torque_Nm")
         assert len(left.unknown) == 2 and all(name.startswith("output_torque") for name in left.unknown)
         assert set(left.unknown) == set(left.extras)

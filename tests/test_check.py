@@ -32,7 +32,7 @@ def read(text):
 
 def some_of_the_papers(*kept):
     """The paper's file with some of its aims, in the same envelope. Of the endurances that of standing still."""
-    text = (Path(requirements_file.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
+    text = (Path(requirements_file.__file__).parent / "aims/paper.toml").read_text("utf-8")
     head, envelope, tail = text.partition("[envelope]")
     lines = [line for line in head.splitlines() if line.partition(" ")[0] in ("schema", *kept)]
     if "standing" in kept:
@@ -212,15 +212,15 @@ def test_points_without_value_are_missed_in_words(robot, tmp_path, capsys):
     file = tmp_path / "steep.toml"
     file.write_text("speed_m_s = 0.5\nwinding_C = 100\n[envelope]\nslope_deg = [0, 16]\n")
     assert command(["check", file, "--out", tmp_path / "run", "--no-changes"]) == 0
-    text = (tmp_path / "run" / "result.json").read_text()
+    text = (tmp_path / "run/result.json").read_text()
     found = json.loads(text)
     jsonschema.validate(found, SCHEMA)
     for r in found["requirements"]:
         assert not r["met"] and r["value"] is None and r["status"] == "slides" and r["at"]["slope_deg"] == 16
-    assert "NaN" not in text and "nan" not in (tmp_path / "run" / "requirements.csv").read_text()
+    assert "NaN" not in text and "nan" not in (tmp_path / "run/requirements.csv").read_text()
     shown = capsys.readouterr().out
     assert "traction demand above the adhesion limit" in shown and "nan" not in shown.lower()
-    assert "nan" not in Tables((tmp_path / "run" / "report.html").read_text()).text.lower()
+    assert "nan" not in Tables((tmp_path / "run/report.html").read_text()).text.lower()
 
 
 @pytest.mark.slow
@@ -231,14 +231,14 @@ def test_external_supply_and_another_configuration(tmp_path):
         '[envelope]\nconfiguration = "4W2T"\nsupply_voltage_V = [30, 33]\npayload_kg = 3\nambient_C = [0, 40]\n'
     )
     assert command(["check", file, "--out", tmp_path / "run", "--no-report"]) == 0
-    found = read_json(tmp_path / "run" / "result.json")
+    found = read_json(tmp_path / "run/result.json")
     assert [r["met"] for r in found["requirements"]] == [True] * 5 and found["missed"] == 0
     slow, fast = (row(found, "speed_m_s", k) for k in (0, 1))
     assert (slow["at"]["supply_voltage_V"], fast["at"]["supply_voltage_V"]) == (30, 33)
     assert slow["at"]["ambient_C"] == 40 and slow["at"]["configuration"] == "4W2T"
-    assert not (tmp_path / "run" / "report.html").exists()
+    assert not (tmp_path / "run/report.html").exists()
     again = json.loads(json.dumps(found))
-    assert again == found and (tmp_path / "run" / "requirements.toml").read_text() == file.read_text()
+    assert again == found and (tmp_path / "run/requirements.toml").read_text() == file.read_text()
 
 
 def test_paper_file_states_where_each_aim_comes_from():

@@ -11,7 +11,6 @@ import pytest
 from calibration.data import terrains
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.climbing.climb_simulation import LOSSES
-from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
 from sweeps.report.climb_report import footing_coordinates
 from tests.commands import ends, read_json, schema_of, text_file
@@ -62,28 +61,28 @@ def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, cas
 
 
 @pytest.mark.parametrize("header", ["x_mm,time_s,front_deg,rear_deg", "x_mm,front_deg,rear_deg,front_V,rear_V"])
-def test_a_sequence_over_both_clocks_or_of_both_units_is_refused(tmp_path, header):
+def test_a_sequence_over_both_clocks_or_of_both_units_is_refused(tmp_path, header, robot):
     with pytest.raises(BadData, match=r"s\.csv: got columns \w+(, rear_V)? and \w+(, rear_deg)?; expected one kind"):
         terrains.read_sequence(
             text_file(tmp_path / "s.csv", f"{header}\n{','.join('0' * (header.count(',') + 1))}\n"),
-            nominal(),
+            robot,
             (0.0, 0.0),
         )
 
 
-def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
+def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path, robot):
     ground = terrains.read_terrain(text_file(tmp_path / "t.csv", "# a kerb\nx_mm;z_mm\n100;0\n100;80\n300,5;80\n"))
     assert float(ground.finish) == pytest.approx(0.2005)
     # above it, within it, and within it where the foot of the kerb is nearest
     gaps = ground.distance(jnp.array([[0.1, 0.1], [0.1, 0.05], [0.01, -0.01]]))[0]
     assert np.asarray(gaps) == pytest.approx([0.02, -0.03, -0.01 * np.sqrt(2)])
     sequence = terrains.read_sequence(
-        text_file(tmp_path / "s.csv", "x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n"), nominal(), (0.0, 0.0)
+        text_file(tmp_path / "s.csv", "x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n"), robot, (0.0, 0.0)
     )
     assert np.degrees(np.asarray(sequence.asked(-0.15, 0.0))) == pytest.approx([22.5, 86])
     assert not sequence.over_time
     sequence = terrains.read_sequence(
-        text_file(tmp_path / "v.csv", "time_s,front_V,rear_V\n0,0,0\n1,6,-12\n"), nominal(), (0.5, 0.1)
+        text_file(tmp_path / "v.csv", "time_s,front_V,rear_V\n0,0,0\n1,6,-12\n"), robot, (0.5, 0.1)
     )
     assert np.asarray(sequence.first) == pytest.approx([0.5, np.pi - 0.1]) and sequence.over_time
     assert np.asarray(sequence.asked(0.0, 0.5)) == pytest.approx([3.0, -6.0])
@@ -127,9 +126,9 @@ def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
         ("front_deg,rear_deg\n1,0\n", r"expected x_mm and front_deg and rear_deg, or time_s"),
     ],
 )
-def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, message):
+def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, message, robot):
     with pytest.raises(BadData, match=message):
-        terrains.read_sequence(text_file(tmp_path / "s.csv", text), nominal(), (0.0, 0.0))
+        terrains.read_sequence(text_file(tmp_path / "s.csv", text), robot, (0.0, 0.0))
 
 
 def test_stairs_are_read_and_refused_as_they_are_written():

@@ -107,7 +107,7 @@ def test_place_is_the_users_by_default(monkeypatch, tmp_path):
     for ignored in ("", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", ignored)
         monkeypatch.setenv("HOME", str(tmp_path))
-        assert compilation_cache.cache_location().parent == tmp_path / ".cache" / "mmrjax"
+        assert compilation_cache.cache_location().parent == tmp_path / ".cache/mmrjax"
     import jaxlib
 
     assert f"-{jaxlib.__version__}-" in compilation_cache.cache_location().name
@@ -126,8 +126,8 @@ def test_oldest_entries_are_dropped(tmp_path, monkeypatch):
         entry.parent.mkdir(exist_ok=True)
         entry.write_bytes(bytes(10))
         os.utime(entry, (k, k))
-    (tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir").mkdir()  # XLA's own, where there is a GPU
-    os.utime(tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir", (0, 0))
+    (tmp_path / "xla-0/xla_gpu_per_fusion_autotune_cache_dir").mkdir()  # XLA's own, where there is a GPU
+    os.utime(tmp_path / "xla-0/xla_gpu_per_fusion_autotune_cache_dir", (0, 0))
     compilation_cache._delete_oldest(tmp_path)
     left = sorted(int(path.name.rpartition("-")[2]) for path in tmp_path.rglob("program-*"))
     assert left == [7, 8, 9, 10, 11]

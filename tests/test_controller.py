@@ -32,14 +32,17 @@ def actuator(tmp_path):
     return made
 
 
+#: Angle over time. One program serves all robots and goals of the same kinds and numbers of rows.
+ANGLE = jax.jit(lambda robot, conditions, grid: histories.history_signals(robot, conditions, grid).angle)
+
+
 def angles(robot, goal, times, parts=1):
     """Simulated angles of the output [rad] for a goal held from each of its instants."""
     grid = histories.time_grid(times, goal[0], parts=parts)
     held = goal[1][np.searchsorted(goal[0], grid + 1e-9, side="right") - 1]
     conditions = mm.Conditions(voltage=servo.TRUE["supply"], goal=0.0)
     conditions = eqx.tree_at(lambda c: c.goal, conditions, jnp.asarray(held))
-    shown = jax.jit(lambda r: histories.history_signals(r, conditions, jnp.asarray(grid)).angle)
-    return shown(robot), np.searchsorted(grid, times)
+    return ANGLE(robot, conditions, jnp.asarray(grid)), np.searchsorted(grid, times)
 
 
 STEPS = np.array([0.0, 0.25]), np.array([0.8, -0.3])
@@ -62,15 +65,15 @@ WAVES = np.arange(0, 0.4, PERIOD), 0.4 * np.sin(8 * np.pi * np.arange(0, 0.4, PE
 SLOWER = {**servo.TRUE, "kp": 2.0, "ki": 3.0}
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_a_sampled_controller_follows_as_an_own_simulation(actuator, late):
+def test_a_sampled_controller_follows_as_an_own_simulation(actuator):
     times = np.linspace(0.0, 0.4, 17)  # between samples too
-    own = servo.simulate(WAVES, times, SLOWER, period=PERIOD, late=late)[0]
-    robot = actuator(SLOWER, "kp = ", SAMPLED[late])
-    shown, rows = angles(robot, WAVES, times, parts=12)
-    assert_allclose(np.asarray(shown)[rows], own, atol=1e-6)
-    held, other = (angles(actuator(SLOWER, "kp = ", x), WAVES, times)[0] for x in ("kp = ", SAMPLED[not late]))
-    assert min(np.abs(np.asarray(x)[rows // 12] - own).max() for x in (held, other)) > 0.01
+    robots = (actuator(SLOWER, "kp = ", text) for text in (*SAMPLED, "kp = "))
+    prompt, late, continuous = (np.asarray(angles(robot, WAVES, times, parts=12)[0]) for robot in robots)
+    rows = np.searchsorted(histories.time_grid(times, WAVES[0], parts=12), times)
+    for shown, other, delayed in ((prompt, late, False), (late, prompt, True)):
+        own = servo.simulate(WAVES, times, SLOWER, period=PERIOD, late=delayed)[0]
+        assert_allclose(shown[rows], own, atol=1e-6)
+        assert min(np.abs(x[rows] - own).max() for x in (continuous, other)) > 0.01
 
 
 def test_runs_of_drive_and_steps_follow_a_sampled_controller(actuator):
@@ -102,24 +105,26 @@ def test_a_run_of_drive_follows_as_an_own_simulation(actuator):
 
 
 @pytest.mark.parametrize("rate", [0, 50])
-@pytest.mark.parametrize("name", ["controller.kp", "controller.kd", "controller.limit", "motor.torque_constant"])
-def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, name, rate):
+def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, rate):
+    names = ("controller.kp", "controller.kd", "controller.limit", "motor.torque_constant")
     robot, times = actuator(), np.linspace(0.0, 0.4, 9)
     onward = STEPS[0], np.array([0.8, 1.2])  # a reversal within a step has an error of its own
     if rate:
         values = {**SLOWER, "coulomb": 0.0}  # the moment at which friction yields is one of a step
         robot, onward = actuator(values, "kp = ", SAMPLED[True]), (WAVES[0], 0.8 + WAVES[0])
-    value = next(float(p.value) for p in params.walk_parameters(robot) if p.name == name)
+    value = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+    at = jnp.array([value[name] for name in names])
 
+    @jax.jit
     def shown(x):
-        found, rows = angles(params.replace(robot, {name: x}), onward, times)
-        return found[rows]
+        angle, rows = angles(params.replace(robot, dict(zip(names, x, strict=True))), onward, times)
+        return angle[rows]
 
-    h = 1e-4 * value
-    _, slope = jax.jvp(shown, (jnp.asarray(value),), (jnp.ones(()),))
-    differences = (shown(jnp.asarray(value + h)) - shown(jnp.asarray(value - h))) / (2 * h)
-    assert np.abs(differences).max() > 1e-3 / value
-    assert_allclose(slope, differences, atol=1e-6 * np.abs(differences).max())
+    slopes = jax.jacfwd(shown)(at).T
+    for step, slope, size in zip(1e-4 * jnp.diag(at), slopes, at, strict=True):
+        differences = (shown(at + step) - shown(at - step)) / (2e-4 * size)
+        assert np.abs(differences).max() > 1e-3 / size
+        assert_allclose(slope, differences, atol=1e-6 * np.abs(differences).max())
 
 
 @pytest.mark.parametrize(("goal", "value", "gains", "signal"), [
@@ -209,11 +214,11 @@ def test_a_controller_that_cannot_be_is_refused(actuator, case):
         actuator(old=old, new=new)
 
 
-def test_a_goal_and_a_controller_need_each_other(actuator):
+def test_a_goal_and_a_controller_need_each_other(actuator, robot):
     with pytest.raises(mm.UsageError, match="goal: not stated"):
         mm.simulate(actuator(), mm.Conditions(voltage=7.4), model="drive")
     with pytest.raises(mm.UsageError, match="the robot has no controller"):
-        mm.simulate(mm.nominal(), mm.Conditions(goal=1.0))
+        mm.simulate(robot, mm.Conditions(goal=1.0))
     with pytest.raises(mm.UsageError, match="a controller needs model='drive'"):
         mm.simulate(actuator(), mm.Conditions(voltage=7.4, goal=1.0))
 

@@ -68,11 +68,8 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
 
 
 @pytest.mark.parametrize("kind", [SettledRuns, Histories])
-def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
-    names = [
-        {e.name for e in discover.visible_effects(BY_NAME, paper_robots.nominal(), kind, way)}
-        for way in (True, False)
-    ]
+def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind, robot):
+    names = [{e.name for e in discover.visible_effects(BY_NAME, robot, kind, way)} for way in (True, False)]
     # A constant torque is directional friction in settled travel.
     only = {
         "directional_friction",
@@ -92,16 +89,13 @@ def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
         ([8.0, 8.0, 8.0], None, False, False),
     ],
 )
-def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(supply, duty, below_one, alone):
+def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(supply, duty, below_one, alone, robot):
     columns = {"configuration": np.full(3, "6T2A"), "supply_voltage_V": np.array(supply)}
     columns |= {} if duty is None else {"duty": np.array(duty)}
     runs = Runs("synthetic", columns)
     assert discover.has_partial_duty(runs) is below_one and varied_by_duty(runs) is alone
     names = {
-        e.name
-        for e in discover.visible_effects(
-            BY_NAME, paper_robots.nominal(), SettledRuns, True, discover.has_partial_duty(runs)
-        )
+        e.name for e in discover.visible_effects(BY_NAME, robot, SettledRuns, True, discover.has_partial_duty(runs))
     }
     assert ("coast_decay" in names) is below_one
     where = DiscrepancyLocation("electrical", "voltage", ("electrical",), (), 9.0, 9.0, by_duty=alone)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 from synthetic import FEW, SETTLED, known, parts, small, table
 from worlds import settled, tables
@@ -25,7 +26,7 @@ from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observe_at
 from mmrjax.effects import BY_NAME
-from mmrjax.model import channels, paper_robots, params
+from mmrjax.model import channels, params
 
 
 @pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
@@ -156,7 +157,7 @@ def test_rows_beyond_the_model_are_kept_out(clean, looks):
     fitted, without = (looks.analyst.base(runs) for runs in (joined(kept, steep), kept))
     assert fitted.unusable == (rows - 2, rows - 1) and fitted.space.included[:rows].sum() == rows - 2
     p = fitted.space.free
-    np.testing.assert_allclose(fitted.candidate.z[:p], without.candidate.z[:p], atol=0.1)
+    assert_allclose(fitted.candidate.z[:p], without.candidate.z[:p], atol=0.1)
 
 
 # --- invariances -------------------------------------------------------------------------------------
@@ -167,8 +168,8 @@ def test_order_of_rows_does_not_matter(churning, looks):
     runs, before = churning.runs, churning.traced
     found = looks.analyst.trace(runs.where(np.random.default_rng(0).permutation(len(runs))))
     assert found.verdict == before.verdict and classes(found) == classes(before)
-    np.testing.assert_allclose(found.screened.base.candidate.cost, churning.base.cost, rtol=1e-5)
-    np.testing.assert_allclose(found.left.scores.single, before.left.scores.single, atol=0.02)
+    assert_allclose(found.screened.base.candidate.cost, churning.base.cost, rtol=1e-5)
+    assert_allclose(found.left.scores.single, before.left.scores.single, atol=0.02)
     assert np.abs(before.left.scores.single).max() > 5
 
 
@@ -228,7 +229,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
         # These rows climb: no load drives a gear.
         hidden = {n for n, s in zip(names, shown, strict=True) if not s}
         assert len(names) > (30 if looks.library is BY_NAME else 4) and hidden == {"backdriving_loss"} & set(names)
-        np.testing.assert_allclose(got[:, shown] / scale[shown], expected[:, shown] / scale[shown], atol=1e-9)
+        assert_allclose(got[:, shown] / scale[shown], expected[:, shown] / scale[shown], atol=1e-9)
         np.testing.assert_array_equal(got[:, ~shown], 0.0)
 
 
@@ -276,25 +277,23 @@ def test_scores_are_falls_of_the_sum_of_squares(toy):
     scores, g_ = toy.scores, np.asarray(toy.linear.signatures)
     e, r = np.asarray(toy.linear.residual), left(toy.linear, np.asarray(toy.linear.signatures))
     norm = np.linalg.norm(r, axis=0)
-    np.testing.assert_allclose(scores.single, -(r.T @ e) / norm, rtol=1e-9)
-    np.testing.assert_allclose(scores.single**2, [fall(toy.linear, g_[:, [k]]) for k in range(5)], rtol=1e-9)
-    np.testing.assert_allclose(scores.amplitude, -(r.T @ e) / norm**2, rtol=1e-9)
-    np.testing.assert_allclose(scores.left, norm, rtol=1e-9)
-    np.testing.assert_allclose(scores.cosine, r.T @ r / np.outer(norm, norm), atol=1e-9)
+    assert_allclose(scores.single, -(r.T @ e) / norm, rtol=1e-9)
+    assert_allclose(scores.single**2, [fall(toy.linear, g_[:, [k]]) for k in range(5)], rtol=1e-9)
+    assert_allclose(scores.amplitude, -(r.T @ e) / norm**2, rtol=1e-9)
+    assert_allclose(scores.left, norm, rtol=1e-9)
+    assert_allclose(scores.cosine, r.T @ r / np.outer(norm, norm), atol=1e-9)
     for i, j in ((0, 1), (1, 2), (2, 4)):
-        np.testing.assert_allclose(scores.pair[i, j], fall(toy.linear, g_[:, [i, j]]), rtol=1e-8)
+        assert_allclose(scores.pair[i, j], fall(toy.linear, g_[:, [i, j]]), rtol=1e-8)
     assert scores.pair[0, 3] == scores.pair[3, 0] == 0 < fall(toy.linear, g_[:, [0, 3]])  # not told apart
     reading = np.eye(len(g_))
-    np.testing.assert_allclose(
-        np.ravel(scores.row) ** 2, [fall(toy.linear, reading[:, [k]]) for k in range(len(g_))], rtol=1e-8
-    )
+    assert_allclose(np.ravel(scores.row) ** 2, [fall(toy.linear, reading[:, [k]]) for k in range(len(g_))], rtol=1e-8)
 
 
 def test_normal_deviates_are_those_of_chi2():
     z = np.array([-2, -1, -0.1, 0, 0.3, 1, 2, 4, 8])
     for freedom in (1.0, 2.0, 5.0, 20.0):
         chi2 = stats.chi2.isf(stats.norm.sf(z), freedom)
-        np.testing.assert_allclose(normal_deviate(jnp.asarray(chi2), jnp.asarray(freedom)), z, atol=0.04)
+        assert_allclose(normal_deviate(jnp.asarray(chi2), jnp.asarray(freedom)), z, atol=0.04)
     assert np.isfinite(normal_deviate(jnp.asarray([0.0, 1e-300, 3.0, 1e9]), jnp.asarray(3.0))).all()
 
 
@@ -308,10 +307,10 @@ def test_curve_scores_are_ridge_regressions(toy):
         r *= 10 / np.linalg.norm(r, axis=0)
         inverse = np.linalg.inv(r.T @ r + np.eye(3))
         explained = (r.T @ e) @ inverse @ (r.T @ e)
-        np.testing.assert_allclose(toy.scores.explained[k], explained, rtol=1e-9)
+        assert_allclose(toy.scores.explained[k], explained, rtol=1e-9)
         freedom = np.trace(r.T @ r @ inverse)
         deviate = stats.norm.isf(stats.chi2.sf(explained, freedom))
-        np.testing.assert_allclose(toy.scores.curve[k], deviate, atol=0.03)
+        assert_allclose(toy.scores.curve[k], deviate, atol=0.03)
 
 
 def test_column_within_the_fit_scores_nothing(toy):
@@ -357,11 +356,11 @@ def test_null_of_one_column_is_normal(clean):
 
 
 @pytest.mark.slow
-def test_bootstrap_of_the_measured_runs_settles():
+def test_bootstrap_of_the_measured_runs_settles(robot):
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
     sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.build_candidate_space(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
+    space = discover.build_candidate_space(runs, robot, sd, settings, {}, SETTLED.library)
     screened = screen_outliers(
         fit_base(space, settings, "measured"), lambda b: discover.bases_at_fit(runs, b), runs, settings
     )

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 from synthetic import STATED, Analyst, known, parts, table
 from worlds import histories
@@ -25,7 +26,7 @@ from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
 from mmrjax.effects import BY_NAME, UNNAMED
 from mmrjax.effects.curve import ordinate_weights
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 
 #: What these histories are searched for; the whole library is what the command and the campaign search.
 SEARCHED = ("rotating_inertia", "series_resistance", "churning", "grouser_polygon", "pulley_eccentricity")
@@ -150,7 +151,7 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     assert "sin(2 θ_k" in curve.proposal.formula
     told = curve.problem, jnp.asarray(curve.z), oval.space.library.scored, oval.bases
     exact, (linear, _, strongest) = diagnose_fit(*told), diagnose_fit(*told, near=oval.left.linear)
-    np.testing.assert_allclose(linear.residual, exact[0].residual, atol=1e-6)
+    assert_allclose(linear.residual, exact[0].residual, atol=1e-6)
     for kind in ("single", "curve", "chi2"):  # by signatures of the fit without the curve
         assert abs(getattr(strongest, kind) - getattr(exact[2], kind)) < 0.3
     after = AdequacyTest(jax.device_get(strongest), oval.left.test.null, ANALYST.settings)
@@ -272,10 +273,10 @@ def test_memory_tells_noise_from_what_remembers(seen):
 
 
 @pytest.mark.slow
-def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
+def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs, robot):
     short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))
-    observer = Histories.of(mixed, paper_robots.nominal())
+    observer = Histories.of(mixed, robot)
     times, names = mixed["time_s"], mixed["run_id"]
     for k, name in enumerate(np.unique(names)):
         there = times[np.asarray(observer.knots[k])]
@@ -289,12 +290,12 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
 
 
 @pytest.mark.slow
-def test_histories_that_do_not_start_from_rest_are_refused(runs):
+def test_histories_that_do_not_start_from_rest_are_refused(runs, robot):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32
     with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* begins at rest"):
-        Histories.check_start(late, known(late), paper_robots.nominal())
-    Histories.check_start(runs, known(runs), paper_robots.nominal())
+        Histories.check_start(late, known(late), robot)
+    Histories.check_start(runs, known(runs), robot)
 
 
 @pytest.mark.slow
@@ -304,7 +305,7 @@ def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
     sd = noise.infer_noise(made, Histories.sizes(made)).sd
     assert (np.ptp(sd, axis=0) == 0).all()
     current = bare["total_current_A"]
-    np.testing.assert_allclose(sd[0, 0], 0.02 * np.sqrt(np.mean(current**2)))
+    assert_allclose(sd[0, 0], 0.02 * np.sqrt(np.mean(current**2)))
 
 
 def test_phase_is_a_shape_and_covers_half_a_turn():
@@ -316,4 +317,4 @@ def test_phase_is_a_shape_and_covers_half_a_turn():
     wanted = np.linspace(-np.pi, np.pi, 400)
     best = np.max(np.abs(np.cos(wanted[:, None] - np.asarray(instances.values))), 1)
     assert best.min() > np.cos(np.radians(18.1))
-    np.testing.assert_allclose(instances.values, 2.0 * np.asarray(instances.at))
+    assert_allclose(instances.values, 2.0 * np.asarray(instances.at))

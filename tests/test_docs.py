@@ -49,7 +49,7 @@ def test_the_written_docs_can_be_read():
     words = {p: len(re.findall(r"\S*\w\S*", p.read_text("utf-8"))) for p in DOCS.rglob("*.md")}
     assert sum(n for p, n in words.items() if str(p.relative_to(DOCS)) not in MADE) <= 30_000
     assert all(n <= 600 for p, n in words.items() if p.parent.name == "howto")
-    assert words[DOCS / "explanation" / "loop.md"] <= 1300
+    assert words[DOCS / "explanation/loop.md"] <= 1300
 
 
 def test_every_page_that_code_names_exists():
@@ -70,7 +70,7 @@ def test_every_public_name_has_a_docstring_with_what_it_takes():
 
 
 def test_the_page_of_public_names_says_what_every_function_returns():
-    text = (DOCS / "reference" / "api.md").read_text("utf-8")
+    text = (DOCS / "reference/api.md").read_text("utf-8")
     for name in (n for n in mm.__all__ if n.islower() and not n.startswith("_")):
         (section,) = re.findall(rf"^## `mm\.{name}\([^`]* → ([^`]+)`\n\n```text\n(.*?)```", text, re.M | re.S)
         assert section[0] not in ("None", "Any", "<class 'inspect._empty'>") and "Returns" in section[1], name
@@ -100,17 +100,17 @@ def test_the_site_asks_nothing_of_a_network():
 @pytest.mark.parametrize("path", sorted((DOCS / "schemas").glob("*.json")), ids=lambda path: path.stem)
 def test_every_schema_is_one_and_is_listed(path):
     jsonschema.validators.validator_for(schema := read_json(path)).check_schema(schema)
-    assert f"schemas/{path.name}" in (DOCS / "reference" / "schemas.md").read_text("utf-8")
+    assert f"schemas/{path.name}" in (DOCS / "reference/schemas.md").read_text("utf-8")
 
 
 def test_questions_are_answered_somewhere():
     """Twenty of a reader, and the one of each page."""
-    lines = re.findall(r"^\| (\d+) \| (.*?\?) \| (.+) \|$", (DOCS / "lab" / "questions.md").read_text("utf-8"), re.M)
+    lines = re.findall(r"^\| (\d+) \| (.*?\?) \| (.+) \|$", (DOCS / "lab/questions.md").read_text("utf-8"), re.M)
     assert [int(number) for number, _, _ in lines] == list(range(1, 21))
 
 
 def test_figures_have_claim_machine_command_and_date():
-    claims = (DOCS / "reference" / "benchmarks.md").read_text("utf-8").splitlines()
+    claims = (DOCS / "reference/benchmarks.md").read_text("utf-8").splitlines()
     lines = [line for line in claims if line.startswith("| ")]
     assert len(claims) <= 25
     head, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
@@ -128,12 +128,12 @@ def test_extras_of_the_project_are_those_that_the_docs_name():
 
 def test_sentences_of_the_example_follow_from_the_recorded_result():
     """Else: make gallery."""
-    assert SITE.example(SITE.RECORD) == (DOCS / "start" / "table.md").read_text("utf-8")
+    assert SITE.example(SITE.RECORD) == (DOCS / "start/table.md").read_text("utf-8")
 
 
 def test_pictures_are_of_todays_pages():
     """Else: make gallery."""
-    made = read_json(DOCS / "gallery" / "sources.json")
+    made = read_json(DOCS / "gallery/sources.json")
     assert made == {p.stem: SITE.picture_source(p.stem) for p in (DOCS / "gallery").glob("*.png")}
 
 
@@ -142,7 +142,7 @@ def test_the_example_is_what_the_loop_says_today(tmp_path, mmrjax):
     """Else: mmrjax loop measured --out found, python docs/site.py found."""
     assert mmrjax("loop measured --out found --no-report")[0] == 0
     numbers = r"[-+−]?\d+(?:\.\d+)?"
-    said, made = (DOCS / "start" / "table.md").read_text("utf-8"), SITE.example(tmp_path / "found" / "result.json")
+    said, made = (DOCS / "start/table.md").read_text("utf-8"), SITE.example(tmp_path / "found/result.json")
     assert re.sub(numbers, "N", said) == re.sub(numbers, "N", made)
     for a, b in zip(re.findall(numbers, said), re.findall(numbers, made), strict=True):
         assert float(a) == pytest.approx(float(b), rel=0.02, abs=0.11), (a, b)

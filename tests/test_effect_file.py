@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import effect_file, robot_file
 from calibration.data.input_errors import BadConfiguration
@@ -78,7 +78,7 @@ def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path, text):
     more = params.replace(robot_file.load_robot("nominal"), {"6T2A.track.loss_coulomb": 0.4})
     run = Conditions(voltage=[15.0])
     got, expected = (steady_batch(r, run).total_current for r in (robot, more))
-    np.testing.assert_allclose(got, expected, rtol=1e-10)
+    assert_allclose(got, expected, rtol=1e-10)
     robot_file.write_robot(robot, tmp_path / "again.toml")
     again = robot_file.load_robot(str(tmp_path / "again.toml"), library)
     assert float(again.effects[0].amplitude) == 0.05

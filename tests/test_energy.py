@@ -1,7 +1,7 @@
 """Energy of one instant: what the source gives goes somewhere or is stored."""
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
@@ -43,4 +43,4 @@ def test_stored_energy_is_of_mass_wheels_rotors_and_inductance(robot):
     signals = balances.moving_signals(robot, run, State(2.0, 600.0, 0.45, 0.0))
     wanted = 0.5 * 13.1 * 0.45**2 + 33.5e-7 * 600.0**2 + 0.119e-3 * 2.0**2
     wanted += float(robot.chassis(0).inertia) * (600.0 / 48) ** 2
-    np.testing.assert_allclose(energy.stored_energy(robot, signals), wanted, rtol=1e-9)
+    assert_allclose(energy.stored_energy(robot, signals), wanted, rtol=1e-9)

@@ -16,7 +16,6 @@ from typer.main import get_command
 from calibration.data.input_errors import InputError
 from calibration.discovery import scales
 from mmrjax import WORKER
-from mmrjax.model import paper_robots
 from sweeps import cli
 from sweeps.pages import words
 from sweeps.points import run
@@ -107,11 +106,9 @@ def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
     assert capsys.readouterr().err == "mmrjax: interrupted; no run folder was written\n"
 
 
-def test_no_thread_outlives_a_refusal(monkeypatch):
+def test_no_thread_outlives_a_refusal(monkeypatch, robot):
     monkeypatch.setattr(scales, "_nominal_signals", lambda: time.sleep(0.3))
-    robot = dataclasses.replace(
-        paper_robots.nominal(), rig=dataclasses.replace(paper_robots.nominal().rig, inherits=False)
-    )
+    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))
     with pytest.raises(InputError, match="refused"), scales.compute_nominal_ahead(robot):
         assert any(t.name.startswith(WORKER) for t in threading.enumerate())
         raise InputError("refused")
@@ -119,7 +116,7 @@ def test_no_thread_outlives_a_refusal(monkeypatch):
 
 
 def test_every_command_says_what_3_means_and_the_docs_have_its_words():
-    text = (DOCS / "reference" / "exit-codes.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference/exit-codes.md").read_text(encoding="utf-8")
     documented = {}
     for line in text.splitlines():
         if line.startswith("| `"):

@@ -5,7 +5,7 @@ import pytest
 from calibration.words import experiment_words as words_of
 from mmrjax import effects
 from mmrjax.errors import allowed_words, similar_words
-from mmrjax.model import channels, paper_robots, params
+from mmrjax.model import channels, params
 from sweeps.commands import explain
 from sweeps.pages import words
 from tests.commands import ends
@@ -60,8 +60,8 @@ def test_a_typical_size_is_simulated(robot):
     assert list(explain._change_sentences(effects.BY_NAME["armature_inductance"]())) == []
 
 
-def test_parameters_and_channels_are_explained_by_their_rows():
-    known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
+def test_parameters_and_channels_are_explained_by_their_rows(robot):
+    known = {p.name: p for p in params.walk_parameters(robot)}
     lines = dict(said("parameter", "motor.resistance"))
     spec = known["motor.resistance"].spec
     assert (

@@ -7,7 +7,6 @@ import csv
 import dataclasses
 import importlib
 import io
-import json
 import os
 import re
 import shutil
@@ -46,7 +45,7 @@ from sweeps.export import (
     situation,
 )
 from sweeps.export import joint as joints
-from tests.commands import ends
+from tests.commands import ends, read_json
 
 WHEELS, TRACKS = "4W2T", "6T2A"
 #: Effects of the drive under test: one that MuJoCo has a term for, one that it can stand in for, one with a memory.
@@ -662,7 +661,7 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     _, out, _ = ends(mmrjax("export", rig, "--to", "mujoco", "--out", "out", "--joint", "wheel"), code=0)
     assert "series_resistance" not in out
     folder = rig.parent / "out"
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     assert result["errors_percent"]["exported"]["motor_speed"] < 0.1  # heat at half of the stall torque
     assert {e["name"]: e["verdict"] for e in result["effects"]}["thermal_drift"] == "held"
     law = (folder / "LAW.md").read_text()

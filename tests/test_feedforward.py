@@ -1,7 +1,6 @@
 """Feedforward constants of WPILib: against an independent least squares, and with seeded faults."""
 
 import dataclasses
-import json
 import struct
 
 import numpy as np
@@ -15,6 +14,7 @@ from calibration.described import sentences
 from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
 from sweeps.commands import feedforward_fit
 from sweeps.report import feedforward_report
+from tests.commands import read_json
 
 TESTS = ("quasistatic-forward", "quasistatic-reverse", "dynamic-forward", "dynamic-reverse")
 STEP, FINE = 0.02, 5
@@ -180,9 +180,9 @@ def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):
     (tmp_path / "robot.wpilog").write_bytes(wpilog(*records))
     code, out, error = mmrjax("calibrate robot.wpilog --feedforward simple --out fit")
     assert code == 0 and "kS = " in out, error
-    found = json.loads((tmp_path / "fit" / "feedforward.json").read_text())
+    found = read_json(tmp_path / "fit/feedforward.json")
     values = [found["feedforward"][name]["value"] for name in ("kS", "kV", "kA")]
     assert_allclose(values, true, rtol=0.02)
     assert found["feedforward"]["kV"]["unit"] == "V·s/rotation" and found["feedback"]["velocity_kP"]["value"] > 0
-    page = (tmp_path / "fit" / "report.html").read_text()
+    page = (tmp_path / "fit/report.html").read_text()
     assert "Quasistatic" in page and "Dynamic" in page and "battery sagged from 12.5 to 9.8 V" in page

@@ -41,8 +41,8 @@ def test_slip_limits_are_finite(speed, theoretical, slip):
     assert float(value) == slip and np.isfinite(gradient).all()
 
 
-def test_ground_traction_equals_adhesion_at_its_largest():
-    surface = paper_robots.nominal().configurations["6T2A"].ground
+def test_ground_traction_equals_adhesion_at_its_largest(robot):
+    surface = robot.configurations["6T2A"].ground
     speeds = np.linspace(0, 0.5, 2001)
     largest = np.max(surface.traction(speeds, 60.0, 1.0))
     assert_allclose(largest, surface.force_adhesion(60.0, 1.0), rtol=1e-9)
@@ -67,15 +67,15 @@ def test_adhesion_ratio_restores_table5(robot, surface, tracked, wheeled):
         assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)
 
 
-def test_traction_rise_is_the_derivative_of_traction():
-    surface = paper_robots.nominal().configurations["6T2A"].ground
+def test_traction_rise_is_the_derivative_of_traction(robot):
+    surface = robot.configurations["6T2A"].ground
     for speed in (-0.05, 0.003, 0.1):
         difference = (surface.traction(speed + 1e-7, 60.0, 1.3) - surface.traction(speed - 1e-7, 60.0, 1.3)) / 2e-7
         assert_allclose(surface.traction_rise(speed, 60.0, 1.3), difference, rtol=1e-5)
 
 
-def test_a_robot_on_a_wall_creeps_at_v_s_with_derivatives_of_zero():
-    surface = paper_robots.nominal().configurations["6T2A"].ground
+def test_a_robot_on_a_wall_creeps_at_v_s_with_derivatives_of_zero(robot):
+    surface = robot.configurations["6T2A"].ground
     for normal, demand in ((0.0, 60.0), (0.0, -60.0), (1e-300, 60.0), (-1.0, 60.0)):
         value, slopes = jax.value_and_grad(surface.speed_creep, argnums=(0, 1))(demand, normal, 1.0)
         assert float(value) == np.sign(demand) * surface.friction.speed_static and slopes == (0.0, 0.0)

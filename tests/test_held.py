@@ -12,6 +12,7 @@ from calibration.data import rig_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import scales
+from calibration.inference.calibration import calibrate
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax import effects
 from mmrjax.errors import UsageError
@@ -119,9 +120,8 @@ def table(held=True, **more):
 
 def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    found = mm.calibrate(
-        records.read_runs(table(), robot=robot), robot, free=FREED, noise="motor_voltage=0.01V,output_torque=0.01Nm"
-    )
+    noise = "motor_voltage=0.01V,output_torque=0.01Nm"
+    found = calibrate(records.read_runs(table(), robot=robot), robot, free=FREED, noise=noise, profiles=False)
     for name, right in (("resistance", 0.25), ("torque_constant", 0.12), ("friction_coulomb", 0.03)):
         p = found.parameters[f"motor.{name}"]
         assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
@@ -46,8 +47,7 @@ def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
     assert np.diff(time_grid(np.array([0.0, 600.0]))).max() > LONGEST  # a long run: no more steps than it can have
 
 
-def test_histories_follow_drive():
-    robot = paper_robots.nominal()
+def test_histories_follow_drive(robot):
     times = jnp.asarray(np.concatenate([[0.0], TIMES]))
     s = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-9, max_steps=20000).signals))(RUNS)
     expected = np.stack([np.asarray(getattr(s, k)) for k in STATE], -1)[:, 1:]
@@ -94,8 +94,7 @@ def test_derivatives_are_those_of_what_is_computed(changes):
 
 
 @pytest.mark.slow
-def test_repeated_instants_change_nothing():
-    robot = paper_robots.nominal()
+def test_repeated_instants_change_nothing(robot):
     short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
     one = jax.tree.map(lambda x: x[0], RUNS)
     first, second = (
@@ -104,11 +103,11 @@ def test_repeated_instants_change_nothing():
     )
     np.testing.assert_array_equal(first, second)
     last = history_signals(robot, one, jnp.asarray(long)).speed_motor
-    np.testing.assert_allclose(last[120:], last[119], rtol=1e-12)
+    assert_allclose(last[120:], last[119], rtol=1e-12)
 
 
-def test_run_that_cannot_be_followed_is_not_finite():
-    robot = params.replace(paper_robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
+def test_run_that_cannot_be_followed_is_not_finite(robot):
+    robot = params.replace(robot, {"motor.resistance": jnp.asarray(jnp.nan)})
     assert not np.isfinite(seen_compiled(robot)).any()
 
 
@@ -126,8 +125,8 @@ def test_known_states_change_neither_values_nor_derivatives():
     by_friction = jax.jit(jax.jacfwd(current, has_aux=True))
     (slope, value), (slope_known, value_known) = by_friction(friction), by_friction(friction, known)
     assert np.abs(value).max() > 1 and np.abs(slope).max() > 0.1
-    np.testing.assert_allclose(value_known, value, rtol=1e-12)
-    np.testing.assert_allclose(slope_known, slope, rtol=1e-9, atol=1e-12)
+    assert_allclose(value_known, value, rtol=1e-12)
+    assert_allclose(slope_known, slope, rtol=1e-9, atol=1e-12)
     # And they are what is followed: those of another run are shown as they are.
     _, other = by_friction(friction, jax.tree.map(lambda x: 2 * x, known))
-    np.testing.assert_allclose(other[1:], 2 * value[1:], rtol=1e-12)
+    assert_allclose(other[1:], 2 * value[1:], rtol=1e-12)

@@ -13,7 +13,7 @@ from calibration.inference.calibration import calibrate
 from calibration.inference.observers import SettledTurns
 from tests.commands import ROOT
 
-HUSKY = ROOT / "docs" / "rigs" / "husky"
+HUSKY = ROOT / "docs/rigs/husky"
 
 
 @pytest.fixture(scope="module")

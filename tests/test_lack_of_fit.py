@@ -19,7 +19,7 @@ from calibration.inference.lack_of_fit import Residuals, adequacy_of_residuals
 from calibration.inference.noise_factor import noise_factors, noise_remarks
 from calibration.inference.observers import SettledRuns
 from calibration.inference.simulation_errors import root_mean_square
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 
 SIGMA = np.array([0.02, 0.5, 3e-3])
 GRID = settled.table8()
@@ -184,8 +184,8 @@ def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():
 
 
 @pytest.mark.slow
-def test_calibration_says_whether_it_is_adequate():
-    climbing = params.replace(paper_robots.nominal(), settled.CLIMBING)
+def test_calibration_says_whether_it_is_adequate(robot):
+    climbing = params.replace(robot, settled.CLIMBING)
     few = {"starts": 2, "profiles": False, "blocks": ()}
     clean = tables.narrow(seed=3, free=settled.FRICTION)
     assert calibrate(table(clean), climbing, **few).adequacy.adequate

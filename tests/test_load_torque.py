@@ -141,12 +141,12 @@ def test_derivatives_by_a_brake_are_differences():
     assert_allclose(both(torque)[1], (more - less) / 2e-4, rtol=1e-3, atol=1e-3)
 
 
-def test_a_brake_on_a_vehicle_is_refused():
+def test_a_brake_on_a_vehicle_is_refused(robot):
     with pytest.raises(UsageError, match=r"load_torque: the robot is a vehicle.*slope_deg or payload"):
-        mm.simulate(mm.nominal(), mm.Conditions(load_torque=0.1))
+        mm.simulate(robot, mm.Conditions(load_torque=0.1))
     profile = mm.profile([0.0, 1.0], load_torque=0.1)
     with pytest.raises(UsageError, match="load_torque: the robot is a vehicle"):
-        mm.simulate(mm.nominal(), mm.Conditions(), profile=profile)
+        mm.simulate(robot, mm.Conditions(), profile=profile)
 
 
 RIG = """
@@ -213,10 +213,10 @@ def test_columns_that_may_be_the_torque_are_asked_about(tmp_path):
         read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm,load_torque_mNm", "24,4000,0,0"])
 
 
-def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
+def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path, robot):
     head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,load_torque_mNm"
     with pytest.raises(BadData) as error:
-        read_table(tmp_path, f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n", mm.nominal(), "runs.csv")
+        read_table(tmp_path, f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n", robot, "runs.csv")
     assert str(error.value) == (
         "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; the torque of a brake acts only "
         "on a shaft; give slope_deg or payload_kg, or describe the load as a shaft"
@@ -295,7 +295,7 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
         )
 
 
-def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
+def test_a_profile_and_a_sweep_state_the_torque(tmp_path, robot):
     table = profiles.read_profile(text_file(tmp_path / "p.csv", "time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n"))
     assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
     assert table.stated == ("load_torque_Nm",)
@@ -306,7 +306,7 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
     free, braked = np.asarray(made.motor_speed).reshape(2, 2).T
     assert (braked < free).all() and "load torque" in str(made)
     with pytest.raises(BadConfiguration, match="--load-torques: the robot is a vehicle"):
-        mm.sweep(mm.nominal(), load_torques=[0.5])
+        mm.sweep(robot, load_torques=[0.5])
     stated = campaign_of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
     assert stated["load_torque"] == [0.0, 0.5]
 

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from synthetic import FEW, small
 from worlds import histories, settled, tables
 
@@ -100,7 +101,7 @@ def commanded(every=False):
         if not every:
             patch.setattr(room, "effect_file", SimpleNamespace(effect_library=lambda paths: FEW.library))
         answer = mmrjax(folder, "loop", "runs.csv", "--replicates", 250, "--out", "found", *PRIORS)
-    result = read_json(folder / "found" / "result.json")
+    result = read_json(folder / "found/result.json")
     return SimpleNamespace(
         folder=folder, case=case, answer=answer, result=result, found=kept[0], room_for_it=room_for_it
     )
@@ -159,13 +160,13 @@ def test_what_is_written_predicts_and_the_refit_stands_beside_it(done):
 
 def test_residuals_of_rows_are_simulated_less_measured_readings(done):
     """As statistics.md has it, before as after."""
-    with (done.folder / "found" / "rows.csv").open(encoding="utf-8", newline="") as file:
+    with (done.folder / "found/rows.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     for name, unit in (("total_current", "A"), ("motor_speed", "rpm"), ("speed", "mm_s")):
         for fit in ("before", "after"):
             names = f"{fit}_{name}_{unit}", f"{name}_{unit}", f"{name}_sd_{unit}", f"residual_{fit}_{name}_sigma"
             shown, read, sd, residual = (np.array([float(row[n]) for row in rows]) for n in names)
-            np.testing.assert_allclose(residual, (shown - read) / sd, atol=1e-4)  # nine digits are written
+            assert_allclose(residual, (shown - read) / sd, atol=1e-4)  # nine digits are written
             assert np.ptp(residual) > 1
 
 
@@ -206,7 +207,7 @@ def test_result_has_the_schema_of_the_issue(done):
     assert after < 0.7 * before
     assert r["adequate"] == {"before": False, "after": True}
     assert {"prior", "before", "after", "unit"} <= set(r["base_shift"]["motor.resistance"])
-    assert not re.search(r"\bNaN\b|Infinity", (done.folder / "found" / "result.json").read_text())
+    assert not re.search(r"\bNaN\b|Infinity", (done.folder / "found/result.json").read_text())
 
 
 def test_copies_count_once_and_are_said(done):
@@ -217,7 +218,7 @@ def test_copies_count_once_and_are_said(done):
 
 
 def test_report_tells_the_story_in_order(done):
-    text = (done.folder / "found" / "report.html").read_text(encoding="utf-8")
+    text = (done.folder / "found/report.html").read_text(encoding="utf-8")
     assert done.result["statement"].split(" (")[0] in text
     order = [
         'id="answer"', 'id="law"', 'id="summary"', 'id="advice"', 'id="found"', 'id="contents"', 'id="before_after"',
@@ -239,10 +240,10 @@ def test_users_effect_is_scored_and_named(quick, tmp_path):
     run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", *PRIORS]
     answer = mmrjax(tmp_path, *run, "--effects", "mine.py")
     assert answer.code == 0
-    result = read_json(tmp_path / "x" / "result.json")
+    result = read_json(tmp_path / "x/result.json")
     assert result["verdict"] == "named" and [e["name"] for e in result["effects"]] == ["payload_binding"]
     assert result["scores"][0]["name"] == "payload_binding" and result["scores"][0]["score"] > 60
-    assert "[effects.payload_binding]" in (tmp_path / "x" / "robot.toml").read_text()
+    assert "[effects.payload_binding]" in (tmp_path / "x/robot.toml").read_text()
 
 
 @pytest.mark.slow
@@ -252,7 +253,7 @@ def test_one_voltage_gives_a_verdict(quick, tmp_path):
     (tmp_path / "mine.py").write_text(MINE)
     run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", "--effects", "mine.py", *PRIORS]
     answer = mmrjax(tmp_path, *run)
-    result = read_json(tmp_path / "x" / "result.json")
+    result = read_json(tmp_path / "x/result.json")
     assert answer.code == 0 and result["verdict"] == "none" and result["effects"] == []
     assert result["adequate"]["before"] and result["next_experiment"] is None
     assert any("supply_voltage_V" in note for note in result["notes"])  # what one voltage cannot show
@@ -379,7 +380,7 @@ def started(quick, tmp_path_factory):
 @pytest.mark.nightly
 def test_histories_go_through_the_command(started):
     assert started.answer.code == 0, started.answer.err
-    r = read_json(started.folder / "found" / "result.json")
+    r = read_json(started.folder / "found/result.json")
     (effect,) = r["effects"]
     assert r["verdict"] == "named" and effect["name"] == "churning" and r["rows"] == 6 * 41
     amplitude = effect["parameters"]["amplitude"]
@@ -396,7 +397,7 @@ def test_histories_go_through_the_command(started):
 
 @pytest.mark.nightly
 def test_robot_found_in_histories_starts_with_the_effect(started):
-    robot = tomllib.loads((started.folder / "found" / "robot.toml").read_text())
+    robot = tomllib.loads((started.folder / "found/robot.toml").read_text())
     assert robot["effects"]["churning"]["amplitude"] > 0
     run = mmrjax(started.folder, "simulate", "--robot", "found/robot.toml", "--model", "drive", "--out", "run",
                  "--duration", "0.5", "--no-report")  # fmt: skip
@@ -405,11 +406,11 @@ def test_robot_found_in_histories_starts_with_the_effect(started):
 
 @pytest.mark.nightly
 def test_report_of_histories_shows_what_only_they_tell(started):
-    page = (started.folder / "found" / "report.html").read_text()
+    page = (started.folder / "found/report.html").read_text()
     for words in ("What only histories tell", "Ljung and Box", "246 of 246 samples", "t [s]"):
         assert words in page
     assert "What each equation lacks" not in page and "Settled runs show nothing" not in page
-    figures = {p.stem for p in (started.folder / "found" / "figures").iterdir()}
+    figures = {p.stem for p in (started.folder / "found/figures").iterdir()}
     assert "series" in figures and "defects" not in figures
 
 
@@ -439,13 +440,13 @@ main()
 
 @pytest.mark.slow
 def test_fourth_channel_goes_through_the_loop_by_one_row(tmp_path):
-    source = Path(__file__).parent / "record" / "library.csv"
+    source = Path(__file__).parent / "record/library.csv"
     command = [sys.executable, "-c", FOURTH, source, tmp_path / "runs.csv", tmp_path / "found", *PRIORS]
     done = subprocess.run(
         list(map(str, command)), cwd=source.parents[2], capture_output=True, text=True, timeout=900, check=False
     )
     assert done.returncode == 0, done.stderr
-    found = read_json(tmp_path / "found" / "result.json")
+    found = read_json(tmp_path / "found/result.json")
     assert "churning" in found["effects"][0]["class"] and "terminal_voltage" in found["noise"]
     assert found["chi2"]["readings"] == 4 * found["rows"]
     assert found["errors"]["after"]["fitted"]["terminal_voltage"]["rows"] == found["rows"]

@@ -224,10 +224,10 @@ def test_each_joint_of_an_arm_has_its_loop_and_keeps_it(mmrjax, tmp_path):
     write(tmp_path, arm(2.0), 3e-4)
     arguments = [*COMMAND.format(tmp_path).split(), "--out", tmp_path / "found", "--within", "1h", "--joints"]
     _, out, _ = ends(mmrjax(*arguments, "elbow"), code=0)
-    assert out.strip().endswith("found") and "elbow/report.html" in (tmp_path / "found" / "report.html").read_text()
-    began = read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"]
+    assert out.strip().endswith("found") and "elbow/report.html" in (tmp_path / "found/report.html").read_text()
+    began = read_json(tmp_path / "found/elbow/manifest.json")["started"]
     ends(mmrjax(*arguments, "elbow"), "elbow: finished in", code=0)
-    assert read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"] == began
+    assert read_json(tmp_path / "found/elbow/manifest.json")["started"] == began
     (tmp_path / "elbow.toml").write_text(RIG.replace("ratio = 50", "ratio = 51"))
     ends(mmrjax(*arguments, "elbow"), "exists already; choose another path")
 
@@ -253,7 +253,7 @@ def test_finished_joints_are_kept_and_all_are_on_one_page(mmrjax, tmp_path, monk
     arguments = [*COMMAND.format(tmp_path).split(), "--joints", "all", "--out", tmp_path / "found"]
     ends(mmrjax(*arguments), "4 → 2", code=0)
     ends(mmrjax(*arguments), "joint shoulder: finished in", code=0)
-    page = (tmp_path / "found" / "report.html").read_text("utf-8")
+    page = (tmp_path / "found/report.html").read_text("utf-8")
     assert ran == [("shoulder",), ("elbow",)] and all(f"{name}/report.html" in page for name in JOINTS)
     (tmp_path / "elbow.toml").write_text(RIG.replace("ratio = 50", "ratio = 51"))
     ends(mmrjax(*arguments), "found/elbow exists already")

@@ -18,7 +18,6 @@ from calibration.discovery import discover as room
 from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
 from mmrjax.compile import programs
-from mmrjax.model import paper_robots
 from sweeps import config
 from sweeps import stage_files as kept_stages
 from sweeps.commands import loop as command
@@ -42,14 +41,14 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
         assert folder.stage("noise 0.5", lambda: 7) == 7
 
 
-def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
+def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch, robot):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
     told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), config.FolderPart(out=tmp_path / "x")
 
     def stage(make, force=False):
         with (
             pytest.raises(KeyboardInterrupt),
-            open_folder("loop", told, paper_robots.nominal(), beside.model_copy(update={"force": force})) as folder,
+            open_folder("loop", told, robot, beside.model_copy(update={"force": force})) as folder,
         ):
             found.append(folder.stage("base", make))
             raise KeyboardInterrupt
@@ -59,7 +58,7 @@ def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch):
     stage(refuse)
     monkeypatch.setattr(programs, "source_hash", lambda: "mended")
     with pytest.raises(BadConfiguration, match="another configuration, table or version"):
-        open_folder("loop", told, paper_robots.nominal(), beside)
+        open_folder("loop", told, robot, beside)
     stage(lambda: 2, force=True)
     assert found == [1, 1, 2]
 

@@ -10,6 +10,7 @@ from unittest.mock import ANY
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from pages import Tables, as_text, drawn, recorded, tokens
 from synthetic import SETTLED, table
 from test_implausible import unnamed
@@ -159,7 +160,7 @@ def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
     change = room.changes_by_effect(found)[effect.name]
     k = [c.name for c in found.channels].index(change.channel.name)
     here = found.included
-    np.testing.assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
+    assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
     assert change.rms > 1.0 and "brush_drop" not in room.changes_by_effect(found)
     assert "law" in drawn(shown("churning", capsys).text)
 
@@ -181,9 +182,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     size = got.found.effects[0].parameters["amplitude"]
     largest = np.abs(change.with_it - change.without).max() / change.channel.factor
     assert axes.get_xlabel() == "motor speed [rpm]"
-    np.testing.assert_allclose(
-        max(abs(band.y0), abs(band.y1)), largest * (1 + 1.96 * size.sd / abs(size.value)), rtol=1e-3
-    )
+    assert_allclose(max(abs(band.y0), abs(band.y1)), largest * (1 + 1.96 * size.sd / abs(size.value)), rtol=1e-3)
     capsys.readouterr()
     print_document(documented(got.found), brief=True)
     lines = capsys.readouterr().out.splitlines()
@@ -393,7 +392,7 @@ def test_the_head_of_a_page_is_read_in_a_minute(shown, capsys):
 
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):
     resolved(shown("churning", capsys).found, 1e-6).save(tmp_path / "saved")
-    assert (tmp_path / "saved" / "robot_track.toml").exists()
+    assert (tmp_path / "saved/robot_track.toml").exists()
 
 
 def test_labels_of_many_groups_do_not_cover_each_other():

@@ -1,12 +1,12 @@
 """Missions that a battery's cut-off ends: beside an independent integration, its derivative, its words, bad input."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import mmrjax as mm
@@ -18,7 +18,7 @@ from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
-from tests.commands import command_in, ends, read_rig, rows
+from tests.commands import ends, read_json, read_rig, rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -175,7 +175,7 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     _, exact = both(zero)
     for k in range(4):
         apart = (both(zero.at[k].add(h))[0] - both(zero.at[k].add(-h))[0]) / (2 * h)
-        np.testing.assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
+        assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
         assert abs(float(apart[0])) > 1.0  # s: the moment moves
 
 
@@ -198,25 +198,24 @@ def written(folder, cutoff, text=""):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def tmp_path(tmp_path_factory):
+    """One folder for all commands of this file."""
     return tmp_path_factory.mktemp("cutoff")
 
 
 @pytest.fixture
-def run_folder(folder, capsys, monkeypatch):
-    if not (folder / "a").exists():
-        _, out, err = ends(
-            command_in(folder, capsys, monkeypatch, *written(folder, 3.3), "--no-report", "--out", "a"), code=0
-        )
-        (folder / "out.txt").write_text(out)
-        (folder / "err.txt").write_text(err)
-    return folder / "a"
+def run_folder(tmp_path, mmrjax):
+    if not (tmp_path / "a").exists():
+        _, out, err = ends(mmrjax(*written(tmp_path, 3.3), "--no-report", "--out", "a"), code=0)
+        (tmp_path / "out.txt").write_text(out)
+        (tmp_path / "err.txt").write_text(err)
+    return tmp_path / "a"
 
 
 @pytest.mark.slow
 def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
     out, err = ((run_folder.parent / f"{name}.txt").read_text() for name in ("out", "err"))
-    result = json.loads((run_folder / "result.json").read_text())
+    result = read_json(run_folder / "result.json")
     left = 100 * result["state_of_charge"]
     assert result["status"] == "cut_off" and "cut_off" in result["flags_raised"]
     assert "no charge left" not in out and f"ended with {left:.1f} % of the charge left" in " ".join(out.split())
@@ -228,17 +227,17 @@ def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
 
 
 @pytest.mark.slow
-def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, capsys, monkeypatch):
+def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(tmp_path, mmrjax):
     """The same three seconds by both, at a current limit, so that current of motors and of the supply differ, and
     backward, so that the two distances do. A mission heats up by some degrees, of which 2 % are allowed for."""
-    (folder / "three.csv").write_text("time_s,supply_voltage_V\n0,-24\n3,-24\n")
+    (tmp_path / "three.csv").write_text("time_s,supply_voltage_V\n0,-24\n3,-24\n")
     asked = ("simulate", "--configuration", "4W2T", "--set", "driver.current_limit=1.5", "--no-report")
     by_run = ("--model", "drive", "--voltage", "-24", "--duration", "3", "--out", "run")
     for words in (by_run, ("--profile", "three.csv", "--out", "mission")):
-        command_in(folder, capsys, monkeypatch, *asked, *words)
+        mmrjax(*asked, *words)
     compared = set()
     for name in ("runs.csv", "history.csv"):
-        one, other = (rows(folder / out / name)[-1] for out in ("run", "mission"))
+        one, other = (rows(tmp_path / out / name)[-1] for out in ("run", "mission"))
         for column in set(one) & set(other):
             try:
                 values = float(one[column]), float(other[column])
@@ -254,7 +253,7 @@ def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, cap
         "voltage_V",
         "speed_mm_s",
     }
-    last = rows(folder / "mission" / "history.csv")[-1]
+    last = rows(tmp_path / "mission/history.csv")[-1]
     assert float(last["distance_m"]) == pytest.approx(-float(last["displacement_m"]), rel=1e-6)
 
 
@@ -279,9 +278,8 @@ def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     assert quiet == []
 
 
-def test_a_mission_that_begins_below_its_cut_off_is_refused(tmp_path, capsys, monkeypatch):
-    words = written(tmp_path, 3.5)
-    code, out, err = command_in(tmp_path, capsys, monkeypatch, *words, "--discharge", "2000", "--out", "b")
+def test_a_mission_that_begins_below_its_cut_off_is_refused(tmp_path, mmrjax):
+    code, out, err = mmrjax(*written(tmp_path, 3.5), "--discharge", "2000", "--out", "b")
     assert (code, out) == (2, "") and not (tmp_path / "b").exists()
     assert (
         "--discharge: got 2000 mAh; a cell is then at 3.377 V, below its cut-off of 3.5 V, before the mission" in err

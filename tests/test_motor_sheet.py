@@ -1,7 +1,6 @@
 """Motors from the six numbers of a data sheet: constants, contradictions, and what is refused."""
 
 import itertools
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from sweeps.commands import rig_from_sheet
 from sweeps.commands.rig_new import write_new_rig
-from tests.commands import ends
+from tests.commands import ends, read_json
 
 #: maxon RE30 310007, as printed.
 RE30 = {
@@ -77,7 +76,7 @@ def test_viscous_friction_of_a_motor_does_not_look_like_a_missing_effect(mmrjax,
     }
     write_new_rig(tmp_path / "rig.toml", "dyno", False, sheet=sheet)
     ends(mmrjax("loop runs.csv --robot rig.toml --out out --no-report"), code=0)
-    assert json.loads((tmp_path / "out/result.json").read_text())["verdict"] == "none"
+    assert read_json(tmp_path / "out/result.json")["verdict"] == "none"
     fitted = robot_file.read_robot(tmp_path / "out/fitted.toml").motor
     assert float(fitted.friction_viscous) == pytest.approx(viscous, rel=0.1)
     assert float(fitted.friction_coulomb) == pytest.approx(coulomb, rel=0.1)
@@ -133,7 +132,7 @@ def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):
 
 
 def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):
-    robot = str(Path(__file__).parent / "data" / "diffbot.urdf")
+    robot = str(Path(__file__).parent / "data/diffbot.urdf")
     sheet = [word for name, text in RE30.items() for word in (f"--{name}", text)]
     code, out, err = mmrjax("rig new r.toml --from", robot, "--joint", "left_wheel_joint", *sheet)
     said = " ".join(out.split())

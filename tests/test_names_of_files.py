@@ -375,7 +375,7 @@ def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
     )
     command(folder, "sweep", "charge.toml", "--export", "csv", "--no-report", "--out", "charge")
     sound(folder / "charge")
-    assert numbers(table(folder / "charge" / "runs.csv"))["discharge_mAh"].tolist() == [0.0, 500.0]
+    assert numbers(table(folder / "charge/runs.csv"))["discharge_mAh"].tolist() == [0.0, 500.0]
 
 
 @pytest.mark.slow

@@ -30,8 +30,8 @@ def test_terminal_and_page_open_with_the_same_sentence(made, tmp_path, capsys):
 def test_a_command_answers_with_one_sentence(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert command([*words, "--out", "x"]) == 0
-    statement = read_json(tmp_path / "x" / "result.json")["statement"]
-    page = Tables((tmp_path / "x" / "report.html").read_text("utf-8"))
+    statement = read_json(tmp_path / "x/result.json")["statement"]
+    page = Tables((tmp_path / "x/report.html").read_text("utf-8"))
     assert capsys.readouterr().out.startswith(statement) and statement in page.text
 
 

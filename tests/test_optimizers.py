@@ -333,10 +333,10 @@ def test_stride_is_the_optimum_beyond_and_along_the_edges_of_penalties():
 
 
 @pytest.mark.nightly
-def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
+def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured, robot):
     """With the noise that is estimated of them the rows pull static friction down to the margin. From just inside of
     it nothing shows the penalty."""
-    posed = pose(measured, paper_robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
+    posed = pose(measured, robot, stated="current=10%,motor_speed=6%,speed=4%")
     limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
     assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
     inside = jnp.asarray(limit.z[0]).at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
@@ -361,8 +361,7 @@ def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
 
 
 @pytest.mark.slow
-def test_what_only_its_prior_holds_is_said(measured):
-    robot = paper_robots.nominal()
+def test_what_only_its_prior_holds_is_said(measured, robot):
     names = (
         *priors.default_names(measured["configuration"], robot),
         "motor.inductance",
@@ -397,8 +396,8 @@ def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
 
 
 @pytest.mark.slow
-def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
-    posed = pose(measured, paper_robots.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
+def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured, robot):
+    posed = pose(measured, robot, stated="current=9%,motor_speed=6%,speed=4%")
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
     about = identifiability.analyse_identifiability(posed, best.z)
     profile = identifiability.profile_likelihoods(posed, best.z, float(best.cost), about)
@@ -409,14 +408,14 @@ def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
 
 
 @pytest.mark.slow
-def test_blocks_left_out_are_not_seen(posed, measured):
+def test_blocks_left_out_are_not_seen(posed, measured, robot):
     masks = {"slope": holdout.blocks_of_kind(measured, "slope")}
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data).z
     held = holdout.hold_out_by_kind(posed, best, masks)["slope"]
     assert held.labels == ("0.0", "5.0", "10.0", "15.0", "20.0") and held.converged.all()
     # the refit without slope 10, done alone, says the same of those rows
     rows = masks["slope"]["10.0"]
-    alone = pose(measured.where(~rows), paper_robots.nominal())
+    alone = pose(measured.where(~rows), robot)
     z = solve(alone, best, alone.data).z
     assert_allclose(held.reading[rows], np.asarray(posed.observation(z).reading)[rows], rtol=1e-4)
     # readings of a block do not change what is predicted for it

@@ -239,13 +239,13 @@ def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
 
 
 @pytest.mark.slow
-def test_calibrated_robot_is_its_fit(tmp_path):
+def test_calibrated_robot_is_its_fit(tmp_path, robot):
     runs = records.read_runs("measured")
-    found = calibrate(runs, paper_robots.nominal(), noise="current=2%,motor_speed=1%,speed=1%", starts=4, profiles=False,
+    found = calibrate(runs, robot, noise="current=2%,motor_speed=1%,speed=1%", starts=4, profiles=False,
                       blocks=())  # fmt: skip
     assert any(n.startswith("4W2T: the table states 13.1 kg without payload") for n in found.notes)
     found.save(tmp_path)
     again = robot_file.read_robot(tmp_path / "robot.toml")
     shown = steady_batch(again, unweighed(runs).conditions(again))
     for name, reading in found.readings.items():
-        assert_allclose(np.asarray(shown.reading[name]), reading.after, rtol=1e-8)
+        assert_allclose(shown.reading[name], reading.after, rtol=1e-8)

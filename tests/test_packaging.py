@@ -56,7 +56,7 @@ def test_every_pin_installs_on_the_oldest_python_that_is_promised():
 
 def test_hosted_checks_run_targets_that_there_are_and_name_no_address():
     hosted = [ROOT / ".pre-commit-config.yaml", *(ROOT / ".github").rglob("*.yml")]
-    checks = (ROOT / ".github" / "workflows" / "checks.yml").read_text("utf-8")
+    checks = (ROOT / ".github/workflows/checks.yml").read_text("utf-8")
     makefile = (ROOT / "Makefile").read_text("utf-8")
     (tests,) = re.findall(r"tests: \[(.*?)\]", checks)
     targets = {*re.findall(r"run: make (\w+)", checks), *tests.split(", ")}
@@ -99,15 +99,15 @@ def test_wheel_and_sdist_install_in_a_clean_environment(tmp_path):
     for file in (wheel, sdist):
         place = tmp_path / file.suffix.strip(".")
         venv.create(place, symlinks=True)
-        python = place / "bin" / "python"
+        python = place / "bin/python"
         pip = (sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "--quiet")
         isolation = () if file is wheel else ("--no-build-isolation",)
         environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"PYTHONPATH": libraries}
         run(*pip, *isolation, file, env=environment)
         where = run(python, "-c", "import mmrjax, sweeps; print(sweeps.__file__)", cwd=tmp_path, env=environment)
         assert Path(where.strip()).is_relative_to(place)
-        command = place / "bin" / "mmrjax"
+        command = place / "bin/mmrjax"
         assert run(command, "--version", cwd=tmp_path, env=environment) == f"mmrjax {PROJECT['version']}\n"
     for words in ("simulate --out a", "compare measured --out b", "rig new r.toml --kind bench", "explain windage"):
         run(command, *words.split(), cwd=tmp_path, env=environment)
-    assert "<svg" in (tmp_path / "a" / "report.html").read_text("utf-8")
+    assert "<svg" in (tmp_path / "a/report.html").read_text("utf-8")

@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from test_documents import size
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -73,14 +75,11 @@ def test_ticks_of_a_map_are_round_numbers_at_their_places(levels, ticks):
     seen = {}
     sweep_figures._set_ticks(lambda places, names: seen.update(zip(names, places, strict=True)), levels)
     assert list(seen) == ticks
-    np.testing.assert_allclose(
-        np.interp(list(seen.values()), np.arange(levels.size), levels), [float(t) for t in ticks]
-    )
+    assert_allclose(np.interp(list(seen.values()), np.arange(levels.size), levels), [float(t) for t in ticks])
 
 
-def test_every_table_of_a_page_scrolls_in_itself(mmrjax, tmp_path):
-    assert mmrjax("simulate --out a")[0] == 0
-    text = (tmp_path / "a" / "report.html").read_text()
+def test_every_table_of_a_page_scrolls_in_itself(tmp_path):
+    text = page_renderer.write_report_page(tmp_path, size()).read_text("utf-8")
     tables = re.findall(r"(.{0,24})<table", text)
     assert len(tables) > 1 and all(before.endswith('"scroll" tabindex="0">') for before in tables)
     assert text.count("</table></div>") == len(tables) and ".scroll { overflow-x: auto; }" in text
@@ -155,19 +154,19 @@ def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
         assert power_figures.draw_chart_of_corners(robot, [corner]).axes
 
 
-def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox():
+def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox(robot):
     """Driving, the load needs 1/η of its torque, driven back it gives η of it, and `backdriving_loss` less. Readings of
     the same robot lie on its lines."""
-    robot = params.replace(paper_robots.nominal(), {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0})
+    robot = params.replace(robot, {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0})
     load, losing = (
         np.array([-4.0, 4.0]),
         dataclasses.replace(robot, effects=(effects.BY_NAME["backdriving_loss"](amplitude=0.25),)),
     )
     needs, loses = (power_figures.torque_of_motor(r, 24.0, load) for r in (robot, losing))
     share = float(robot.gearbox.efficiency_load)
-    np.testing.assert_allclose(needs / load, [share, 1 / share], rtol=1e-4)
-    np.testing.assert_allclose(loses / load, [0.75 * share, 1 / share], rtol=1e-4)
-    np.testing.assert_allclose(power_figures.torque_of_motor(robot, -24.0, load), -needs[::-1], rtol=1e-4)
+    assert_allclose(needs / load, [share, 1 / share], rtol=1e-4)
+    assert_allclose(loses / load, [0.75 * share, 1 / share], rtol=1e-4)
+    assert_allclose(power_figures.torque_of_motor(robot, -24.0, load), -needs[::-1], rtol=1e-4)
     runs = records.read_runs("measured")
     simulated = mm.simulate(losing, runs.conditions(losing))
     runs = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": np.asarray(simulated.total_current)})
@@ -176,4 +175,4 @@ def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox():
     lines = {line.get_label(): line.get_xydata() for line in plane.lines}
     dots = lines["measured"][np.isfinite(lines["measured"]).all(1)]
     assert len(dots) > 10 and dots[:, 0].min() > 0
-    np.testing.assert_allclose(dots[:, 1], np.interp(dots[:, 0], *lines["runs forward"].T), rtol=1e-3)
+    assert_allclose(dots[:, 1], np.interp(dots[:, 0], *lines["runs forward"].T), rtol=1e-3)

@@ -6,8 +6,8 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model import paper_robots, params
@@ -105,7 +105,7 @@ def test_simplified_robots_are_table_a4(build, torque):
     assert float(robot.motor.torque_loss(0.0, 1.0)) == float(robot.motor.torque_loss(1200.0, 1.0)) == 4.2e-3
     assert float(robot.gearbox.efficiency(0.03, 900.0)) == 0.75
     assert float(robot.configurations["6T2A"].track.torque_loss(20.0, 1.0)) == torque
-    np.testing.assert_allclose(robot.battery.voltage(5.0, 3000.0), 33.6, rtol=1e-12)
+    assert_allclose(robot.battery.voltage(5.0, 3000.0), 33.6, rtol=1e-12)
 
 
 def test_track_of_a_lever_closes_around_its_pulley_and_roller(robot):

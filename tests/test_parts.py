@@ -140,7 +140,7 @@ def test_parts_cells_weigh_what_cells_weigh():
 
 
 def test_parts_columns_are_those_of_the_sheets(tmp_path, monkeypatch):
-    folder = tmp_path / "data" / "parts"
+    folder = tmp_path / "data/parts"
     folder.mkdir(parents=True)
     monkeypatch.setattr(parts.resources, "files", lambda package: tmp_path)
     with (ROOT / "calibration/data/parts/cells.csv").open(encoding="utf-8", newline="") as lines:

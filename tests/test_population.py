@@ -231,7 +231,7 @@ def test_what_members_did_is_counted_and_said(found):
 
 
 @pytest.mark.slow
-def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
+def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, robot):
     true = population._observe_points
 
     def broken(posed, points):
@@ -243,7 +243,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     monkeypatch.setattr(population, "_observe_points", broken)
     name = "6T2A.ground.rolling_resistance"
     with pytest.raises(BadConfiguration, match=r"none of \d+ members can be run in every row .*: \d+ tips"):
-        calibrate(runs, paper_robots.nominal(), model="drive", free=(name,), population=4, generations=1)
+        calibrate(runs, robot, model="drive", free=(name,), population=4, generations=1)
 
 
 @pytest.mark.quick(1)
@@ -256,9 +256,9 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
         (dict(generations=3, population=0, model="track"), "--generations: has an effect only with --population"),
     ],
 )
-def test_options_of_a_population_that_cannot_be_are_refused(options, says):
+def test_options_of_a_population_that_cannot_be_are_refused(options, says, robot):
     with pytest.raises(BadConfiguration, match=says):
-        calibrate(records.read_runs("measured"), paper_robots.nominal(), **options)
+        calibrate(records.read_runs("measured"), robot, **options)
 
 
 @pytest.mark.nightly

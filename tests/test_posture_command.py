@@ -95,7 +95,7 @@ def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
         (row,) = csv.DictReader(file)
     assert float(row["highest_step_mm"]) == pytest.approx(236, abs=1)
     page = (folder / "report.html").read_text()
-    assert 'id="posture-section"' in page and (folder / "figures" / "steps.svg").exists()
+    assert 'id="posture-section"' in page and (folder / "figures/steps.svg").exists()
 
 
 @pytest.mark.nightly

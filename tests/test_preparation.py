@@ -11,7 +11,6 @@ from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
 from calibration.inference.foresight import predict_identifiability
-from mmrjax.model import paper_robots
 from tests.commands import csv_text, read_table, text_file
 
 ALL = {
@@ -23,13 +22,13 @@ ALL = {
 
 
 @pytest.mark.parametrize("who", ALL)
-def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
+def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who, robot):
     """`calibrate` took the table's mass for the robot's own before it compared the two, and fitted a robot of 79 kg.
     `rig check` compared nothing."""
     runs = records.read_runs("measured")
     runs = Runs("runs.csv", {**runs.columns, "total_mass_kg": 6 * runs["total_mass_kg"]})
     with pytest.raises(BadData, match=r"runs.csv, total_mass_kg: about 6\.2 times too large for this robot"):
-        ALL[who](runs, paper_robots.nominal())
+        ALL[who](runs, robot)
 
 
 @pytest.mark.slow

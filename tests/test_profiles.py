@@ -10,7 +10,7 @@ from calibration.data import profiles
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.missions.mission import mission
 from mmrjax.missions.profile import MODES
-from mmrjax.model import channels, paper_robots
+from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
 from tests.commands import text_file
@@ -30,9 +30,9 @@ def read(tmp_path):
 
 
 @pytest.mark.parametrize("name", profiles.PACKAGED)
-def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name):
+def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name, robot):
     table = profiles.read_profile(name)
-    made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1])))
+    made = table.profile(robot, Conditions(configuration=np.array([0, 1])))
     assert (made.segment_count, made.cycles, made.linear) == (table.segment_count, table.cycles, table.linear)
     assert float(made.duration) == pytest.approx(table.duration)
     assert tuple(MODES[k] for k in made.mode) == table.modes
@@ -41,7 +41,7 @@ def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name):
 def test_packaged_names_are_the_packaged_files():
     from importlib import resources
 
-    folder = resources.files("calibration") / "data" / "profiles"
+    folder = resources.files("calibration") / "data/profiles"
     assert {p.name for p in folder.iterdir()} == {f"{name}.csv" for name in profiles.PACKAGED}
 
 
@@ -52,10 +52,10 @@ def test_packaged_patrol_is_an_hour_with_120_starts():
     assert table.cycles * sum(begins) == 120
 
 
-def test_range_of_other_consumers_is_the_batterys():
+def test_range_of_other_consumers_is_the_batterys(robot):
     from mmrjax.model import params
 
-    (found,) = (p for p in params.walk_parameters(paper_robots.nominal()) if p.name == "battery.current_other")
+    (found,) = (p for p in params.walk_parameters(robot) if p.name == "battery.current_other")
     assert profiles.QUANTITIES["current_other"].range == found.spec.bounds
 
 
@@ -130,9 +130,9 @@ def test_ramp_ends_at_the_cell_of_the_row_that_brakes_or_else_is_held(read):
     assert_allclose(duties[:3], [0, 0.8, 0.8])
 
 
-def test_surface_scales_the_adhesion_of_each_runs_movers(read):
+def test_surface_scales_the_adhesion_of_each_runs_movers(read, robot):
     table = read("time_s,speed_mm_s,surface\n0,400,asphalt\n5,400,linoleum\n9,,\n")
-    made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1, 0])))
+    made = table.profile(robot, Conditions(configuration=np.array([0, 1, 0])))
     wanted = [[adhesion_ratio(s, t) for s in ("asphalt", "linoleum", "linoleum")] for t in (True, False, True)]
     assert_allclose(made.adhesion, wanted)
 
@@ -226,12 +226,12 @@ def test_a_mission_may_begin_in_motion_and_warm(read):
 
 
 @pytest.mark.slow
-def test_a_mission_begins_as_its_profile_says(read):
+def test_a_mission_begins_as_its_profile_says(read, robot):
     table = read("# start_speed_mm_s = 400\n# start_winding_C = 60\ntime_s,mode\n0,coast\n1,\n")
     found = mission(
-        paper_robots.nominal(),
+        robot,
         Conditions(voltage=24.0),
-        table.profile(paper_robots.nominal(), Conditions([0])),
+        table.profile(robot, Conditions([0])),
         table.start,
     )
     assert float(found.total.of["distance"]) > 0.01 and 59.0 < float(found.peaks["temperature"]) <= 60.0

@@ -68,8 +68,7 @@ def test_a_program_of_this_process_is_not_read_again(folder):
     assert kept.of(((3 * MATRIX,), {})) is first
 
 
-def test_results_come_back_with_what_is_no_array(folder):
-    robot = paper_robots.nominal()
+def test_results_come_back_with_what_is_no_array(folder, robot):
     for function in (for_equations, untraceable(for_equations)):
         found = programs.Programs(function).of(((robot,), {}))(((robot,), {}))
         assert found.configurations.names == robot.configurations.names and found.rig == robot.rig
@@ -129,7 +128,7 @@ def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
     for package in programs.OWN:
         (tmp_path / package / "room").mkdir(parents=True)
         for content in ("x = 1\n", "x = 2\n"):
-            (tmp_path / package / "room" / "module.py").write_text(content)
+            (tmp_path / package / "room/module.py").write_text(content)
             found.add(programs.source_hash.__wrapped__(tmp_path))
     assert len(found) == 2 * len(programs.OWN)
 

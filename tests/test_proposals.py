@@ -92,7 +92,7 @@ def test_proposals_of_a_generated_file_are_read_as_they_are(rig, seed):
         "time [s]", *signal_of.values()
     }  # fmt: skip
     read = runs.read_runs(table, rig, columns=columns)
-    assert_allclose(np.asarray(read.conditions(rig).voltage), TRUTH["supply_voltage"], rtol=1e-9)
+    assert_allclose(read.conditions(rig).voltage, TRUTH["supply_voltage"], rtol=1e-9)
     for quantity in ("motor_current", "motor_speed", "output_angle"):
         k = [c.name for c in rig.channels].index(quantity)
         assert_allclose(read.measured()[:, k], TRUTH[quantity], rtol=1e-9)

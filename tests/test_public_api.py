@@ -94,9 +94,9 @@ def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
         mm.replace(robot, {"friction_coulomb": 0.5})
 
 
-def test_package_states_its_names_version_and_types():
+def test_package_states_its_names_version_and_types(robot):
     assert set(mm.__all__) <= set(dir(mm))
-    assert {"motor", "gearbox", "battery"} <= set(dir(mm.nominal())) and "within" not in dir(mm.nominal())
+    assert {"motor", "gearbox", "battery"} <= set(dir(robot)) and "within" not in dir(robot)
     for name in mm.__all__:
         assert getattr(mm, name) is not None
     with pytest.raises(AttributeError, match="module 'mmrjax' has no attribute 'simulat'"):
@@ -112,7 +112,7 @@ def test_package_states_its_names_version_and_types():
 
 
 def test_type_checkers_see_every_public_name():
-    text = (ROOT / "mmrjax" / "__init__.pyi").read_text(encoding="utf-8")
+    text = (ROOT / "mmrjax/__init__.pyi").read_text(encoding="utf-8")
     assert set(re.findall(r"import (\w+) as \1", text)) == set(mm.__all__) - {"__version__"}
 
 
@@ -313,12 +313,10 @@ def test_derivative_by_conditions_and_through_bad_values_passes_the_door(robot):
 # --- wrong use --------------------------------------------------------------------------------------------
 
 
-def test_every_packaged_robot_is_within_its_bounds():
+def test_every_packaged_robot_is_within_its_bounds(robot):
     for build in paper_robots.ROBOTS.values():
         mm.simulate(build(), mm.Conditions())
-    mm.simulate(
-        dataclasses.replace(paper_robots.nominal(), effects=tuple(effect() for effect in ALL)), mm.Conditions()
-    )
+    mm.simulate(dataclasses.replace(robot, effects=tuple(effect() for effect in ALL)), mm.Conditions())
 
 
 def with_value(name, value):
@@ -404,7 +402,7 @@ def test_other_wrong_use_is_said(robot):
 
 MASKED = np.ma.masked_array([24.0, 12.0], [False, True])
 FREE = "motor.resistance"
-MEASURED = ROOT / "calibration" / "data" / "measured.csv"
+MEASURED = ROOT / "calibration/data/measured.csv"
 
 
 @pytest.fixture(scope="module")

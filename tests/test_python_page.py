@@ -71,15 +71,15 @@ def test_a_tutorial_runs(page, tmp_path, monkeypatch):
 @pytest.mark.nightly
 def test_the_tutorial_about_a_log_finds_the_fan(tmp_path, mmrjax):
     """What the page says: 24 settled runs, and windage in the class."""
-    bench = DOCS / "start" / "bench"
+    bench = DOCS / "start/bench"
     made = runpy.run_path(str(bench / "make.py"))["log"]()
     packed = np.loadtxt(bench / "log.csv", delimiter=",", skiprows=1)
     assert_allclose(packed, made, atol=0.51, rtol=0)
     assert_allclose(packed[:, 2], made[:, 2], atol=6e-4)
     assert mmrjax("rig new rig.toml --kind bench")[0] == 0
     assert mmrjax("settle", bench / "log.csv", "--robot", "rig.toml", "--out", "settled", "--no-report")[0] == 0
-    assert len((tmp_path / "settled" / "settled.csv").read_text().splitlines()) == 25
+    assert len((tmp_path / "settled/settled.csv").read_text().splitlines()) == 25
     assert mmrjax("loop settled/settled.csv --robot rig.toml --out found --no-report")[0] == 0
-    found = read_json(tmp_path / "found" / "result.json")
+    found = read_json(tmp_path / "found/result.json")
     assert found["verdict"] == "class" and "loss torque that changes with speed" in found["statement"]
     assert "windage" in found["statement"]

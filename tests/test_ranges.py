@@ -14,7 +14,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.inference import ranges
 from calibration.inference.ranges import check_ranges
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from tests.commands import read_rig, read_table
 
@@ -83,52 +83,46 @@ def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, s
 
 
 @pytest.mark.slow
-def test_right_units_pass_in_silence(runs, histories):
-    robot = paper_robots.nominal()
+def test_right_units_pass_in_silence(runs, histories, robot):
     assert check_ranges(runs, robot) == check_ranges(histories, robot) == []
     assert check_ranges(records.read_runs("measured"), robot) == []
     assert check_ranges(records.read_runs("simulated_by_paper"), robot) == []
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(runs, case):
+@pytest.mark.quick(1 + len(WRONG))
+@pytest.mark.parametrize(
+    ("data", "case"), [*(("runs", case) for case in WRONG), ("histories", "m/s"), ("histories", "rad/s")]
+)
+def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(request, data, case, robot):
     column, factor, says = WRONG[case]
     with pytest.raises(BadData, match=f"runs.csv, {says}"):
-        check_ranges(scaled(runs, column, factor), paper_robots.nominal())
+        check_ranges(scaled(request.getfixturevalue(data), column, factor), robot)
 
 
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("case", ["m/s", "rad/s"])
-def test_wrong_units_of_histories_are_refused(histories, case):
-    column, factor, says = WRONG[case]
-    with pytest.raises(BadData, match=f"runs.csv, {says}"):
-        check_ranges(scaled(histories, column, factor), paper_robots.nominal())
-
-
-def test_histories_that_never_get_under_way_are_no_matter_of_units(histories):
-    assert check_ranges(scaled(histories, "speed_mm_s", 1 / 150), paper_robots.nominal()) == []
+def test_histories_that_never_get_under_way_are_no_matter_of_units(histories, robot):
+    assert check_ranges(scaled(histories, "speed_mm_s", 1 / 150), robot) == []
     early = histories.where(histories["time_s"] < 0.011)
-    assert check_ranges(early, paper_robots.nominal()) == []
+    assert check_ranges(early, robot) == []
 
 
 @pytest.mark.parametrize(("factor", "is_said"), [(3.0, True), (1 / 3.0, True), (1.7, False)])
-def test_smaller_factors_are_said_and_not_refused(runs, factor, is_said):
-    said = check_ranges(scaled(runs, "speed_mm_s", factor), paper_robots.nominal())
+def test_smaller_factors_are_said_and_not_refused(runs, factor, is_said, robot):
+    said = check_ranges(scaled(runs, "speed_mm_s", factor), robot)
     assert bool(said) == is_said and all(s.column == "speed_mm_s" and (s.factor > 1) == (factor > 1) for s in said)
 
 
-def test_a_factor_that_all_speeds_share_points_to_the_voltage(runs):
+def test_a_factor_that_all_speeds_share_points_to_the_voltage(runs, robot):
     half = scaled(scaled(runs, "speed_mm_s", 1 / 6.5), "motor_speed_rpm", 1 / 6.5)
     with pytest.raises(
         BadData, match=r"; the same factor in speed_mm_s: check supply_voltage_V and the robot's file"
     ):
-        check_ranges(half, paper_robots.nominal())
+        check_ranges(half, robot)
 
 
-def test_friction_that_nobody_has_measured_is_no_matter_of_units(runs):
+def test_friction_that_nobody_has_measured_is_no_matter_of_units(runs, robot):
     # three times the friction, as of a robot file that another robot's friction was left in
     others = params.replace(
-        paper_robots.nominal(),
+        robot,
         {
             f"{c}.track.loss_{k}": 3.0 * v
             for c in ("6T2A", "4W2T")
@@ -141,17 +135,17 @@ def test_friction_that_nobody_has_measured_is_no_matter_of_units(runs):
 @pytest.mark.parametrize(
     ("unit", "of"), [("radians", np.radians), ("percent", lambda a: 100 * np.tan(np.radians(a)))]
 )
-def test_slopes_in_other_units_are_said(runs, unit, of):
+def test_slopes_in_other_units_are_said(runs, unit, of, robot):
     other = Runs("runs.csv", {**runs.columns, "slope_deg": of(runs["slope_deg"])})
-    said = check_ranges(other, paper_robots.nominal())
+    said = check_ranges(other, robot)
     assert any(s.code == "slopes_in" and s.unit == unit for s in said), said
 
 
-def test_missing_channels_and_readings_pass(runs):
+def test_missing_channels_and_readings_pass(runs, robot):
     bare = {k: v for k, v in runs.columns.items() if "current" not in k}
     speed = runs["speed_mm_s"].copy()
     speed[::2] = np.nan
-    assert check_ranges(Runs("runs.csv", {**bare, "speed_mm_s": speed}), paper_robots.nominal()) == []
+    assert check_ranges(Runs("runs.csv", {**bare, "speed_mm_s": speed}), robot) == []
 
 
 @pytest.mark.parametrize("command", ["compare", "calibrate", "loop"])

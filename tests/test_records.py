@@ -106,7 +106,7 @@ def test_a_record_is_checked_and_calibrated(name, tmp_path, capsys, monkeypatch)
     assert command(["rig", "check", file, data]) == 0
     assert "These data determine" in capsys.readouterr().out
     assert command(["calibrate", data, "--robot", file, "--out", "fit"]) == (3 if name in UNSETTLED else 0)
-    found = read_json(tmp_path / "fit" / "result.json")
+    found = read_json(tmp_path / "fit/result.json")
     assert found["optimizer"]["status"] == ("not_converged" if name in UNSETTLED else "converged")
     errors = {channel: e["rms_percent"] for channel, e in found["errors"]["after"]["fitted"].items()}
     assert errors and max(errors.values()) < MISSED[name], errors

@@ -207,10 +207,9 @@ def test_run_without_numbers_says_why(tmp_path):
     assert drawn(page) == set() and words.STATUSES["slides"][1] in page and "No run ends in steady travel" in page
 
 
-def test_operating_points_lie_on_the_chart_of_motor_and_gear():
+def test_operating_points_lie_on_the_chart_of_motor_and_gear(robot):
     """The chart is of a bench with a brake, the points are of the robot on a slope: one drive."""
     runs = _runs(("6T2A", "4W2T"), 33.0, 8.0, (0.0, 10.0))
-    robot = ROBOTS["nominal"]()
     points, curves = power_figures.operating_points(robot, runs), power_figures.drive_curves(robot, 33.0)
     assert (runs["status"] == "converged").all() and np.ptp(points["torque_Nm"]) > 1.0
     for name in ("motor_rpm", "motor_A"):

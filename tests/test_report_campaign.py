@@ -1,7 +1,5 @@
 """The page of a sweep into a store: offline, true to the store, also where nothing settles or much is left out."""
 
-import json
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,6 +8,7 @@ from test_sweep_store import CONFIG
 
 from sweeps.pages import campaign_figures
 from sweeps.report import campaign_report
+from tests.commands import read_json
 
 REPORTED = CONFIG.replace("report = false\n", "")
 
@@ -19,7 +18,7 @@ def page(mmrjax, tmp_path):
     def write(config=REPORTED):
         (tmp_path / "plan.toml").write_text(config)
         assert mmrjax("sweep plan.toml --out s --force")[0] == 0
-        return Tables((tmp_path / "s" / "report.html").read_text())
+        return Tables((tmp_path / "s/report.html").read_text())
 
     return write
 
@@ -27,7 +26,7 @@ def page(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tmp_path):
     tables = page()
-    store = xr.open_zarr(tmp_path / "s" / "results.zarr").load()
+    store = xr.open_zarr(tmp_path / "s/results.zarr").load()
     assert outside(tmp_path / "s") == []
     assert "Sweep of 300 points" in tables.text
     slides = int((store.status == 2).sum())
@@ -43,8 +42,8 @@ def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tm
     settled = store.total_current.values[store.status.values == 0]
     numbers = [settled.min(), *np.quantile(settled, (0.05, 0.5, 0.95)), settled.max()]
     assert ranges["total current"] == ["A", *(f"{v:.4g}" for v in numbers)]
-    assert drawn((tmp_path / "s" / "report.html").read_text()) == {
-        "spread_" + name for name in json.loads((tmp_path / "s" / "result.json").read_text())["outputs"]
+    assert drawn((tmp_path / "s/report.html").read_text()) == {
+        "spread_" + name for name in read_json(tmp_path / "s/result.json")["outputs"]
     }
 
 
@@ -52,7 +51,7 @@ def test_page_is_offline_and_shows_counts_names_and_ranges_of_the_store(page, tm
 def test_page_of_a_sweep_in_which_nothing_settles_has_no_figures(page, tmp_path):
     tables = page("[conditions]\nslope_deg = 40\n[axes]\nvoltage = [15, 24, 33]\n")
     assert tables.tables["statuses"][1][:2] == ["slides", "3"] and tables.tables["ranges"][1][2] == "–"
-    assert drawn((tmp_path / "s" / "report.html").read_text()) == set()
+    assert drawn((tmp_path / "s/report.html").read_text()) == set()
 
 
 @pytest.mark.slow

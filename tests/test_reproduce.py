@@ -2,7 +2,6 @@
 """The paper remade by `mmrjax reproduce`: complete, offline, true to the paper's tables and to the model's numbers."""
 
 import dataclasses
-import json
 import sys
 
 import jax
@@ -16,10 +15,10 @@ from pages import Tables, drawn, outside
 
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
-from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import cli
 from sweeps.paper import data
+from tests.commands import read_json
 
 FIGURES = {
     "fig28_current_over_slope",
@@ -59,7 +58,7 @@ def paper(reproduced):
 @pytest.mark.slow
 def test_run_folder_has_the_papers_rows(paper):
     folder = paper[0]
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     assert result["schema"] == "mmrjax.reproduce/1" and result["rows"] == 20
     assert result["errors"]["paper"]["total_current"]["rms_percent"] == pytest.approx(4.0, abs=0.05)
     rows = (folder / "rows.csv").read_text().splitlines()
@@ -109,22 +108,21 @@ def test_row_table_has_a_second_row_for_another_mass_and_letters_that_say_why(pa
 
 
 @pytest.mark.slow
-def test_raised_adhesion_makes_every_measured_row_climb():
-    rows = data.simulate_measured_rows(ROBOTS["nominal"]())
+def test_raised_adhesion_makes_every_measured_row_climb(robot):
+    rows = data.simulate_measured_rows(robot)
     assert (rows.plain["status"] == "slides").sum() == 6
     assert (rows.raised["status"] == "converged").all()
     assert rows.ratio["6T2A"] * 0.32 == pytest.approx(0.45) and rows.ratio["4W2T"] * 0.38 == pytest.approx(0.60)
 
 
-def test_raised_adhesion_leaves_a_robot_that_climbs_alone():
+def test_raised_adhesion_leaves_a_robot_that_climbs_alone(robot):
     values = {f"{c}.ground.friction.static": 0.9 for c in (TRACKED, WHEELED)}
-    rows = data.simulate_measured_rows(params.replace(ROBOTS["nominal"](), values))
+    rows = data.simulate_measured_rows(params.replace(robot, values))
     assert rows.ratio == {"6T2A": 1.0, "4W2T": 1.0}
 
 
 @pytest.mark.slow
-def test_energy_split_sums_to_the_supply():
-    robot = ROBOTS["nominal"]()
+def test_energy_split_sums_to_the_supply(robot):
     effects = (BY_NAME["series_resistance"](amplitude=0.4), BY_NAME["churning"](amplitude=1e-3))
     for member in (robot, dataclasses.replace(robot, effects=effects)):
         kind = np.array(["6T2A", "4W2T", "6T2A"])
@@ -135,18 +133,18 @@ def test_energy_split_sums_to_the_supply():
         assert_allclose(split["other"] / points["power_supply_W"], 0, atol=1e-9)
 
 
-def test_idle_current_balances_the_losses_by_hand():
+def test_idle_current_balances_the_losses_by_hand(robot):
     speed = np.array([5.0, 20.0])
     motor = speed * 48.0
     for kind, coulomb, viscous in (("6T2A", 0.350, 0.016), ("4W2T", 0.070, 0.003)):
         at_motor = (coulomb + viscous * speed) / 48.0 / 0.74 + 0.3e-3 + 1.4e-6 * motor + 2.7e-3 + 5.5e-7 * motor
-        found = data.idle_current(ROBOTS["nominal"](), kind, speed)
+        found = data.idle_current(robot, kind, speed)
         assert_allclose(found, at_motor / 25.9e-3, rtol=1e-9)
 
 
 @pytest.mark.slow
-def test_stages_follow_the_slide():
-    for start in data.simulate_starts(ROBOTS["nominal"]()):
+def test_stages_follow_the_slide(robot):
+    for start in data.simulate_starts(robot):
         assert 0 < start.starting < start.slipping < start.time[-1]
         sliding = start.theoretical - start.speed
         assert np.all(sliding[start.time > start.slipping] <= 20.0 + 1e-6)  # V_s [mm/s]

@@ -23,7 +23,7 @@ from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
 from tests.commands import ROOT, read_json, text_file
 
-SCHEMAS = ROOT / "docs" / "schemas"
+SCHEMAS = ROOT / "docs/schemas"
 ROWS = 90
 CURRENT, MOTOR, SPEED = range(3)
 
@@ -267,13 +267,13 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     assert document["residual_clusters"][0]["statement"] == found.statement and found.statement in document["notes"]
     document = calibration_report.calibration_document(shifted, "nominal")
     page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")
-    assert "residuals of speed cluster by idle_wheel" in page and (tmp_path / "figures" / "clusters.svg").exists()
+    assert "residuals of speed cluster by idle_wheel" in page and (tmp_path / "figures/clusters.svg").exists()
     assert Tables(page).tables
 
 
 @pytest.mark.slow
-def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
-    clean = calibrate(measured_table(1, 0.0), paper_robots.nominal(), starts=2, profiles=False, blocks=())
+def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path, robot):
+    clean = calibrate(measured_table(1, 0.0), robot, starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
     document = calibration_report.calibration_document(clean, "nominal")
     page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")

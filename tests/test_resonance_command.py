@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import CONVERGED
@@ -148,7 +149,7 @@ def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
     runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
     normal = np.asarray(runs.signals.normal)[:, 500:]
     ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)
-    np.testing.assert_allclose(found.table["reaction_ripple_percent"], ripple, rtol=0.02)
+    assert_allclose(found.table["reaction_ripple_percent"], ripple, rtol=0.02)
 
 
 def test_runs_without_ripple_are_shown_as_what_they_are(tracked):

@@ -96,10 +96,10 @@ def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says
 
 
 @pytest.mark.slow
-def test_a_robot_that_its_drive_and_the_ground_hold_stands():
+def test_a_robot_that_its_drive_and_the_ground_hold_stands(robot):
     """6T2A on 17 degrees: gravity less rolling is 0.77 of the adhesion, travel would take 1.14 of it."""
     voltage = np.array([0.0, 0.5, 0.9, -0.02, 3.0, 24.0])
-    found = steady_batch(paper_robots.nominal(), Conditions(np.zeros(6, int), voltage, np.full(6, 17.0)))
+    found = steady_batch(robot, Conditions(np.zeros(6, int), voltage, np.full(6, 17.0)))
     assert list(WORDS[np.asarray(found.status)]) == ["stalled"] * 4 + ["slides"] * 2
     assert (np.asarray(found.speed)[:4] == 0).all() and (np.asarray(found.motor_speed)[:2] == 0).all()
     used = np.asarray(found.adhesion_used)
@@ -116,12 +116,12 @@ STANDING = [
 ]  # fmt: skip
 
 
-def test_a_robot_that_stands_is_in_static_equilibrium():
+def test_a_robot_that_stands_is_in_static_equilibrium(robot):
     """By formulas of their own: traction holds gravity along the slope as far as shafts and ground do, and the output
     carries what friction between it and the cause does not."""
     voltage, slope, payload = np.array(STANDING).T
     runs = Conditions(np.zeros(len(voltage), int), voltage, slope, payload)
-    found = steady_batch(paper_robots.nominal(), runs)
+    found = steady_batch(robot, runs)
     assert (np.asarray(found.status) == STALLED).all()
     normal, pull = ((13.1 + payload) / 2 * paper.G * f(np.radians(slope)) for f in (np.cos, np.sin))
     radius = 48 * 5e-3 / (2 * np.pi)

@@ -12,7 +12,6 @@ from calibration.data.runs import Runs
 from calibration.inference.simulation_errors import relative_error, sized_error
 from mmrjax import fidelities
 from mmrjax.model import channels, params, quantities
-from mmrjax.model.paper_robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.points import imposed
@@ -122,7 +121,7 @@ SIMULATED = {
 def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_path, case):
     kind, speed, options, columns = SIMULATED[case]
     _, out, err = ends(mmrjax("simulate --robot", of_kind(tmp_path, kind, speed), *options, "--out", "run"), code=0)
-    (row,) = rows_of(tmp_path / "run" / "runs.csv")
+    (row,) = rows_of(tmp_path / "run/runs.csv")
     assert columns <= set(row) and row["status"] in ("converged", "reverses")
     on_ground = {"slip", "adhesion_used", "slope_deg", "total_mass_kg", "power_ground_W"}
     assert on_ground <= set(row) if kind in ("wheeled", "tracked") else on_ground.isdisjoint(row)
@@ -140,10 +139,10 @@ def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind
         mmrjax("simulate --robot", rig, "--voltage", "3", "--model", "drive", "--duration", "0.5", "--out", "run"),
         code=0,
     )  # an arm still moves
-    history = rows_of(tmp_path / "run" / "history.csv")
+    history = rows_of(tmp_path / "run/history.csv")
     shafts = {"motor_speed_rpm", "output_angle_deg"}
     assert (shafts <= set(history[0])) == (kind != "wheeled") and len(history) > 100
-    assert (tmp_path / "run" / "figures" / ("history.svg" if kind == "wheeled" else "courses.svg")).is_file()
+    assert (tmp_path / "run/figures" / ("history.svg" if kind == "wheeled" else "courses.svg")).is_file()
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
@@ -153,7 +152,7 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
     _, out, err = ends(
         mmrjax("simulate --robot", of_kind(tmp_path, "bench"), "--profile", "turn.csv", "--out", "run"), code=0
     )
-    course = rows_of(tmp_path / "run" / "history.csv")
+    course = rows_of(tmp_path / "run/history.csv")
     assert (
         "demanded_motor_speed_rpm" in course[0]
         and "slope_deg" not in course[0]
@@ -240,7 +239,7 @@ def test_what_a_rig_does_not_have_is_refused_in_one_sentence(mmrjax, tmp_path, c
 def test_a_single_run_takes_the_limit_of_the_file(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
     ends(mmrjax("simulate --robot", rig, "--set", "motor.voltage_limit=18", "--out", "run", "--no-report"), code=0)
-    assert float(rows_of(tmp_path / "run" / "runs.csv")[0]["supply_voltage_V"]) == 18.0
+    assert float(rows_of(tmp_path / "run/runs.csv")[0]["supply_voltage_V"]) == 18.0
 
 
 def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
@@ -267,7 +266,7 @@ def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
         "thirds of the voltage_limit in the robot's file are used: 8,16,24",
         code=0,
     )
-    table = rows_of(tmp_path / "run" / "runs.csv")
+    table = rows_of(tmp_path / "run/runs.csv")
     assert [float(row["supply_voltage_V"]) for row in table] == [8.0, 16.0, 24.0]
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
@@ -278,7 +277,7 @@ def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_p
     _, out, err = ends(
         mmrjax("sweep --robot", rig, "--motor-speeds", "1000,-1000", "--slopes", "0,5", "--out", "run"), code=0
     )
-    table = rows_of(tmp_path / "run" / "runs.csv")
+    table = rows_of(tmp_path / "run/runs.csv")
     assert len(table) == 4 and {row["payload_kg"] for row in table} == {"0"}
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
@@ -327,7 +326,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
 def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
     _, out, _ = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
-    errors = read_json(tmp_path / "compared" / "result.json")["errors"]["all"]["total_current"]
+    errors = read_json(tmp_path / "compared/result.json")["errors"]["all"]["total_current"]
     assert errors["unit"] == "A" and 0.01 < errors["rms"] < 0.1 and " A " in out
     _, said, err = ends(
         mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"),
@@ -335,9 +334,9 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
     )
     assert re.search(r"rms error before → after on .*: total current 18", said)
     assert "speed" not in said.splitlines()[0]
-    fitted = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
+    fitted = robot_file.read_robot(tmp_path / "fitted/robot.toml")
     assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
-    priors = read_json(tmp_path / "fitted" / "result.json")["parameters"]
+    priors = read_json(tmp_path / "fitted/result.json")["parameters"]
     assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
     for folder in ("compared", "fitted"):
         assert words_of_others(*left_in(tmp_path / folder)) == [], folder
@@ -352,9 +351,9 @@ def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
         "total current",
         code=0,
     )
-    defects = (tmp_path / "found" / "figures" / "defects.svg").read_text()
+    defects = (tmp_path / "found/figures/defects.svg").read_text()
     assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
-    page = (tmp_path / "found" / "report.html").read_text()
+    page = (tmp_path / "found/report.html").read_text()
     assert "The channels determine the defects of 1 equation: torque." in page
     assert words_of_others(*left_in(tmp_path / "found"), told, err) == []
 
@@ -410,7 +409,7 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
     data = precise_table(tmp_path / "runs.csv")
     _, told, _ = ends(mmrjax("loop", data, "--robot", "motor.toml", "--replicates", "250", "--out", "found"), code=0)
-    found = read_json(tmp_path / "found" / "result.json")
+    found = read_json(tmp_path / "found/result.json")
     assert found["verdict"] in ("named", "class"), told
     (effect,) = found["effects"]
     amplitude = effect["parameters"]["amplitude"]
@@ -431,7 +430,7 @@ def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
 def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     rig, data = rover
     _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
-    shown = (tmp_path / "compared" / "figures" / "errors.svg").read_text()
+    shown = (tmp_path / "compared/figures/errors.svg").read_text()
     assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
     assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
 
@@ -480,8 +479,8 @@ def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):
     assert "bench.radius" not in {p[0] for p in capabilities.rig_parameters(robot_file.parse_robot_file(bench))}
 
 
-def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):
-    specs = {p.name: p.spec for p in params.walk_parameters(nominal())}
+def test_the_packaged_robots_parameters_keep_their_sources(tmp_path, robot):
+    specs = {p.name: p.spec for p in params.walk_parameters(robot)}
     assert "eq. (15)" in specs["motor.resistance"].meaning
     own_specs = {p.name: p.spec for p in params.walk_parameters(robot_file.read_robot(of_kind(tmp_path, "bench")))}
     assert "eq." not in own_specs["motor.resistance"].meaning

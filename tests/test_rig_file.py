@@ -8,6 +8,7 @@ import re
 import equinox as eqx
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import configuration_tables, rig_facts, rig_file, robot_file, stated
 from calibration.data.input_errors import BadConfiguration
@@ -15,7 +16,7 @@ from calibration.inference import priors
 from calibration.sensitivity import uncertain_inputs
 from mmrjax import effects
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Instrument
 from mmrjax.model.shaft import Shaft
@@ -229,7 +230,7 @@ def test_linear_unit_is_a_shaft(tmp_path, travel, radius, sides):
     ]
     weight = 2.5 * GRAVITY * 0.5
     forces = [12.0 * radius / sides, 40.0 * radius**2 / sides, (3.0 + weight) * radius / sides]
-    np.testing.assert_allclose(found, [radius, 1e-5 + 2.5 * radius**2 / sides, *forces], rtol=1e-12)
+    assert_allclose(found, [radius, 1e-5 + 2.5 * radius**2 / sides, *forces], rtol=1e-12)
     assert "speed" in robot.rig.channels
     assert same(again(tmp_path, robot), robot)
 
@@ -435,8 +436,8 @@ def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
     assert said.startswith("rig.toml") and "\n" not in said
 
 
-def test_packaged_robot_is_as_it_was(tmp_path):
-    robot = robot_file.add_effects(paper_robots.nominal(), tuple(effects.BY_NAME))
+def test_packaged_robot_is_as_it_was(tmp_path, robot):
+    robot = robot_file.add_effects(robot, tuple(effects.BY_NAME))
     assert same(again(tmp_path, robot), robot) and "[rig]" not in (tmp_path / "again.toml").read_text()
 
 
@@ -625,7 +626,7 @@ def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
         read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
 
 
-ROBOT_FILES = ROOT / "docs" / "reference" / "robot-files.md"
+ROBOT_FILES = ROOT / "docs/reference/robot-files.md"
 PAGE = ROBOT_FILES.read_text(encoding="utf-8")
 EXAMPLES = PAGE.split("```toml\n")[1:]
 
@@ -637,9 +638,9 @@ def test_example_of_the_page_reads(tmp_path, text):
     assert same(again(tmp_path, robot), robot)
 
 
-def test_every_key_of_robot_files_is_in_the_reference():
+def test_every_key_of_robot_files_is_in_the_reference(robot):
     parameters = (ROBOT_FILES.parent / "parameters.md").read_text(encoding="utf-8")
-    own = {p.name for p in params.walk_parameters(paper_robots.nominal())}
+    own = {p.name for p in params.walk_parameters(robot)}
     fixed = {*robot_file.COUNTS, *robot_file.RATINGS, *robot_file.SWITCHES, *robot_file.CHOICES}
     lacking = {name for name in own | fixed if f"`{name}`" not in parameters}
     shaft = {field.name for field in dataclasses.fields(Shaft) if "spec" in field.metadata}

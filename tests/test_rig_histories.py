@@ -330,7 +330,7 @@ def test_every_row_of_an_imposed_speed_has_the_acceleration_of_the_motion_there(
 def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
     imposed_speed(tmp_path, 2, lambda path, robot, *told: history(path, robot, robot, *told, 3))
     ends(mmrjax("compare table.csv --robot rig.toml --no-report --out found"), code=0)
-    with (tmp_path / "found" / "comparison.csv").open(encoding="utf-8") as file:
+    with (tmp_path / "found/comparison.csv").open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     error = [float(r["simulated_total_current_A"]) - float(r["total_current_A"]) for r in table]
     assert len(table) == 40 and np.std(error) == pytest.approx(0.01, rel=0.4) and table[20]["run_id"] == "1"

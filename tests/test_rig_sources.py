@@ -14,7 +14,7 @@ from sweeps.commands import rig_from_mujoco, rig_new
 from sweeps.commands.rig_template import rig_template
 from tests.commands import ends, read_rig
 
-DIFFBOT = Path(__file__).parent / "data" / "diffbot.urdf"
+DIFFBOT = Path(__file__).parent / "data/diffbot.urdf"
 FREE = """<mujoco>
   <default>
     <default class="wheel">

@@ -73,7 +73,7 @@ def test_a_foreign_partial_folder_is_left_alone(tmp_path, name, text, force):
     file = tmp_path / "x.partial" / name
     file.parent.mkdir(parents=True)
     file.write_text(text)
-    (tmp_path / "x.partial" / "thesis.txt").write_text("years of work")
+    (tmp_path / "x.partial/thesis.txt").write_text("years of work")
     before = names(tmp_path)
     with pytest.raises(BadConfiguration, match=r"x\.partial already exists and was not created by mmrjax"):
         RunFolder(tmp_path / "x", LOOP, force=force)
@@ -85,7 +85,7 @@ def test_a_partial_folder_that_is_a_link_is_left_alone(tmp_path):
     (tmp_path / "x.partial").symlink_to(partial)
     with pytest.raises(BadConfiguration, match="not created by mmrjax"):
         RunFolder(tmp_path / "x", SWEEP, force=True)
-    assert (partial / "chunks" / "base.stage").is_file()
+    assert (partial / "chunks/base.stage").is_file()
 
 
 def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
@@ -99,9 +99,9 @@ def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
         BadConfiguration, match=r"x\.partial contains interrupted work of another configuration.*--force"
     ):
         RunFolder(tmp_path / "x", other)
-    assert (partial / "chunks" / "base.stage").is_file()
+    assert (partial / "chunks/base.stage").is_file()
     RunFolder(tmp_path / "x", other, force=True).close()
-    assert not (partial / "chunks" / "base.stage").exists()
+    assert not (partial / "chunks/base.stage").exists()
     assert "x.partial: was made with another configuration, so it is started again" in capsys.readouterr().err
     RunFolder(tmp_path / "x", SWEEP).close()  # nothing of the loop's is left
     interrupted(tmp_path / "x", SWEEP)
@@ -138,13 +138,13 @@ def test_a_foreign_file_that_comes_during_the_run_is_not_listed_as_ours(tmp_path
         (folder.partial / "notes.txt").write_text("years of work")
         folder.write_text("robot.toml", "")
         folder.finish({})
-    assert read_json(tmp_path / "x" / "manifest.json")["contents"] == ["manifest.json", "robot.toml"]
+    assert read_json(tmp_path / "x/manifest.json")["contents"] == ["manifest.json", "robot.toml"]
     with pytest.raises(BadConfiguration, match=r"--force would delete notes\.txt"):
         finished(tmp_path / "x", force=True)
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "y", LOOP) as folder:
         (folder.partial / "notes.txt").write_text("years of work")
         raise KeyboardInterrupt
-    assert (tmp_path / "y.partial" / "notes.txt").is_file()
+    assert (tmp_path / "y.partial/notes.txt").is_file()
 
 
 def test_a_folder_killed_while_its_results_were_written_is_taken_up(tmp_path):
@@ -159,7 +159,7 @@ def test_a_refusal_keeps_the_work_that_was_taken_up(tmp_path):
     partial = interrupted(tmp_path / "x")
     with pytest.raises(BadConfiguration, match="refused"), RunFolder(tmp_path / "x", LOOP):
         raise BadConfiguration("refused")
-    assert (partial / "chunks" / "base.stage").is_file()
+    assert (partial / "chunks/base.stage").is_file()
 
 
 @pytest.mark.parametrize("there", ["my own rig", None])
@@ -192,7 +192,7 @@ def test_writing_follows_links_keeps_modes_and_writes_to_pipes(tmp_path):
 
 def test_a_folder_killed_before_its_mark_was_written_is_taken_up(tmp_path):
     (tmp_path / "x.partial").mkdir()
-    (tmp_path / "x.partial" / "lock").touch()
+    (tmp_path / "x.partial/lock").touch()
     finished(tmp_path / "x")
     assert names(tmp_path) == ["x", "x/manifest.json", "x/robot.toml"]
 
@@ -237,11 +237,11 @@ def test_of_many_processes_at_once_one_finishes(tmp_path):
 def test_what_appears_at_the_path_meanwhile_is_left_alone_and_so_is_the_result(tmp_path):
     with pytest.raises(OSError, match="exists") as refused, RunFolder(tmp_path / "x", LOOP) as folder:
         (tmp_path / "x").mkdir()
-        (tmp_path / "x" / "thesis.txt").write_text("years of work")
+        (tmp_path / "x/thesis.txt").write_text("years of work")
         folder.write_text("robot.toml", "")
         folder.finish({})
     assert refused.value.filename == str(tmp_path / "x")
-    assert (tmp_path / "x" / "thesis.txt").is_file() and (tmp_path / "x.partial" / "manifest.json").is_file()
+    assert (tmp_path / "x/thesis.txt").is_file() and (tmp_path / "x.partial/manifest.json").is_file()
 
 
 @pytest.mark.parametrize("ended", [MemoryError(), RuntimeError(), OSError(28, os.strerror(28)), KeyboardInterrupt()])

@@ -1,5 +1,7 @@
 """Tables of runs: what is read, and the sentence for everything that is refused."""
 
+import functools
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -9,21 +11,20 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
 from calibration.data.table import Runs
-from mmrjax.model import channels, paper_robots
+from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from sweeps.pages import loop_figures
 from sweeps.pages.time_overlay import time_overlay
+from tests.commands import read_table, text_file
 
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
 )
+SEMICOLONS = HEADER.replace(",", ";")
 ROW = "6T2A,15,13.1,0,5,2.75,4800,400"
 
 
-def write(tmp_path, text):
-    path = tmp_path / "runs.csv"
-    path.write_text(text, encoding="utf-8")
-    return path
+read = functools.partial(read_table, name="runs.csv")
 
 
 def test_packaged_tables_are_tables_a1_and_a2():
@@ -37,9 +38,7 @@ def test_packaged_tables_are_tables_a1_and_a2():
 
 
 def test_conditions_are_those_of_the_robot(tmp_path, robot):
-    runs = records.read_runs(
-        write(tmp_path, f"{HEADER},surface\n{ROW},linoleum\n4W2T,33,21.1,8,20,4,11000,1200,asphalt\n")
-    )
+    runs = read(tmp_path, f"{HEADER},surface\n{ROW},linoleum\n4W2T,33,21.1,8,20,4,11000,1200,asphalt\n")
     conditions = runs.conditions(robot)
     assert isinstance(conditions, Conditions) and conditions.shape == (2,)
     assert conditions.slope == pytest.approx(np.radians([5, 20]))
@@ -50,43 +49,31 @@ def test_conditions_are_those_of_the_robot(tmp_path, robot):
 
 
 def test_a_configuration_that_the_robot_lacks_is_refused_with_those_it_has(tmp_path, robot):
-    runs = records.read_runs(write(tmp_path, f"{HEADER}\n{ROW}\n{ROW.replace('6T2A', '6T2')}\n"))
+    runs = read(tmp_path, f"{HEADER}\n{ROW}\n{ROW.replace('6T2A', '6T2')}\n")
     says = r"runs\.csv row 2, configuration: got 6T2; expected one of these; did you mean 6T2A\? allowed: 6T2A, 4W2T"
     with pytest.raises(BadData, match=says):
         runs.conditions(robot)
 
 
 def test_columns_without_a_name_are_nothing_or_called_by_their_place(tmp_path):
-    plain = records.read_runs(write(tmp_path, f"{HEADER}\n{ROW}\n"))
+    plain = read(tmp_path, f"{HEADER}\n{ROW}\n")
     for text in (f"{HEADER},\n{ROW},\n", f"{HEADER}\n{ROW},,\n", f"{HEADER},,\n{ROW}\n"):
-        runs = records.read_runs(write(tmp_path, text))
+        runs = read(tmp_path, text)
         assert runs.unknown == () and set(runs.columns) == set(plain.columns)
-    assert records.read_runs(write(tmp_path, f",{HEADER}\n7,{ROW}\n")).unknown == ("column 1",)
+    assert read(tmp_path, f",{HEADER}\n7,{ROW}\n").unknown == ("column 1",)
     with pytest.raises(BadData, match=r"row 1: got 10 cells; the header has 8 columns"):
-        records.read_runs(write(tmp_path, f"{HEADER}\n{ROW},,9\n"))
+        read(tmp_path, f"{HEADER}\n{ROW},,9\n")
 
 
 def test_missing_readings_are_nan_and_counted(tmp_path):
     header = HEADER.replace(",motor_speed_rpm", "")
-    runs = records.read_runs(write(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n"))
+    runs = read(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n")
     assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
         "total_current_A: 1 of 2 readings are missing (row 2)",
         "motor_speed_rpm: no readings. Parameters that only this channel determines are not fitted",
     ]
     assert np.isnan(runs.deviations()).all()
-
-
-def test_a_table_without_any_known_channel_is_refused(tmp_path):
-    header, row = ",".join(HEADER.split(",")[:5]), "6T2A,15,13.1,0,5"
-    with pytest.raises(BadData, match=r"no column with readings; expected at least one of total_current_A, motor_sp"):
-        records.read_runs(write(tmp_path, f"{header}\n{row}\n"))
-
-
-def test_a_reading_without_its_stated_sd_is_refused(tmp_path):
-    text = f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},\n"
-    with pytest.raises(BadData, match=r"row 2, speed_sd_mm_s: got an empty cell next to a reading; expected its sd"):
-        records.read_runs(write(tmp_path, text))
 
 
 def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
@@ -98,12 +85,12 @@ def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
         return f"{where}: refused"
 
     monkeypatch.setattr(column_names, "refused_cell_sentence", refusal)
-    runs = records.read_runs(write(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW[:-3]}n/a,\n"))
+    runs = read(tmp_path, f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW[:-3]}n/a,\n")
     assert runs["payload_kg"].tolist() == [0, 0] and runs["configuration"].tolist() == ["6T2A"] * 2
     assert_array_equal(runs["speed_mm_s"], [400, np.nan])
     assert not looked_at
     with pytest.raises(BadData, match=r"row 2: refused; .*; and 12 more$"):
-        records.read_runs(write(tmp_path, "\n".join([f"{HEADER},speed_sd_mm_s", f"{ROW},4", *[f"{ROW},0"] * 20])))
+        read(tmp_path, "\n".join([f"{HEADER},speed_sd_mm_s", f"{ROW},4", *[f"{ROW},0"] * 20]))
     assert len(looked_at) == 8
 
 
@@ -122,7 +109,7 @@ def of_arrays(columns, **stated):
 def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
     numbers = records.runs_of_arrays(of_arrays(ARRAYS))
     rows = zip(*([str(x) for x in np.asarray(values).tolist()] for values in ARRAYS.values()), strict=True)
-    texts = records.read_runs(write(tmp_path, "\n".join([",".join(ARRAYS), *map(",".join, rows)])))
+    texts = read(tmp_path, "\n".join([",".join(ARRAYS), *map(",".join, rows)]))
     assert numbers.unknown == texts.unknown == ("room_C",) and numbers.headings == texts.headings
     for column in texts.columns:
         assert_array_equal(numbers[column], texts[column], column)
@@ -176,12 +163,12 @@ def test_a_clock_of_numbers_counts_from_the_first_row_of_its_run():
 
 
 def test_unknown_columns_are_reported_and_kept_out(tmp_path):
-    runs = records.read_runs(write(tmp_path, f"{HEADER},operator\n{ROW},Anna\n"))
+    runs = read(tmp_path, f"{HEADER},operator\n{ROW},Anna\n")
     assert runs.unknown == ("operator",) and not runs.has("operator")
 
 
 def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path, robot):
-    path = write(tmp_path, "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,15,0,5\n")
+    path = text_file(tmp_path / "runs.csv", "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,15,0,5\n")
     assert records.read_runs(path, measured=False).conditions(robot).total_mass is None
     with pytest.raises(BadData, match="column total_mass_kg is missing"):
         records.read_runs(path)
@@ -237,6 +224,30 @@ REFUSED = {
         r"surface: got ice; expected one of these; allowed: linoleum",
     ),
     "sd of zero": (f"{HEADER},speed_sd_mm_s\n{ROW},0", r"speed_sd_mm_s: got 0; expected more than 0"),
+    "no known channel": (
+        ",".join(HEADER.split(",")[:5]) + "\n6T2A,15,13.1,0,5",
+        r"no column with readings; expected at least one of total_current_A, motor_sp",
+    ),
+    "a reading without its sd": (
+        f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},",
+        r"row 2, speed_sd_mm_s: got an empty cell next to a reading; expected its sd",
+    ),
+    "thousands with points": (
+        f"{SEMICOLONS}\n6T2A;15;13,1;0;0;2,75;4.800;422",
+        r"runs\.csv, motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected either decimal",
+    ),
+    "thousands with commas": (
+        f"{SEMICOLONS}\n6T2A;15;13.1;0;0;2.75;4,800;422",
+        r"motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected either decimal",
+    ),
+    "thousands next to whole numbers": (
+        f"{SEMICOLONS}\n6T2A;15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
+        r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* no thousands separators",
+    ),
+    "commas and points in one column": (
+        f"{SEMICOLONS}\n6T2A;15;13.1;0;5;2,75;4800;400\n6T2A;33;21.1;8;0;3.2;11590;970",
+        r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected either decimal commas or decimal points",
+    ),
     "payload above total": (
         f"{HEADER}\n6T2A,15,5,8,5,2.75,4800,400",
         r"total_mass_kg: got 5; expected more than the payload of 8",
@@ -248,34 +259,26 @@ REFUSED = {
 def test_bad_tables_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
     with pytest.raises(BadData, match=sentence) as refusal:
-        records.read_runs(write(tmp_path, text))
+        read(tmp_path, text)
     assert "\n" not in str(refusal.value)
     assert refusal.value.exit_code == 4
 
 
-def test_missing_and_binary_files_are_refused(tmp_path):
+def test_missing_files_are_refused(tmp_path):
     with pytest.raises(BadData, match=r"no such file and no packaged table; packaged: measured, simulated_by_paper"):
         records.read_runs(tmp_path / "none.csv")
-    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
-    with pytest.raises(BadData, match="cannot be read as a text file"):
-        records.read_runs(tmp_path / "picture.csv")
 
 
 # --- as spreadsheets and people write them -----------------------------------------------------------
 
 
-def written(tmp_path, text):
-    (tmp_path / "runs.csv").write_text(text, encoding="utf-8")
-    return tmp_path / "runs.csv"
-
-
 def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
-    usual = records.read_runs(written(tmp_path, f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n"))
+    usual = read(tmp_path, f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n")
     for text, said in (
         (f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace(".", ","), "semicolons, and"),
         (f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", "\t"), "tabs; read so"),
     ):
-        found = records.read_runs(written(tmp_path, text))
+        found = read(tmp_path, text)
         for column in usual.columns:
             assert_array_equal(found[column], usual[column])
         assert len(found.notes) == 1 and f"runs.csv: columns are separated by {said}" in found.notes[0]
@@ -285,7 +288,7 @@ def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
 @pytest.mark.parametrize(("encoding", "said"), [("utf-16", "is read as UTF-16"), ("cp1252", "read as Windows-1252")])
 def test_tables_in_other_encodings_are_read_and_said(tmp_path, encoding, said):
     text = f"{HEADER},Öl [µm]\n{ROW},1\n"
-    usual = records.read_runs(written(tmp_path, text))
+    usual = read(tmp_path, text)
     (tmp_path / "runs.csv").write_bytes(text.encode(encoding))
     found = records.read_runs(tmp_path / "runs.csv")
     assert found.unknown == ("Öl [µm]",) and usual.notes == () and found.notes[0].endswith(said)
@@ -300,52 +303,19 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
             records.read_runs(tmp_path / "runs.csv")
 
 
-@pytest.mark.parametrize(
-    ("rows", "says"),
-    [
-        (
-            "15;13,1;0;0;2,75;4.800;422",
-            r"motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected either decimal",
-        ),
-        (
-            "15;13.1;0;0;2.75;4,800;422",
-            "motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected either decimal",
-        ),
-        (
-            "15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
-            r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* no thousands separators",
-        ),
-    ],
-)
-def test_marks_between_thousands_are_refused_and_not_read_as_decimals(tmp_path, rows, says):
-    with pytest.raises(BadData, match=rf"runs\.csv, {says}"):
-        records.read_runs(written(tmp_path, f"{HEADER.replace(',', ';')}\n6T2A;{rows}\n"))
-
-
 def test_three_decimals_everywhere_are_no_thousands(tmp_path):
     text = f"{HEADER}\n6T2A,15.000,13.100,0.000,0.000,2.750,480.125,422.000\n".replace(",", ";")
-    assert records.read_runs(written(tmp_path, text))["motor_speed_rpm"] == 480.125
+    assert read(tmp_path, text)["motor_speed_rpm"] == 480.125
 
 
 def test_copies_of_rows_are_said(tmp_path):
     other = ROW.replace("4800", "4801")
-    plain = records.read_runs(written(tmp_path, f"{HEADER}\n{ROW}\n{other}\n"))
-    copied = records.read_runs(
-        written(tmp_path, f"{HEADER},run_id\n{ROW},a\n{other},b\n{ROW},c\n{other},d\n{other},e\n")
-    )
+    plain = read(tmp_path, f"{HEADER}\n{ROW}\n{other}\n")
+    copied = read(tmp_path, f"{HEADER},run_id\n{ROW},a\n{other},b\n{ROW},c\n{other},d\n{other},e\n")
     assert (
         plain.notes == ()
         and "runs.csv: rows 1 and 3 have the same conditions and readings, as do 1 more. " in copied.notes[0]
     )
-
-
-def test_commas_and_points_in_one_column_are_refused(tmp_path):
-    text = f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace("2.75", "2,75")
-    with pytest.raises(
-        BadData,
-        match=r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected either decimal commas or decimal points",
-    ):
-        records.read_runs(written(tmp_path, text))
 
 
 @pytest.mark.parametrize(
@@ -384,36 +354,34 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
 def test_units_and_words_in_cells_get_a_hint(tmp_path, column, cell, says):
     row = dict(zip(HEADER.split(","), ROW.split(","), strict=True)) | {column: cell}
     with pytest.raises(BadData, match=rf"^runs\.csv row 1, {column}: .*{says}"):
-        records.read_runs(written(tmp_path, f"{HEADER}\n{','.join(row.values())}\n"))
+        read(tmp_path, f"{HEADER}\n{','.join(row.values())}\n")
 
 
 def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
     rows = [ROW, ROW.replace("4800", "fast"), ROW, ROW.replace("15", "-50000").replace("2.75", "inf")]
     with pytest.raises(BadData) as error:
-        records.read_runs(written(tmp_path, "\n".join([HEADER, *rows])))
+        read(tmp_path, "\n".join([HEADER, *rows]))
     said = str(error.value)
     assert said.startswith("runs.csv row 2, motor_speed_rpm: got fast; expected a number")
     assert said.index("; also row 4, supply_voltage_V: got -50000") < said.index("; row 4, total_current_A: got inf")
     with pytest.raises(BadData, match=r"expected .* 1e\+06; also row 2, motor_speed_rpm: got fast; row 3"):
-        records.read_runs(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 3])))
-    with pytest.raises(BadData, match=r"; and 12 more$"):
-        records.read_runs(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 20])))
+        read(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 3]))
 
 
-def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path):
+def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path, robot):
     text = f"{HEADER}\n{ROW}\n".replace("slope_deg", "Slope_Deg").replace("6T2A", "6t2a")
-    found = records.read_runs(written(tmp_path, text), robot=paper_robots.nominal())
+    found = read(tmp_path, text, robot=robot)
     assert found["slope_deg"].tolist() == [5.0] and found["configuration"].tolist() == ["6T2A"]
     assert found.notes == (
         "runs.csv: column Slope_Deg is read as slope_deg", "runs.csv: configuration 6t2a is read as 6T2A",
     )  # fmt: skip
 
 
-def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
+def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path, robot):
     header = f"{HEADER.replace(',motor_speed_rpm', '')},run_id"
     rows = [ROW.replace(",4800", "").replace("2.75", f"2.7{k}") + f",{run}" for k, run in enumerate("abac")]
     rows[1] = rows[1].replace("2.71", "")
-    found = records.read_runs(written(tmp_path, "\n".join([header, *rows])), robot=paper_robots.nominal())
+    found = read(tmp_path, "\n".join([header, *rows]), robot=robot)
     assert found.notes == (
         "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2. They are ignored",
         "runs.csv: no column motor_speed_rpm, so this channel has no readings",

@@ -152,7 +152,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     assert "regression only, not confirmed by simulation: perhaps a loss torque that changes" in err
-    left = read_json(tmp_path / "found.partial" / "screening.json")
+    left = read_json(tmp_path / "found.partial/screening.json")
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
 

@@ -171,7 +171,7 @@ def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path, outputs):
 @pytest.mark.slow
 def test_morris_has_indices_of_its_own(mmrjax, tmp_path):
     code, _, _ = mmrjax(*SMALL, "--method", "morris", "--no-report", "--out", "m")
-    document = read_json(tmp_path / "m" / "result.json")
+    document = read_json(tmp_path / "m/result.json")
     jsonschema.validate(document, SCHEMA)
     index = document["indices"]["speed"]["motor.torque_constant"]
     assert code == 0 and {"mean_absolute_effect", "mean_effect", "sd_effect"} <= set(index)
@@ -205,7 +205,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     code, out, _ = mmrjax(
         "sensitivity --robot robot.toml --posterior --voltages 24 --payloads 3 --slopes 0 --configurations 6T2A --outputs speed --evaluations 6000 --no-report --out p",
     )  # fmt: skip
-    document = read_json(tmp_path / "p" / "result.json")
+    document = read_json(tmp_path / "p/result.json")
     jsonschema.validate(document, SCHEMA)
     assert code == 0 and document["method"] == "local" and document["correlated"]
 
@@ -214,7 +214,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
         code=0,
     )
     assert re.search(r"total current \[A\] +\d\.\d+ ± 0\.\d+", out)
-    (row,) = table(tmp_path / "u" / "runs.csv")
+    (row,) = table(tmp_path / "u/runs.csv")
     low, high = float(row["speed_mm_s_lower"]), float(row["speed_mm_s_upper"])
     assert low < float(row["speed_mm_s"]) < high
     assert float(row["speed_mm_s_sd"]) == pytest.approx((high - low) / 3.92, rel=0.3)
@@ -225,7 +225,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
         " ± ",
         code=0,
     )
-    assert "speed_mm_s_sd" in table(tmp_path / "w" / "runs.csv")[0]
+    assert "speed_mm_s_sd" in table(tmp_path / "w/runs.csv")[0]
     ends(
         mmrjax("simulate --robot robot.toml --set", f"{NAMES[0]}=0.03", "--posterior", "20"),
         f"{NAMES[0]} is 0.03 in the robot; expected",
@@ -282,7 +282,7 @@ def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
         "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,3,0\n4W2T,33,8,5\n"
     )
     got, _, _ = mmrjax(*SMALL, "--method", "local", "--candidates", "two.csv", "--no-report", "--out", "c")
-    runs = read_json(tmp_path / "c" / "result.json")["next_runs"]
+    runs = read_json(tmp_path / "c/result.json")["next_runs"]
     assert got == 0 and runs["candidates"] == 2 and runs["source"] == "two.csv" and len(runs["runs"]) == 2
 
 
@@ -311,7 +311,7 @@ def test_points_that_are_not_held_are_said(mmrjax, tmp_path):
         "1 of 2 operating points are left out",
         code=0,
     )
-    document = read_json(tmp_path / "h" / "result.json")
+    document = read_json(tmp_path / "h/result.json")
     assert document["outputs"]["speed"]["studied"] == [True, False]
     low, high = document["indices"]["speed"][NAMES[0]]["total_interval"]
     assert low < 1 < high  # the only input
@@ -341,7 +341,7 @@ def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(m
         ),
         code=0,
     )
-    document = read_json(tmp_path / "v" / "result.json")
+    document = read_json(tmp_path / "v/result.json")
     assert vary.partition("=")[0] in document["inputs"] and len(document["next_runs"]["runs"]) == 5
 
 
@@ -350,7 +350,7 @@ def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):
     code, _, _ = mmrjax(
         "sensitivity --method local --parameters motor.resistance,6T2A.ground.friction.dynamic --voltages 24 --payloads 0 --slopes 0 --configurations 6T2A --outputs start --no-report --out t",
     )  # fmt: skip
-    document = read_json(tmp_path / "t" / "result.json")
+    document = read_json(tmp_path / "t/result.json")
     assert code == 0 and set(document["outputs"]) == {"peak_current", "time_to_speed", "energy_start"}
     peak, time = (document["indices"][n] for n in ("peak_current", "time_to_speed"))
     assert peak["motor.resistance"]["elasticity"][0] < -0.5  # U / R before the motor turns

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.data.input_errors import BadConfiguration
@@ -70,7 +71,7 @@ def test_radius_is_that_of_the_centre_of_mass():
     ahead, aside, rate = np.array(
         [[0.3, 0.4, 1.0], [0.3, 0.0, -0.5], [-0.3, 0.0, 0.5], [0.0, 0.1, 2.0], [0.3, 0, 0]]
     ).T
-    np.testing.assert_allclose(turning_figures.turning_radius(ahead, aside, rate), [0.5, -0.6, -0.6, 0.05, np.inf])
+    assert_allclose(turning_figures.turning_radius(ahead, aside, rate), [0.5, -0.6, -0.6, 0.05, np.inf])
     slope = jax.grad(lambda v: turning_figures.turning_radius(v, 0.0, 2.0))(0.3)
     assert float(slope) == pytest.approx(0.5) and np.isfinite(
         jax.grad(lambda w: turning_figures.turning_radius(0.3, 0.0, w))(0.0)
@@ -101,5 +102,5 @@ def test_the_yaw_rate_of_a_turn_is_studied(mmrjax, tmp_path):
     told = "--configurations", "6T2A", "--voltages", "24", "--payloads", "0", "--vary", "duty_left=0.4:0.8"
     more = "--method", "local", "--outputs", "yaw_rate,turning_radius", "--no-report", "--out", str(tmp_path / "s")
     ends(mmrjax("sensitivity", *told, *more), "yaw rate", "turning radius", code=0)
-    with (tmp_path / "s" / "points.csv").open() as file:
+    with (tmp_path / "s/points.csv").open() as file:
         assert any(row["input"] == "6T2A.turning.lateral" for row in csv.DictReader(file))

@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import json
 import re
 import time
 
@@ -21,7 +20,7 @@ from calibration.inference import noise as noises
 from calibration.inference.foresight import InformationForecast
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
-from tests.commands import ROOT, csv_text, ends, read_rig, text_file
+from tests.commands import ROOT, csv_text, ends, read_json, read_rig, text_file
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -527,19 +526,19 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     _, world, robot = made(tmp_path)
     _, out, _ = ends(mmrjax("settle log.csv --robot rig.toml --out found"), code=0)
     assert f"{len(world.conditions)} settled runs, " in " ".join(out.split())
-    runs = records.read_runs(tmp_path / "found" / "settled.csv", robot=robot)
+    runs = records.read_runs(tmp_path / "found/settled.csv", robot=robot)
     assert not runs.sampled and len(runs) == len(world.conditions)
     assert np.isfinite(runs.deviations()).all() and not runs.unknown
-    with (tmp_path / "found" / "stretches.csv").open(encoding="utf-8") as file:
+    with (tmp_path / "found/stretches.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["first_row"] == "1" and float(rows[0]["motor_speed_change_rpm"]) < 10
-    document = json.loads((tmp_path / "found" / "result.json").read_text())
+    document = read_json(tmp_path / "found/result.json")
     assert document["settled"] == len(runs) and document["schema"] == "mmrjax.settle/1"
-    page = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "found/report.html").read_text(encoding="utf-8")
     assert (
         "The log." in page
         and '<th rowspan="2">voltage [V]</th>' in page
-        and (tmp_path / "found" / "figures" / "log.svg").is_file()
+        and (tmp_path / "found/figures/log.svg").is_file()
     )
 
 
@@ -592,7 +591,7 @@ def turning(tmp_path):
         "yaw_rate_rad_s": (right - left) / 0.8 + 0.01 * noise[2],
     }
     write_table({n: [f"{x:.6g}" for x in column] for n, column in table.items()}, tmp_path / "log.csv")
-    return pairs, robot_file.read_robot(ROOT / "docs" / "rigs" / "husky" / "husky.toml")
+    return pairs, robot_file.read_robot(ROOT / "docs/rigs/husky/husky.toml")
 
 
 def test_levels_of_a_turn_are_those_of_both_sides_and_a_yaw_rate_has_its_own_sign(tmp_path):

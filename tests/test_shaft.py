@@ -177,9 +177,9 @@ def test_power_of_a_shaft_adds_up():
         assert given - stored - taken > -1e-9  # the gearbox never adds power
 
 
-def test_loads_state_what_they_can_do():
+def test_loads_state_what_they_can_do(robot):
     """Each says of the other's what it has none of, so that nobody has to ask which it is."""
-    shaft, vehicle = bench(torque_constant=0.3, torque_gravity=0.2, angle_zero=-np.pi / 2), paper_robots.nominal()
+    shaft, vehicle = bench(torque_constant=0.3, torque_gravity=0.2, angle_zero=-np.pi / 2), robot
     load, chassis = shaft.configurations["bench"], vehicle.configurations["6T2A"]
     assert (
         not shaft.has_ground and vehicle.has_ground and balances.absent_balances(shaft) >= {"ground", "slip", "mass"}

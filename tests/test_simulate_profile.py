@@ -1,7 +1,6 @@
 """`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
 
 import csv
-import functools
 import re
 
 import numpy as np
@@ -16,7 +15,7 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import energy
 from mmrjax.model.signals import STATUSES
 from sweeps.commands.missions import select_course_rows
-from tests.commands import command_in, ends, read_json
+from tests.commands import ends, read_json, text_file
 
 #: Up a slope, to a stop, and back; twice.
 MISSION = """\
@@ -33,18 +32,21 @@ time_s,speed_mm_s,mode,slope_deg
 4.5,0,brake,0
 5,,brake,0
 """
+VOLTS = "time_s,voltage_left_V,voltage_right_V\n0,20,10\n2,20,10\n"
+FILES = {
+    "mission.csv": MISSION, "sides.csv": VOLTS, "volts.csv": "time_s,supply_voltage_V\n0,24\n1,24\n",
+    "floors.csv": "time_s,duty,surface\n0,1,asphalt\n1,1,asphalt\n",
+}  # fmt: skip
 SHORT = profile([0.0, 0.5, 1.5, 2.0], ["speed", "speed", "brake", "brake"], demand=[0.0, 0.3, 0.3, 0.0], linear=True)
 
 
 @pytest.fixture(scope="module")
-def mmrjax(tmp_path_factory):
-    """Run the command line in a folder of its own."""
+def tmp_path(tmp_path_factory):
+    """One folder for all commands of this file."""
     folder = tmp_path_factory.mktemp("missions")
-
-    run = functools.partial(command_in, folder)
-    run.folder = folder
-    (folder / "mission.csv").write_text(MISSION)
-    return run
+    for name, text in FILES.items():
+        text_file(folder / name, text)
+    return folder
 
 
 def rows(path):
@@ -61,14 +63,12 @@ def rows(path):
 
 
 @pytest.fixture
-def done(mmrjax, capsys, monkeypatch):
+def done(mmrjax, tmp_path):
     """The folder of one mission on the battery, made once."""
-    if not (mmrjax.folder / "one").exists():
-        _, out, _ = ends(
-            mmrjax(capsys, monkeypatch, "simulate", "--profile", "mission.csv", "--battery", "--out", "one"), code=0
-        )
-        (mmrjax.folder / "said.txt").write_text(out)
-    return mmrjax.folder / "one"
+    if not (tmp_path / "one").exists():
+        _, out, _ = ends(mmrjax("simulate", "--profile", "mission.csv", "--battery", "--out", "one"), code=0)
+        (tmp_path / "said.txt").write_text(out)
+    return tmp_path / "one"
 
 
 # --- what comes out -------------------------------------------------------------------------------------------------
@@ -143,14 +143,14 @@ def test_report_shows_course_energy_and_segments(done):
 
 
 @pytest.mark.slow
-def test_runs_of_a_file_follow_the_same_profile(mmrjax, capsys, monkeypatch):
-    (mmrjax.folder / "plan.csv").write_text(
+def test_runs_of_a_file_follow_the_same_profile(mmrjax, tmp_path):
+    (tmp_path / "plan.csv").write_text(
         "run_id,configuration,supply_voltage_V,payload_kg,slope_deg\na,6T2A,33,0,0\nb,4W2T,24,4,0\n"
     )
     words = ("--profile", "mission.csv", "--runs", "plan.csv", "--out", "several")
-    _, _, err = ends(mmrjax(capsys, monkeypatch, "simulate", *words), code=0)
-    assert "plan.csv, slope_deg: not used, mission.csv states it" in err
-    folder = mmrjax.folder / "several"
+    _, _, err = ends(mmrjax("simulate", *words), code=0)
+    assert "plan.csv, slope_deg: not used, because mission.csv gives it" in err
+    folder = tmp_path / "several"
     result = read_json(folder / "result.json")
     assert [m["status"] for m in result["missions"]] == ["converged"] * 2
     assert (
@@ -161,66 +161,44 @@ def test_runs_of_a_file_follow_the_same_profile(mmrjax, capsys, monkeypatch):
     assert Tables((folder / "report.html").read_text()).tables["runs"][0][1].startswith("a: 6T2A")
 
 
-def test_battery_that_ends_in_the_mission_is_said(mmrjax, capsys, monkeypatch):
+def test_battery_that_ends_in_the_mission_is_said(mmrjax, tmp_path):
     """The time and the distance up to there, and no segments after it."""
     words = ("--profile", "mission.csv", "--battery", "--discharge", "2198", "--no-report", "--out", "empty")
-    ends(
-        mmrjax(capsys, monkeypatch, "simulate", *words), "battery empty", "the battery's capacity is used up", code=0
-    )
-    result = read_json(mmrjax.folder / "empty" / "result.json")
+    ends(mmrjax("simulate", *words), "battery empty", "the battery's capacity is used up", code=0)
+    result = read_json(tmp_path / "empty/result.json")
     assert result["status"] == "battery_empty" and 2 < result["duration_s"] < 5
     assert result["endurance_s"] == pytest.approx(result["duration_s"])
     assert result["state_of_charge"] == pytest.approx(0, abs=1e-6)
-    segments = rows(mmrjax.folder / "empty" / "segments.csv")
+    segments = rows(tmp_path / "empty/segments.csv")
     assert len(segments["status"]) < 7 and segments["status"][-1] == "battery_empty"
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------
 
+#: Profile and options, exit code, and the sentence.
 REFUSED = {
-    "steady": (["--model", "steady"], 2, r"--profile has an effect only with --model drive, which simulates a profile; got --model steady"),
-    "track": (["--model", "track"], 2, r"got --model track"),
-    "duration": (["--duration", "5"], 2, r"--duration cannot be combined with --profile"),
-    "posterior": (["--posterior", "50"], 2, r"--posterior cannot be combined with --profile"),
-    "slope twice": (["--slope", "0"], 2, r"--slope: mission.csv contains slope_deg too"),
-    "empty battery": (["--battery", "--discharge", "2300"], 2, r"--discharge: got 2300 mAh; the battery is empty at 2200 mAh"),
-    "no such profile": (["--profile", "petrol"], 4, r"petrol: no such file and no packaged profile; .*patrol"),
+    "mission.csv --model steady": (2, r"--profile has an effect only with --model drive, which simulates a profile; got --model steady"),
+    "mission.csv --model track": (2, r"got --model track"),
+    "mission.csv --duration 5": (2, r"--duration cannot be combined with --profile"),
+    "mission.csv --posterior 50": (2, r"--posterior cannot be combined with --profile"),
+    "mission.csv --slope 0": (2, r"--slope: mission.csv contains slope_deg too"),
+    "mission.csv --battery --discharge 2300": (2, r"--discharge: got 2300 mAh; the battery is empty at 2200 mAh"),
+    "petrol": (4, r"petrol: no such file and no packaged profile; .*patrol"),
+    "volts.csv --battery": (2, "--battery cannot be combined with volts.csv, which gives supply_voltage_V"),
+    "sides.csv --voltage 15": (2, r"voltage_left_V and voltage_right_V: got 20 V; the supply has 15 V"),
+    "sides.csv --battery": (2, r"--battery cannot be combined with sides.csv, which gives voltage_left_V; .* duty_left and duty_right"),
+    "sides.csv --set sides=1": (2, r"sides.csv drives the two sides differently: got a robot of 1 side; expected sides = 2"),
+    "sides.csv --left 10 --right 5": (2, r"--left cannot be combined with --profile"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_does_not_go_with_a_profile_is_refused(mmrjax, capsys, monkeypatch, case):
-    options, wanted, message = REFUSED[case]
-    code, out, err = mmrjax(capsys, monkeypatch, "simulate", "--profile", "mission.csv", *options, "--out", "x")
+@pytest.mark.parametrize("options", REFUSED)
+def test_what_does_not_go_with_a_profile_is_refused(mmrjax, tmp_path, options):
+    wanted, message = REFUSED[options]
+    code, out, err = mmrjax(f"simulate --out x --profile {options}")
     assert (code, out) == (wanted, "")
     assert re.search(message, err) and err.count("\n") == 1, err
-    assert not list(mmrjax.folder.glob("x*"))
-
-
-_VOLTS = "time_s,voltage_left_V,voltage_right_V\n0,20,10\n2,20,10\n"
-SIDES = {
-    "more than the supply has": (_VOLTS, ["--voltage", "15"], r"voltage_left_V and voltage_right_V: got 20 V; the supply has 15 V"),
-    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery cannot be combined with sides.csv, which gives voltage_left_V; .* duty_left and duty_right"),
-    "a robot of one side": (_VOLTS, ["--set", "sides=1"], r"sides.csv drives the two sides differently: got a robot of 1 side; expected sides = 2"),
-    "options beside": (_VOLTS, ["--left", "10", "--right", "5"], r"--left cannot be combined with --profile"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", SIDES)
-def test_sides_that_cannot_be_are_refused(mmrjax, capsys, monkeypatch, case):
-    content, options, message = SIDES[case]
-    (mmrjax.folder / "sides.csv").write_text(content)
-    code, out, err = mmrjax(capsys, monkeypatch, "simulate", "--profile", "sides.csv", *options, "--out", "x")
-    assert code in (2, 4) and out == ""
-    assert re.search(message, err) and err.count("\n") == 1, err
-
-
-def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, monkeypatch):
-    (mmrjax.folder / "volts.csv").write_text("time_s,supply_voltage_V\n0,24\n1,24\n")
-    ends(
-        mmrjax(capsys, monkeypatch, "simulate", "--profile", "volts.csv", "--battery"),
-        "--battery cannot be combined with volts.csv, which gives supply_voltage_V",
-    )
+    assert not list(tmp_path.glob("x*"))
 
 
 # --- rows of the history --------------------------------------------------------------------------------------------
@@ -294,12 +272,12 @@ payload = [0, 8]
 
 
 @pytest.mark.slow
-def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, monkeypatch):
+def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, tmp_path, done):
     import xarray as xr
 
-    (mmrjax.folder / "plan.toml").write_text(PLAN)
-    ends(mmrjax(capsys, monkeypatch, "sweep", "plan.toml", "--no-report", "--out", "swept"), code=0)
-    found = xr.open_zarr(mmrjax.folder / "swept" / "results.zarr")
+    (tmp_path / "plan.toml").write_text(PLAN)
+    ends(mmrjax("sweep", "plan.toml", "--no-report", "--out", "swept"), code=0)
+    found = xr.open_zarr(tmp_path / "swept/results.zarr")
     one = read_json(done / "result.json")
     assert float(found.energy_Wh.sel(payload=0)) == pytest.approx(one["energy_Wh"], rel=1e-6)
     assert float(found.energy_Wh.sel(payload=8)) > one["energy_Wh"] and found.energy_Wh.attrs["units"] == "Wh"
@@ -317,9 +295,8 @@ BAD_PLANS = {
 
 
 @pytest.mark.parametrize("case", BAD_PLANS)
-def test_wrong_plan_is_refused(mmrjax, capsys, monkeypatch, case):
+def test_wrong_plan_is_refused(mmrjax, tmp_path, case):
     text, message = BAD_PLANS[case]
-    (mmrjax.folder / "plan.toml").write_text(text)
-    (mmrjax.folder / "floors.csv").write_text("time_s,duty,surface\n0,1,asphalt\n1,1,asphalt\n")
-    code, _, err = mmrjax(capsys, monkeypatch, "sweep", "plan.toml", "--out", "y")
+    (tmp_path / "plan.toml").write_text(text)
+    code, _, err = mmrjax("sweep", "plan.toml", "--out", "y")
     assert code in (2, 4) and re.search(message, err), err

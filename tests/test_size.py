@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.parts import packaged_gearboxes, packaged_motors
@@ -156,7 +157,7 @@ def test_margins_are_differentiable(robot, asked, found):
     for k in range(3):
         step = 1e-5 * np.eye(3)[k]
         difference = (np.asarray(margins(x[0] + step)) - np.asarray(margins(x[0] - step))) / 2e-5
-        np.testing.assert_allclose(exact[:, k], difference, rtol=1e-3, atol=1e-5)
+        assert_allclose(exact[:, k], difference, rtol=1e-3, atol=1e-5)
 
 
 def test_paper_parts_make_the_papers_robot(robot, asked):

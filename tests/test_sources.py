@@ -327,7 +327,7 @@ def test_a_link_to_another_file_is_not_followed(tmp_path, robot):
     with pytest.raises(BadData, match=r"volts: is a link to another file, /etc/passwd"):
         records.read_runs(tmp_path / "log.h5", robot)
     samples.ros2(tmp_path / "bag", samples.fast(0.1), samples.slow(0.1))
-    (tmp_path / "bag" / "more.db3").symlink_to("/etc/passwd")
+    (tmp_path / "bag/more.db3").symlink_to("/etc/passwd")
     with pytest.raises(BadData, match=r"bag, more.db3: is a link that points outside the bag"):
         records.read_runs(tmp_path / "bag", robot)
 
@@ -421,7 +421,7 @@ def test_contents_of_an_empty_file_are_an_error_and_empty_cells_are_missing(tmp_
 
 def test_a_bags_folder_without_its_metadata_is_named(tmp_path):
     (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "bag_0.mcap").touch()
+    (tmp_path / "bag/bag_0.mcap").touch()
     with pytest.raises(BadData, match=r"without metadata\.yaml; .* as .*bag_0\.mcap"):
         contents.inspect_source(tmp_path / "bag")
 

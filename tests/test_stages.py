@@ -135,7 +135,7 @@ def test_a_forged_stage_runs_nothing_and_is_made_again(tmp_path, monkeypatch, ca
     monkeypatch.chdir(tmp_path)
     with RunFolder(tmp_path / "x", {"command": "loop"}) as folder:
         folder.stage("base", lambda: 1)
-        file = folder.partial / "chunks" / "base.stage"
+        file = folder.partial / "chunks/base.stage"
         if what == "a pickle":
             file.write_bytes(FORGED[what])
         else:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
+from numpy.testing import assert_allclose
 from synthetic import SETTLED, table
 from worlds import laws, settled, tables
 
@@ -222,7 +223,7 @@ def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
         sides.append(legendre.legvander(x, PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)))
     raw = bases.place_signature(toy.linear, "track", np.einsum("ri,rj->rij", *sides).reshape(toy.rows, -1))
     ratio = found.columns[:, 0] / raw[:, 0]
-    np.testing.assert_allclose(found.columns, ratio[0] * raw, rtol=1e-9)
+    assert_allclose(found.columns, ratio[0] * raw, rtol=1e-9)
     for factor in (0.3, 0.6, 1.7, 3.0):
         assert gained(toy, factor * found.columns) < found.evidence + 0.2  # of a grid, so nearly the largest
 

@@ -12,7 +12,6 @@ from worlds import paper
 
 from mmrjax.derived import start_figures
 from mmrjax.fidelities.base import History, in_table_time
-from mmrjax.model import paper_robots
 from mmrjax.model.params import replace
 from mmrjax.model.quantities import MM
 from mmrjax.model.rig import Rig
@@ -38,7 +37,7 @@ def written(mmrjax, tmp_path):
         (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
         asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
         assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
-        return table(tmp_path / "d" / "history.csv"), read_json(tmp_path / "d" / "result.json")
+        return table(tmp_path / "d/history.csv"), read_json(tmp_path / "d/result.json")
 
     return left
 
@@ -151,12 +150,12 @@ def test_the_delay_of_histories_is_the_one_of_fits():
     assert float(slope) == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)
 
 
-def test_a_delay_that_is_none_changes_no_number():
+def test_a_delay_that_is_none_changes_no_number(robot):
     t = jnp.linspace(0, 1, 5)[None]
     signals = Signals(speed=t, speed_theoretical=2 * t, current=t, speed_motor=t, total_current=t)
-    prompt = History.of(paper_robots.nominal(), t, t, signals)
+    prompt = History.of(robot, t, t, signals)
     assert prompt.signals is signals and (np.asarray(prompt.time) == np.asarray(t)).all()
-    late = History.of(replace(paper_robots.nominal(), {"rig.delay": 0.25}), t, t, signals)
+    late = History.of(replace(robot, {"rig.delay": 0.25}), t, t, signals)
     assert_allclose(late.time[0], [0, 0.5, 0.75, 1.0, 1.25])
     assert_allclose(late.reading["speed"][0], t[0])
     assert_allclose(late.signals.speed_theoretical[0], 2 * t[0])
@@ -170,13 +169,13 @@ def test_what_a_delay_moves_is_moved_by_one_program(compilations):
     assert_allclose(late["7"][0, 2:], t[0, 2:] + 7)
 
 
-def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history():
+def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history(robot):
     t = jnp.linspace(0, 1, 4)[None]
     signals = Signals(
         speed=0.5 * t, speed_theoretical=t, current=t, speed_motor=t, total_current=t, voltage=t, traction=t,
         speed_sliding=0.5 * t, speed_output=t, angle=t,
     )  # fmt: skip
-    history = History.of(paper_robots.nominal(), t, t, signals)
+    history = History.of(robot, t, t, signals)
 
     class Runs:
         def has(self, name):
@@ -185,6 +184,6 @@ def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history
         def __len__(self):
             return 1
 
-    shown = simulate.history_table(paper_robots.nominal(), history, Runs())
+    shown = simulate.history_table(robot, history, Runs())
     assert_allclose(shown["speed_mm_s"], np.asarray(0.5 * t[0]) / MM)
     assert_allclose(shown["slip"], [0, 0.5, 0.5, 0.5])

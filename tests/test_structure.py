@@ -155,18 +155,18 @@ def observers_alone_know_the_kind_of_data(path, tree):
         return
     for node in walked(tree):
         if isinstance(node, ast.Call):
-            called = ast.unparse(node.func)
+            called = _dotted(node.func)
             if called in ("isinstance", "issubclass") and len(node.args) == 2:
                 asked = {n.id for n in walked(node.args[1]) if isinstance(n, ast.Name)}
                 asked |= {n.attr for n in walked(node.args[1]) if isinstance(n, ast.Attribute)}
                 if asked & OBSERVERS:
                     yield node.lineno, "asks for the class of an observer"
-            if called.endswith(".has") and any(
+            if getattr(node.func, "attr", "") == "has" and any(
                 isinstance(a, ast.Constant) and a.value == "time_s" for a in node.args
             ):
                 yield node.lineno, "asks whether a table has time_s"
         if isinstance(node, ast.Compare):
-            sides = {ast.unparse(x).rpartition(".")[2] for x in (node.left, *node.comparators)}
+            sides = {getattr(x, "attr", getattr(x, "id", "")) for x in (node.left, *node.comparators)}
             if sides & OBSERVERS:
                 yield node.lineno, "compares the class of an observer"
         if isinstance(node, ast.Attribute) and node.attr in ("series", "is_series"):
@@ -329,16 +329,16 @@ def _changed(node, inside):
         yield from node.names
     elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         made = (d.func if isinstance(d, ast.Call) else d for d in node.decorator_list)
-        yield from (node.name for d in made if ast.unparse(d).rpartition(".")[2] in CACHES)
-    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(CARRIERS):
-        yield ast.unparse(node.func)
+        yield from (node.name for d in made if _dotted(d).rpartition(".")[2] in CACHES)
+    elif isinstance(node, ast.Call) and _dotted(node.func).endswith(CARRIERS):
+        yield _dotted(node.func)
     elif isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del) and inside:
-        yield "globals" if ast.unparse(node).startswith("globals()[") else _dotted(node)
+        yield "globals" if "globals" in {getattr(n, "id", "") for n in ast.walk(node)} else _dotted(node)
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and inside:
         if node.func.attr in CHANGES:
             yield _dotted(node.func.value)
-    elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("setattr", "delattr") and inside:
-        yield f"{_dotted(node.args[0])}.{ast.unparse(node.func)}"
+    elif isinstance(node, ast.Call) and _dotted(node.func) in ("setattr", "delattr") and inside:
+        yield f"{_dotted(node.args[0])}.{_dotted(node.func)}"
 
 
 def modules_keep_no_state(path, tree):
@@ -397,7 +397,7 @@ def of_errors(tree):
         made = [
             n
             for n in inside
-            if isinstance(n, ast.Raise) or (isinstance(n, ast.Call) and ast.unparse(n.func).startswith("Bad"))
+            if isinstance(n, ast.Raise) or (isinstance(n, ast.Call) and _dotted(n.func).startswith("Bad"))
         ]
         taken = [n for error in made for n in walked(error)]
         names = {n.id for n in taken if isinstance(n, ast.Name)}
@@ -405,7 +405,7 @@ def of_errors(tree):
             if isinstance(n, ast.Assign) and {t.id for t in n.targets if isinstance(t, ast.Name)} & names:
                 taken += walked(n.value)
         found |= {id(n) for n in taken}
-        called |= {ast.unparse(n.func) for n in taken if isinstance(n, ast.Call)}
+        called |= {_dotted(n.func) for n in taken if isinstance(n, ast.Call)}
     return found | {id(n) for function in functions if function.name in called for n in walked(function)}
 
 
@@ -580,7 +580,7 @@ def test_what_is_kept_is_there():
 
 
 def test_front_door_loads_nothing_heavy():
-    if not (ROOT / "sweeps" / "cli.py").exists():
+    if not (ROOT / "sweeps/cli.py").exists():
         pytest.skip("no command line yet")
     code = "import sys, sweeps.cli; print(sorted({m.partition('.')[0] for m in sys.modules} & set(sys.argv[1:])))"
     heavy = sorted({*HEAVY, "numpy"})
@@ -675,8 +675,21 @@ def test_one_preparation_serves_all():
     assert found == allowed
     for room in ("inference/calibration", "inference/foresight", "discovery/discover"):
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
-        calls = {ast.unparse(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
+        calls = {_dotted(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
         assert "prepare_input" in calls, room
+
+
+def statements(body, annotations=False):
+    """Statements at any depth of a body, either those for annotations alone, under `TYPE_CHECKING`, or all others."""
+    for node in body:
+        inner = [n for name in ("body", "handlers", "cases") for n in getattr(node, name, ())]
+        if isinstance(node, ast.If) and _dotted(node.test) == "TYPE_CHECKING":
+            yield from node.body if annotations else ()
+            inner = []
+        elif not annotations:
+            yield node
+        inner += [n for name in ("orelse", "finalbody") for n in getattr(node, name, ())]
+        yield from statements(inner, annotations)
 
 
 def circle(root):
@@ -685,10 +698,6 @@ def circle(root):
     Imports for annotations alone (under `TYPE_CHECKING`) are no part of it.
     """
 
-    class Runs(ast.NodeTransformer):
-        def visit_If(self, node):
-            return node.orelse or None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
-
     files = {}
     for file in (file for layer in LAYERS for file in sorted((root / layer).rglob("*.py"))):
         parts = file.relative_to(root).with_suffix("").parts
@@ -696,9 +705,10 @@ def circle(root):
     graph = {}
     for name, file in files.items():
         package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-        tree = Runs().visit(ast.parse(file.read_text(encoding="utf-8")))
         graph[name] = set()
-        for node in (n for n in walked(tree) if isinstance(n, ast.Import | ast.ImportFrom)):
+        for node in statements(ast.parse(file.read_text(encoding="utf-8")).body):
+            if not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
             imported = [module for module, _ in names_imported(ast.Module([node], []), package)]
             whole, *each = [m for m in imported if m in files] or [""]
             # What is imported from a package is its modules, and the package itself only where one is none of them.
@@ -718,10 +728,10 @@ def test_no_module_imports_itself_by_way_of_others():
 @pytest.mark.parametrize("found", [True, False])
 def test_a_circle_of_imports_is_found(found, tmp_path):
     (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps" / "__init__.py").write_text("")
-    (tmp_path / "sweeps" / "a.py").write_text("def f():\n    from sweeps import b")
+    (tmp_path / "sweeps/__init__.py").write_text("")
+    (tmp_path / "sweeps/a.py").write_text("def f():\n    from sweeps import b")
     guard = "pass" if found else "if TYPE_CHECKING:\n    from sweeps.a import f"
-    (tmp_path / "sweeps" / "b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
+    (tmp_path / "sweeps/b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
     assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
 
 
@@ -736,10 +746,8 @@ def annotated(root):
         for layer in LAYERS
         for path in sorted((root / layer).rglob("*.py"))
         if any(
-            isinstance(node, ast.If)
-            and ast.unparse(node.test) == "TYPE_CHECKING"
-            and any(isinstance(x, ast.Import | ast.ImportFrom) for x in node.body)
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            isinstance(node, ast.Import | ast.ImportFrom)
+            for node in statements(ast.parse(path.read_text(encoding="utf-8")).body, annotations=True)
         )
     ]
 
@@ -748,8 +756,8 @@ def test_few_modules_import_for_annotations_alone(tmp_path):
     """A type that two modules need of one another belongs below both."""
     assert len(found := annotated(ROOT)) <= ANNOTATED, found
     (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps" / "a.py").write_text("if TYPE_CHECKING:\n    from sweeps.b import f")
-    (tmp_path / "sweeps" / "b.py").write_text("if not TYPE_CHECKING:\n    from sweeps.a import f")
+    (tmp_path / "sweeps/a.py").write_text("if TYPE_CHECKING:\n    from sweeps.b import f")
+    (tmp_path / "sweeps/b.py").write_text("if not TYPE_CHECKING:\n    from sweeps.a import f")
     assert annotated(tmp_path) == ["sweeps/a.py"]
 
 

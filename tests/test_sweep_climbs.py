@@ -155,7 +155,7 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
     ends(mmrjax("sweep map.toml --out map"), "resumes after 2 of 6 points", "have a verdict", code=0)
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
-    store = zarr.open_group(tmp_path / "map" / "results.zarr", mode="r")
+    store = zarr.open_group(tmp_path / "map/results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
 
 
@@ -181,7 +181,7 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
         page = (tmp_path / name / "report.html").read_text("utf-8")
         where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
         assert f"The largest obstacle that the robot gets over: {size} mm, at {where}." in page
-    page = (tmp_path / "map" / "report.html").read_text("utf-8")
+    page = (tmp_path / "map/report.html").read_text("utf-8")
     names = {name: (meaning, unit) for name, meaning, unit, _ in Tables(page).tables["names"][1:]}
     assert names["obstacle_mm"] == ("height of the step", "mm") and "endings" in drawn(page)
 
@@ -206,11 +206,11 @@ obstacle_mm = [60, 500]
     for share in ("1/2", "2/2"):
         ends(mmrjax("sweep map.toml --shard", share, "--out", "run"), code=0)
         assert (tmp_path / "run").exists() == (share == "2/2")
-    result = read_json(tmp_path / "run" / "result.json")
+    result = read_json(tmp_path / "run/result.json")
     assert result["model"] == "climb" and result["statuses"]["converged"] == 4
-    store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
+    store = zarr.open_group(tmp_path / "run/results.zarr", mode="r")
     verdicts = [[NAMES[k] for k in row] for row in store["verdict"][:]]
     assert [row[0] for row in verdicts] == ["over", "over"] and "over" not in [row[1] for row in verdicts]
     assert (store["furthest_mm"][:, 0] > 60).all() and np.isfinite(store["energy_J"][:]).all()
-    page = (tmp_path / "run" / "report.html").read_text("utf-8")
+    page = (tmp_path / "run/report.html").read_text("utf-8")
     assert "Verdicts over what varies" in page and "gets over" in page and page.count("<svg") == 3

@@ -86,7 +86,7 @@ def test_worker_killed_in_the_middle_changes_nothing(tmp_path, two_workers):
     killed = []
 
     def kill():
-        journal = tmp_path / "there.partial" / "journal" / "1-of-1.jsonl"
+        journal = tmp_path / "there.partial/journal/1-of-1.jsonl"
         while not journal.exists() or journal.read_text().count("\n") < 100:
             time.sleep(0.01)
         two_workers.workers[0].send_signal(signal.SIGKILL)

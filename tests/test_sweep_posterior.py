@@ -47,9 +47,9 @@ def test_posterior_is_sampled_with_its_correlation_whatever_the_chunk(folder):
         assert np.array_equal(samples.values(first, count), values[:, first : first + count])
 
 
-def test_posterior_of_another_robot_and_a_folder_without_one_are_refused(folder, tmp_path):
+def test_posterior_of_another_robot_and_a_folder_without_one_are_refused(folder, tmp_path, robot):
     with pytest.raises(InputError, match=r"plan\.toml, samples\.posterior: motor\.resistance is"):
-        plan(folder, params.replace(paper_robots.nominal(), {"motor.resistance": 0.9}))
+        plan(folder, params.replace(robot, {"motor.resistance": 0.9}))
     with pytest.raises(InputError, match=r"no such file; expected the posterior\.nc"):
         plan(tmp_path / "elsewhere")
     with pytest.raises(InputError, match=r"samples\.posterior: got 3; expected a run folder"):

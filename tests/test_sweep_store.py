@@ -103,7 +103,7 @@ def whole(tmp_path_factory):
 # --- what is left -------------------------------------------------------------------------------------------
 
 
-def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
+def test_store_is_opened_by_xarray_with_units_and_long_names(whole, robot):
     found = xr.open_zarr(whole / zarr_store.STORE)
     assert dict(found.sizes) == {"configuration": 2, "slope_deg": 3, "sample": 50}
     assert found["configuration"].values.tolist() == ["6T2A", "4W2T"]
@@ -113,7 +113,7 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
     assert units == {
         "total_current": "A", "motor_speed": "rpm", "speed": "mm/s", "status": None, "configuration": None,
         "slope_deg": "deg", "motor.resistance": "Ohm", "voltage": "V",
-    } | {"motor.resistance": next(p.spec.unit for p in params.walk_parameters(paper_robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
+    } | {"motor.resistance": next(p.spec.unit for p in params.walk_parameters(robot) if p.name == "motor.resistance")}  # fmt: skip
     assert all(found[name].attrs["long_name"] for name in units)
     meanings = dict(zip(found.status.attrs["flag_values"], found.status.attrs["flag_meanings"].split(), strict=True))
     assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
@@ -140,7 +140,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 12)
     small, _, _ = mmrjax(*grid, "--out", "small")
     assert small == 0  # some slide
-    assert (tmp_path / "small" / "runs.csv").exists() and not (tmp_path / "small" / zarr_store.STORE).exists()
+    assert (tmp_path / "small/runs.csv").exists() and not (tmp_path / "small" / zarr_store.STORE).exists()
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 11)
     code, out, said = mmrjax(*grid, "--out", "large")
     assert code == small and out.splitlines()[-1] == "large"
@@ -155,18 +155,18 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     written = arrays(tmp_path / "large")
     assert mmrjax(*grid, "--out", "large", "--export", "csv")[0] == small
     assert arrays(tmp_path / "large") == written
-    same_table(tmp_path / "small" / "runs.csv", tmp_path / "large" / "runs.csv")
+    same_table(tmp_path / "small/runs.csv", tmp_path / "large/runs.csv")
     robots_ = [(tmp_path / name / "robot.toml").read_text().splitlines()[1:] for name in ("small", "large")]
     assert robots_[0] == robots_[1]
 
 
 @pytest.mark.slow
-def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
+def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path, robot):
     grid = ["sweep", "--slopes", "0,5", "--payloads", "0", "--voltages", "24", "--no-report"]
     assert mmrjax(*grid, "--outputs", "slip, flags", "--out", "s")[0] == 0
     found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
     assert set(found.data_vars) == {"slip", "flags", "status"}
-    alone = steady(paper_robots.nominal(), Conditions(0, 24.0, 5.0, 0.0))
+    alone = steady(robot, Conditions(0, 24.0, 5.0, 0.0))
     assert_allclose(found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12)
     ends(mmrjax(*grid, "--outputs", "slipp", "--out", "t"), "outputs: got slipp; did you mean slip")
 
@@ -184,7 +184,7 @@ def test_exports_hold_the_store_row_by_row(sweep, tmp_path, whole):
 
     ends(sweep("s", "--export", "csv", "--export", "parquet"), "runs.parquet", code=0)
     found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
-    one, other = parquet.read_table(tmp_path / "s" / "runs.parquet"), arrow.read_csv(tmp_path / "s" / "runs.csv")
+    one, other = parquet.read_table(tmp_path / "s/runs.parquet"), arrow.read_csv(tmp_path / "s/runs.csv")
     assert one.column_names == other.column_names == [
         "configuration", "slope_deg", "motor.resistance", "supply_voltage_V",
         "total_current_A", "motor_speed_rpm", "speed_mm_s", "status",
@@ -214,7 +214,7 @@ def test_outputs_storage_and_compression_are_as_stated(sweep, tmp_path, whole):
 @pytest.mark.slow
 def test_resolved_configuration_and_robot_repeat_the_sweep(sweep, whole, tmp_path):
     assert sweep("s", config=(whole / "config.resolved.toml").read_text())[0] == 0
-    assert sweep("t", "--robot", tmp_path / "s" / "robot.toml")[0] == 0
+    assert sweep("t", "--robot", tmp_path / "s/robot.toml")[0] == 0
     assert arrays("s") == arrays(whole) == arrays("t")
 
 
@@ -238,7 +238,7 @@ def test_finished_sweep_is_not_simulated_again(sweep, monkeypatch, tmp_path):
     assert sweep("s")[0] == 0
     monkeypatch.setattr(scale, "Compiled", None)
     _, out, _ = ends(sweep("s", "--export", "parquet"), code=0)
-    assert out.splitlines()[-1] == "s" and (tmp_path / "s" / "runs.parquet").is_file()
+    assert out.splitlines()[-1] == "s" and (tmp_path / "s/runs.parquet").is_file()
     ends(
         sweep("s", config=CONFIG.replace("seed = 7", "seed = 8")),
         "s contains another sweep, which differs in configuration (samples.seed was 7, is 8)",
@@ -314,7 +314,7 @@ def test_what_is_half_written_is_not_trusted(sweep, whole, monkeypatch, tmp_path
     heal = stopping(monkeypatch, 30, KeyboardInterrupt())
     assert sweep("s")[0] == 130
     heal()
-    journal = tmp_path / "s.partial" / "journal" / "1-of-1.jsonl"
+    journal = tmp_path / "s.partial/journal/1-of-1.jsonl"
     lines = journal.read_text().splitlines(keepends=True)
     assert len(lines) > 3
     chunk = json.loads(lines[-1][9:])[0]
@@ -322,7 +322,7 @@ def test_what_is_half_written_is_not_trusted(sweep, whole, monkeypatch, tmp_path
     place = xr.open_zarr(tmp_path / "s.partial" / zarr_store.STORE).speed.encoding["chunks"]
     assert place == (1, 1, 25)
     where = "/".join(map(str, np.unravel_index(chunk, (2, 3, 2))))
-    victim = tmp_path / "s.partial" / zarr_store.STORE / "speed" / "c" / where
+    victim = tmp_path / "s.partial" / zarr_store.STORE / "speed/c" / where
     victim.write_bytes(victim.read_bytes()[:11])
     assert sweep("s")[0] == 0
     assert arrays("s") == arrays(whole)
@@ -391,7 +391,7 @@ def test_failing_write_leaves_no_file_behind(tmp_path, monkeypatch):
 def begun(sweep, monkeypatch, tmp_path):
     """A sweep with the robot of a file, stopped in the middle."""
     assert sweep("first", "--chunk", "300")[0] == 0
-    shutil.copy(tmp_path / "first" / "robot.toml", tmp_path / "robot.toml")
+    shutil.copy(tmp_path / "first/robot.toml", tmp_path / "robot.toml")
     heal = stopping(monkeypatch, 30, KeyboardInterrupt())
     assert sweep("s", "--robot", "robot.toml")[0] == 130
     heal()
@@ -493,7 +493,7 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
     assert sweep("s", "--shard", "1/3")[0] == 0
     import fcntl
 
-    with (tmp_path / "s.partial" / "journal" / "2-of-3.jsonl").open("a") as held:
+    with (tmp_path / "s.partial/journal/2-of-3.jsonl").open("a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         code, _, err = sweep("s", "--shard", "2/3")
     assert code == 2 and "another process is using s.partial, share 2 of 3" in err
@@ -543,7 +543,7 @@ def test_store_is_not_abandoned_while_a_share_is_at_work(opened, tmp_path):
     share.begin((2, 3))
     rest.begin()
     rest.abandon()
-    assert (tmp_path / "s.partial" / "identity.json").is_file()
+    assert (tmp_path / "s.partial/identity.json").is_file()
     share.close()
     rest.abandon()
     assert not list(tmp_path.iterdir())
@@ -710,7 +710,7 @@ def test_a_forged_line_of_a_journal_counts_for_nothing(opened, line):
     store = opened()
     store.begin()
     check = f"{zlib.crc32(line.encode()):08x}"
-    (store.partial / "journal" / "0-of-1.jsonl").write_text(f"{check} {line}\n")
+    (store.partial / "journal/0-of-1.jsonl").write_text(f"{check} {line}\n")
     assert not store.done()
     written(store, 0, 1, 2)
     assert len(store.done()) == 3
@@ -745,7 +745,7 @@ def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path
     command = [*MMRJAX, "sweep", "plan.toml", "--chunk", "27", "--out", "s"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert len(read_json(tmp_path / "s" / "manifest.json")["devices"]) == 4
+    assert len(read_json(tmp_path / "s/manifest.json")["devices"]) == 4
     compare(tmp_path / "s", whole)
 
 
@@ -848,26 +848,25 @@ def test_bad_sweeps_end_with_2_and_one_sentence_and_leave_nothing(sweep, tmp_pat
 
 def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
     (tmp_path / "s.partial").mkdir()
-    (tmp_path / "s.partial" / "thesis.txt").write_text("years of work")
+    (tmp_path / "s.partial/thesis.txt").write_text("years of work")
     ends(sweep("s"), "already exists and was not created by mmrjax")
     (tmp_path / "t").mkdir()
-    (tmp_path / "t" / "thesis.txt").write_text("years of work")
+    (tmp_path / "t/thesis.txt").write_text("years of work")
     for force in ([], ["--force"]):
         ends(sweep("t", *force), "t exists already")
-    assert (tmp_path / "s.partial" / "thesis.txt").is_file() and (tmp_path / "t" / "thesis.txt").is_file()
+    assert (tmp_path / "s.partial/thesis.txt").is_file() and (tmp_path / "t/thesis.txt").is_file()
 
 
-def test_layout_counts_its_bytes_without_writing(whole):
+def test_layout_counts_its_bytes_without_writing(whole, robot):
     """Without overhead for large chunks: 9 bytes a point of one output and its status."""
     config = Campaign(axes={"voltage": np.linspace(15, 33, 4_000_000).tolist()}, chunk=10**6, outputs=("speed",))
-    robot = paper_robots.nominal()
     job = prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x")
     assert store_layout(config, job).size == pytest.approx((9 + 8) * 4e6, rel=2e-3)
 
 
 @pytest.mark.slow
 def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
-    page = (ROOT / "docs" / "reference" / "plans.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reference/plans.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     _, out, _ = ends(mmrjax("sweep plan.toml --dry-run --chunk 1000"), code=0)
     assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out

@@ -108,7 +108,7 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     with pytest.raises(KeyboardInterrupt):
         uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
-    kept = len(list((tmp_path / "r.partial" / "chunks").glob("draws-*.stage")))
+    kept = len(list((tmp_path / "r.partial/chunks").glob("draws-*.stage")))
     assert kept <= 2
     computed.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])

@@ -109,8 +109,7 @@ def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
 
 
 @pytest.mark.slow
-def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model():
-    robot = nominal()
+def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model(robot):
     gear = robot.running_gear
     main = belt_loop.BeltLoop(
         robot.radius_pulley, robot.radius_pulley, gear.wheelbase, gear.grouser_height, gear.grouser_length, 24

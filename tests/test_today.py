@@ -79,11 +79,11 @@ DOWNHILL = "simulate --battery --configuration 4W2T --slope -20 --payload 8 --su
 )
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
     _, out, _ = ends(mmrjax(DOWNHILL, *model, "--no-report", "--out", "a"), code=0)
-    (row,) = table(tmp_path / "a" / "runs.csv")
+    (row,) = table(tmp_path / "a/runs.csv")
     assert "overvoltage" in row["flags"].split(";") and float(row["total_current_A"]) < -0.5
     assert float(row["voltage_cell_V"]) == pytest.approx(float(row["voltage_V"]) / 8, rel=1e-6)
     assert float(row["voltage_cell_V"]) > 4.2 and row["supply_voltage_V"] == ""
-    (note,) = read_json(tmp_path / "a" / "result.json")["notes"]
+    (note,) = read_json(tmp_path / "a/result.json")["notes"]
     assert note in " ".join(out.split()) and "A flow into the battery, a cell at 4." in note
     _, out, _ = ends(
         mmrjax(DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b"), code=0
@@ -91,32 +91,32 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
     assert "overvoltage" not in out
 
 
-def test_a_cell_has_no_voltage_on_the_external_supply():
-    found = api.simulate(paper_robots.nominal(), api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
+def test_a_cell_has_no_voltage_on_the_external_supply(robot):
+    found = api.simulate(robot, api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
     assert (np.asarray(found.voltage_cell) > 0).tolist() == [False, True]
     assert np.isnan(found.to_dict()["supply_voltage_V"]).tolist() == [False, True]
 
 
-def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
+def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path, robot):
     blocked = ("--configuration", "4W2T", "--slope", 20, "--payload", 200, "--surface", "concrete")
     ends(mmrjax("simulate", *blocked, "--out", "a"), "none settles", code=0)
-    text = (tmp_path / "a" / "result.json").read_text()
+    text = (tmp_path / "a/result.json").read_text()
     assert "Infinity" not in text and "NaN" not in text
-    (row,) = table(tmp_path / "a" / "runs.csv")
+    (row,) = table(tmp_path / "a/runs.csv")
     said = f"winding, long running: none settles at {float(row['total_current_A']) / 2:.2f} A per motor"
     notes = json.loads(text)["notes"]
     assert notes[1].startswith(said)
     time = float(row["permissible_time_s"])
-    permissible = jax.jit(lambda current: paper_robots.nominal().motor.time_permissible(current))
+    permissible = jax.jit(lambda current: robot.motor.time_permissible(current))
     assert time == pytest.approx(float(permissible(float(row["total_current_A"]) / 2)), rel=1e-4)
     assert notes[0].startswith(f"winding_hot: 125 °C are reached after {time:.3g} s at this current")
     assert row["winding_settled_C"] == "" and "winding_hot" in row["flags"]
-    page = (tmp_path / "a" / "report.html").read_text()
+    page = (tmp_path / "a/report.html").read_text()
     assert "none settles" in page and ">inf" not in page and "nan %" not in page
 
 
-def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance():
-    motor = paper_robots.nominal().motor
+def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance(robot):
+    motor = robot.motor
     assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
 
 
@@ -141,18 +141,18 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     ends(mmrjax("sweep --battery --slopes 0,5 --payloads 0,8 --out a"), code=0)
-    rows = table(tmp_path / "a" / "runs.csv")
+    rows = table(tmp_path / "a/runs.csv")
     assert len(rows) == 2 * 2 * 2 and {row["supply_voltage_V"] for row in rows} == {""}
     assert len({row["total_current_A"] for row in rows}) == len(rows)
-    page = (tmp_path / "a" / "report.html").read_text()
-    assert "nan V" not in page and "6T2A, battery" in (tmp_path / "a" / "figures" / "sweep_speed.svg").read_text()
-    resolved = tmp_path / "a" / "config.resolved.toml"
+    page = (tmp_path / "a/report.html").read_text()
+    assert "nan V" not in page and "6T2A, battery" in (tmp_path / "a/figures/sweep_speed.svg").read_text()
+    resolved = tmp_path / "a/config.resolved.toml"
     assert "voltages_V" not in resolved.read_text()
     assert mmrjax("sweep --config", resolved, "--out", "b")[0] == 0  # what it left can be run again
-    assert table(tmp_path / "b" / "runs.csv") == rows
+    assert table(tmp_path / "b/runs.csv") == rows
     (tmp_path / "runs.csv").write_text("configuration,payload_kg,slope_deg\n6T2A,8,5\n")
     assert mmrjax("simulate --battery --runs runs.csv --out c")[0] == 0
-    (row,) = table(tmp_path / "c" / "runs.csv")
+    (row,) = table(tmp_path / "c/runs.csv")
     assert row["total_current_A"] in {r["total_current_A"] for r in rows}
 
 
@@ -164,7 +164,7 @@ def test_the_command_line_reverses(mmrjax, tmp_path):
         code=0,
     )
     mmrjax("simulate --voltage 15 --out b --no-report")
-    (back,), (forth,) = table(tmp_path / "a" / "runs.csv"), table(tmp_path / "b" / "runs.csv")
+    (back,), (forth,) = table(tmp_path / "a/runs.csv"), table(tmp_path / "b/runs.csv")
     for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s"):
         assert float(back[column]) == pytest.approx(-float(forth[column]), rel=1e-6)
     ends(
@@ -173,8 +173,8 @@ def test_the_command_line_reverses(mmrjax, tmp_path):
         ),
         code=0,
     )
-    assert read_json(tmp_path / "c" / "result.json")["statuses"]["reverses"] == 4
-    assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
+    assert read_json(tmp_path / "c/result.json")["statuses"]["reverses"] == 4
+    assert "-33 V" in (tmp_path / "c/report.html").read_text()
     ends(
         mmrjax("simulate --voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
         "No operating point: gravity drives the robot",
@@ -203,7 +203,7 @@ def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
     (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
     _, out, _ = ends(mmrjax("compare mine.csv --no-report --out a"), code=0)
     assert "did not converge" not in out
-    rows = table(tmp_path / "a" / "comparison.csv")
+    rows = table(tmp_path / "a/comparison.csv")
     # An error is simulated less measured, with its sign, over the size of the channel.
     forth, back = (float(row["error_total_current_percent"]) for row in rows)
     assert forth == pytest.approx(-back) and abs(forth) < 1
@@ -217,18 +217,18 @@ def climb():
 
 
 @pytest.mark.slow
-def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
+def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path, robot):
     _, found = climb
-    fine = drive_batch(paper_robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
+    fine = drive_batch(robot, api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
     _, out, _ = ends(mmrjax("simulate --model drive --slope", 10, "--no-report", "--out", "a"), code=0)
     assert re.search(rf"peak current, all motors \[A\] +{peak:.1f}", out)
-    (row,) = table(tmp_path / "a" / "runs.csv")
+    (row,) = table(tmp_path / "a/runs.csv")
     assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
-    kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
+    kept = [float(r["total_current_A"]) for r in table(tmp_path / "a/history.csv")]
     assert 0.999 * float(row[PEAK]) < max(kept) < float(row[PEAK])
-    assert read_json(tmp_path / "a" / "result.json")[PEAK] == pytest.approx(float(row[PEAK]))
+    assert read_json(tmp_path / "a/result.json")[PEAK] == pytest.approx(float(row[PEAK]))
 
 
 @pytest.mark.slow
@@ -251,18 +251,18 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
 def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     asked = "simulate --battery --model drive --discharge 2190 --duration"
     _, out, _ = ends(mmrjax(asked, "60", "--out", "a"), code=0)
-    (row,) = table(tmp_path / "a" / "runs.csv")
+    (row,) = table(tmp_path / "a/runs.csv")
     assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
     when, far = float(row["time_end_s"]), float(row["displacement_m"])
     assert f"after {when:.1f} s and {far:.2f} m" in out and re.search(rf"displacement.* \[m\] +{far:.2f}\n", out)
     # The same run, ended just before and just after: where the charge runs out does not depend on the samples.
     assert mmrjax(asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
     assert mmrjax(asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 0
-    (before,) = table(tmp_path / "b" / "runs.csv")
+    (before,) = table(tmp_path / "b/runs.csv")
     assert float(before["displacement_m"]) == pytest.approx(far, abs=0.01)
     charge = 3.6 * 10 - np.trapezoid(
-        [float(r["total_current_A"]) + 1.5 for r in table(tmp_path / "b" / "history.csv")],
-        [float(r["time_s"]) for r in table(tmp_path / "b" / "history.csv")],
+        [float(r["total_current_A"]) + 1.5 for r in table(tmp_path / "b/history.csv")],
+        [float(r["time_s"]) for r in table(tmp_path / "b/history.csv")],
     )
     assert charge == pytest.approx(0.01 * (float(row["total_current_A"]) + 1.5), abs=0.05)
     ends(
@@ -273,8 +273,8 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_may_last_a_day(mmrjax):
-    found = api.simulate(paper_robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
+def test_a_run_may_last_a_day(mmrjax, robot):
+    found = api.simulate(robot, api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
     ends(mmrjax("simulate --model drive --duration 86401"), "86400")
     ends(
@@ -283,9 +283,9 @@ def test_a_run_may_last_a_day(mmrjax):
     )
 
 
-def test_remarks_name_the_run_they_are_of():
-    found = api.simulate(paper_robots.nominal(), api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
-    shown = run_remarks(paper_robots.nominal(), found.to_dict())
+def test_remarks_name_the_run_they_are_of(robot):
+    found = api.simulate(robot, api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
+    shown = run_remarks(robot, found.to_dict())
     assert len(shown) == 2 and shown[0].startswith("run 2: winding_hot: 125 °C are reached after ")
     assert shown[1].startswith("run 2: winding, long running: none settles")
 
@@ -296,8 +296,8 @@ RATED = (
 )
 
 
-def test_rated_limits_and_switches_are_read_and_written(tmp_path):
-    nominal = paper_robots.nominal()
+def test_rated_limits_and_switches_are_read_and_written(tmp_path, robot):
+    nominal = robot
     assert nominal.gearbox.torque_limit == pytest.approx(3.0 * 25 / 12)
     robot = read_rig(tmp_path, RATED, "mine.toml")
     assert (robot.gearbox.torque_limit, robot.gearbox.mesh_theory, robot.driver.returns_current) == (4.5, True, False)
@@ -327,21 +327,20 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
         ({"battery.current_charge": True}, "battery.current_charge: got True; expected a number"),
     ],
 )
-def test_bad_limits_and_switches_are_refused(values, sentence):
+def test_bad_limits_and_switches_are_refused(values, sentence, robot):
     with pytest.raises(BadConfiguration, match=sentence):
-        robot_file.change_robot(paper_robots.nominal(), values, where="mine.toml")
+        robot_file.change_robot(robot, values, where="mine.toml")
 
 
 @pytest.mark.slow
 def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
     ends(mmrjax("simulate --set gearbox.mesh_theory=true --no-report --out a"), code=0)
-    assert "mesh_theory = true" in (tmp_path / "a" / "robot.toml").read_text()
-    assert '"gearbox.mesh_theory" = true' in (tmp_path / "a" / "config.resolved.toml").read_text()
+    assert "mesh_theory = true" in (tmp_path / "a/robot.toml").read_text()
+    assert '"gearbox.mesh_theory" = true' in (tmp_path / "a/config.resolved.toml").read_text()
     ends(mmrjax("simulate --set gearbox.mesh_theory=2 --out b"), "expected true or false")
 
 
-def test_rated_limits_stand_in_the_report():
-    robot = paper_robots.nominal()
+def test_rated_limits_stand_in_the_report(robot):
     found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
     run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
     shown = {line["words"]: line for line in runs_report.limits_used(robot, run)}

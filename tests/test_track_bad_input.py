@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.fidelities.track import _simulate_batch, track_batch
@@ -69,7 +70,7 @@ def test_small_v_s_is_neither_refused_nor_wrong(robot, speed_static):
     runs = Conditions(voltage=[15.0, 33.0], slope_deg=[5.0, 10.0])
     assert largest_step(small, runs).min() > 1e-4
     slip = [np.asarray(_simulate_batch(small, runs, 0.5, step, 1e-3, True).result.slip) for step in (1e-4, 1e-5)]
-    np.testing.assert_allclose(slip[0], slip[1], atol=5e-4)
+    assert_allclose(slip[0], slip[1], atol=5e-4)
 
 
 @pytest.mark.parametrize("name", ["lever_front", "lever_rear"])

@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mmrjax.fidelities.track import track
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, GRAVITY
 from mmrjax.undercarriage import half_robot
@@ -110,8 +110,7 @@ def test_reverse_derivatives_are_forward_ones(averages, commands, at, forward):
 
 
 @pytest.mark.slow
-def test_robot_at_rest_is_borne_with_exact_derivatives():
-    robot = paper_robots.nominal()
+def test_robot_at_rest_is_borne_with_exact_derivatives(robot):
 
     def borne(payload, slope_deg, configuration):
         conditions = Conditions(configuration, voltage=24.0, slope_deg=slope_deg, payload=payload)

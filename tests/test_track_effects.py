@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from mmrjax.effects import ALL
 from mmrjax.fidelities.steady import steady
@@ -66,7 +67,7 @@ def test_effect_acts_as_in_the_steady_model(slopes, k):
     assert np.isfinite(ours).all()
     assert np.abs(ours).max() > 0
     scale = np.maximum(np.abs(theirs).max(axis=0), 5e-3 * np.abs(slopes[1]).max(axis=(0, 2)))
-    np.testing.assert_allclose(ours / scale, theirs / scale, atol=0.05)
+    assert_allclose(ours / scale, theirs / scale, atol=0.05)
 
 
 @pytest.fixture(scope="module")

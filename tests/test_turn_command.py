@@ -1,7 +1,6 @@
 """The command `simulate` of a robot whose sides are driven apart."""
 
 import dataclasses
-import json
 import types
 
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
 from sweeps.report import check_report, run_tables, turn_report
 from sweeps.report.words import turn_words
-from tests.commands import ends, rows, text_file
+from tests.commands import ends, read_json, rows, text_file
 
 
 @pytest.mark.slow
@@ -38,7 +37,7 @@ def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
     assert "Turns to the right: a circle of 442 mm radius at 642 mm/s ahead" in out
     folder = tmp_path / "run"
     (row,) = rows(folder / "runs.csv")
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     assert result["turn"]["turning_radius_mm"] == pytest.approx(float(row["turning_radius_mm"]))
     left, right = (float(row[f"motor_voltage_{side}_V"]) for side in ("left", "right"))
     assert (left, right) == (pytest.approx(33.0), pytest.approx(15.0))
@@ -54,11 +53,11 @@ def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
 def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
     told = "--left", "24", "--right", "10", "--model", "track", "--duration", "0.2", "--no-report"
     assert mmrjax("simulate", *told, "--out", str(tmp_path / "run"))[0] == 0
-    first, *_, last = rows(tmp_path / "run" / "history.csv")
+    first, *_, last = rows(tmp_path / "run/history.csv")
     assert float(last["yaw_deg"]) < -0.2 < float(first["yaw_deg"]) < 0
     assert float(last["motor_current_left_A"]) > float(last["motor_current_right_A"]) > 0.5
     assert float(last["x_mm"]) > 20
-    (row,) = rows(tmp_path / "run" / "runs.csv")
+    (row,) = rows(tmp_path / "run/runs.csv")
     assert 0.95 < float(row["guide_share"]) < 1
 
 
@@ -66,12 +65,12 @@ def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
 def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
     told = "--speed", "0.3", "--yaw-rate", "1", "--voltage", "24", "--no-report"
     assert mmrjax("simulate", *told, "--out", str(tmp_path / "asked"))[0] == 0
-    (asked,) = rows(tmp_path / "asked" / "runs.csv")
+    (asked,) = rows(tmp_path / "asked/runs.csv")
     assert float(asked["speed_mm_s"]) == pytest.approx(300.0, rel=1e-6)
     assert float(asked["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
     sides = [word for side in ("left", "right") for word in (f"--{side}", asked[f"motor_voltage_{side}_V"])]
     assert mmrjax("simulate", *sides, "--no-report", "--out", str(tmp_path / "driven"))[0] == 0
-    (driven,) = rows(tmp_path / "driven" / "runs.csv")
+    (driven,) = rows(tmp_path / "driven/runs.csv")
     assert float(driven["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
     code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
     assert code == 2
@@ -196,11 +195,11 @@ def row(**changes):
     return usual | sides | changes
 
 
-def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves():
+def test_radius_is_that_of_the_circle_on_which_the_centre_of_mass_moves(robot):
     """Beside a braked side it moves aside by a third of how it moves ahead, so its circle is the larger one."""
     reading = {"yaw_rate": [-2.0, 2.0, 0.0], "speed": [0.3, -0.3, 0.3], "lateral_speed": [0.1, 0.1, 0.0]}
     reading |= {f"motor_{what}_{side}": np.ones(3) for what in ("speed", "current", "voltage") for side in SIDES}
-    found = derived.turning_columns(paper_robots.nominal(), reading, np.full(3, 0.04))
+    found = derived.turning_columns(robot, reading, np.full(3, 0.04))
     size = 1000 * np.hypot(0.3, 0.1) / 2
     assert_allclose(found["turning_radius_mm"], [-size, -size, np.inf], rtol=1e-12)
     away = np.hypot(found["centre_x_mm"][:2], found["centre_y_mm"][:2])
@@ -270,9 +269,9 @@ def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
         )
 
 
-def test_one_imposed_speed_of_two_sides_is_refused():
+def test_one_imposed_speed_of_two_sides_is_refused(robot):
     with pytest.raises(mm.UsageError, match="motor_speed_left needs motor_speed_right too; give both"):
-        mm.simulate(paper_robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
+        mm.simulate(robot, mm.Conditions("6T2A", motor_speed_left=800.0))
 
 
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
@@ -308,8 +307,7 @@ def told(robot, name, ended=None):
     yield from (" | ".join(map(str, side)) for side in turn_report.sides_table(robot, turn).rows)
 
 
-def test_turns_are_told_as_recorded():
-    robot = paper_robots.nominal()
+def test_turns_are_told_as_recorded(robot):
     wide = params.replace(robot, {"6T2A.turning.width": 0.5})
     unknown = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=HEAT[-1:]))
     lines = [line for name in TOLD for line in told(robot, name)]
@@ -328,8 +326,7 @@ def test_turns_are_told_as_recorded():
 PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axes]\nduty_left = [-1, 1]\n'
 
 
-def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before():
-    robot = paper_robots.nominal()
+def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before(robot):
     assert showing_turns(robot, {"voltage", "slope_deg"}) is robot
     shown = showing_turns(robot, {"voltage", "duty_left"}).channels
     assert {"yaw_rate", "motor_current_left", "speed"} <= {c.name for c in shown}
@@ -340,7 +337,7 @@ def test_a_sweep_over_duties_leaves_yaw_rates(tmp_path, mmrjax):
     (tmp_path / "plan.toml").write_text(PLAN)
     told = "sweep", str(tmp_path / "plan.toml"), "--export", "csv", "--no-report", "--out", str(tmp_path / "run")
     assert mmrjax(*told)[0] == 0
-    spot, straight = rows(tmp_path / "run" / "runs.csv")
+    spot, straight = rows(tmp_path / "run/runs.csv")
     assert float(spot["yaw_rate_rad_s"]) > 3 and float(spot["speed_mm_s"]) == pytest.approx(0.0, abs=1e-6)
     assert float(straight["yaw_rate_rad_s"]) == pytest.approx(0.0, abs=1e-9)
 
@@ -359,7 +356,7 @@ def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings
         f"{HEADER}total_mass_kg,{SIDED},total_current_A,{','.join(read)}\n6T2A,24,0,0,25,0.6,1,2.3,0.4,1.9,0.7\n"
     )
     assert mmrjax("compare", path, "--out", tmp_path / "out")[0] == 0
-    found = (tmp_path / "out" / "comparison.csv").read_text().splitlines()
+    found = (tmp_path / "out/comparison.csv").read_text().splitlines()
     row = dict(zip(*(line.split(",") for line in found), strict=True))
     assert [float(row[name]) for name in read] == [0.4, 1.9, 0.7]
     left, right, yaw_rate = (float(row[f"simulated_{name}"]) for name in read)
@@ -367,12 +364,12 @@ def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings
     assert (row["duty_left"], row["duty_right"]) == ("0.6", "1")
 
 
-def test_simulate_in_python_refuses_turns_as_the_command_line_does():
-    alone = dataclasses.replace(mm.nominal(), sides=jnp.asarray(1.0))
+def test_simulate_in_python_refuses_turns_as_the_command_line_does(robot):
+    alone = dataclasses.replace(robot, sides=jnp.asarray(1.0))
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
     with pytest.raises(UsageError, match="duty cannot be combined with duty_left and duty_right"):
-        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
+        mm.simulate(robot, mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
 
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
@@ -407,8 +404,8 @@ def test_profiles_in_python_are_refused_before_they_are_followed(robot, told, sa
         mm.simulate(robot, mm.Conditions("6T2A"), **told)
 
 
-def test_tables_have_no_negative_zero():
-    straight = mm.simulate(mm.nominal(), mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
+def test_tables_have_no_negative_zero(robot):
+    straight = mm.simulate(robot, mm.Conditions("6T2A", voltage=24, slope_deg=-1e-6))
     assert "-0" not in straight.table() and "0.00" in straight.table()
     table = {"slope_deg": np.array([-0.0]), "speed_mm_s": np.array([-0.01])}
     shown = run_tables.quantity_table("runs", table, table)

@@ -48,9 +48,9 @@ def amplitudes(**some):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", effects.OF_TURNS)
-def test_effect_moves_the_turn_and_mirrors(name):
+def test_effect_moves_the_turn_and_mirrors(name, robot):
     y = flat(MOTION)
-    plain = circling.turning_rates(paper_robots.nominal(), RUN, y)
+    plain = circling.turning_rates(robot, RUN, y)
     assert_allclose(rates(amplitudes(), RUN, y), plain, rtol=1e-12, atol=1e-12)
     size = amplitude(name)
     moved = np.asarray(rates(amplitudes(**{name: size}), RUN, y))
@@ -109,8 +109,7 @@ def test_energy_is_kept_and_resistance_to_turning_takes_it():
     assert float(sinks["sliding"] - plain["sliding"]) == pytest.approx(taken, rel=1e-6)
 
 
-def test_straight_travel_shows_none_of_them():
-    robot = paper_robots.nominal()
+def test_straight_travel_shows_none_of_them(robot):
     run = mm.Conditions("6T2A", slope_deg=3.0).resolved(robot)
     state = State(*(jnp.asarray(x) for x in (2.0, 900.0, 0.7, 0.0)))
     plain = balances.settled_signals(robot, run, state, 1.0)[0]

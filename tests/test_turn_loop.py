@@ -1,7 +1,6 @@
 """The loop on tables of settled turns: what effects and defects of each side do to the readings, and what is found."""
 
 import dataclasses
-import json
 
 import equinox as eqx
 import jax
@@ -19,7 +18,7 @@ from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
 from mmrjax.effects.curve import ordinate_weights
 from mmrjax.model import params
-from tests.commands import ends
+from tests.commands import ends, read_json
 
 pytestmark = pytest.mark.slow
 
@@ -134,7 +133,7 @@ def test_command_finds_what_a_second_implementation_planted(tmp_path, mmrjax, ca
     table, robot = planted.write(tmp_path, case)
     told = ("--robot", str(robot), "--noise", planted.NOISE, "--replicates", "250")
     _, out, _ = ends(mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run")), code=0)
-    found = json.loads((tmp_path / "run" / "result.json").read_text())
+    found = read_json(tmp_path / "run/result.json")
     if FOUND[case] is None:
         assert found["verdict"] == "none" and "nothing" in out.lower()
         return

@@ -109,14 +109,14 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
     assert [c.name for c in records.read_runs(path, robot=robot).channels] == ["yaw_rate"]
 
 
-def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, capsys, monkeypatch):
+def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, capsys, monkeypatch, robot):
     path, reads = tmp_path / "turns.csv", []
     read = records.read_runs
     monkeypatch.setattr(records, "read_runs", lambda *told, **how: reads.append(told) or read(*told, **how))
     header = "configuration,voltage_left_V,voltage_right_V,total_mass_kg,payload_kg,slope_deg"
     runs = read_runs(
         text_file(path, f"{header},yaw_rate_rad_s,motor_current_left_A\n" + "6T2A,24,12,13.1,0,0,-1.1,2\n" * 2),
-        mm.nominal(),
+        robot,
         measured=True,
         of_turns=True,
     )
@@ -130,7 +130,7 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
             f"{header.replace('voltage_left_V,voltage_right_V', 'supply_voltage_V')},yaw_rate_rad_s,speed_mm_s"
             "\n6T2A,24,13.1,0,0,0,700\n",
         ),
-        mm.nominal(),
+        robot,
         measured=True,
         of_turns=True,
     ).unknown == ("yaw_rate_rad_s",)
@@ -201,13 +201,13 @@ def test_a_supply_of_either_sign_drives_the_sides(rig, table):
         table(header, *[(24, *row[1:]) for row in rows], robot=robot)
 
 
-def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_path):
+def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_path, robot):
     path = tmp_path / "turns.csv"
     header = "configuration,total_mass_kg,payload_kg,slope_deg,voltage_left_mV,voltage_right_mV"
     runs = records.read_runs(
         text_file(path, f"{header}\n6T2A,13.1,0,0,6000,24000\n6T2A,13.1,0,0,-12000,12000\n"), measured=False
     )
-    conditions = runs.conditions(mm.nominal())
+    conditions = runs.conditions(robot)
     assert_allclose(conditions.voltage, [24.0, 12.0])
     assert_allclose(conditions.duty_left, [0.25, -1.0])
     with pytest.raises(BadData, match=r"voltage_left_V together with --battery, .* give duty_left and duty_right"):

@@ -49,7 +49,7 @@ def turns(robot):
 def test_turns_are_found_past_kinks_of_friction_and_gears():
     """Of robots whose open side is dragged slowly: rates grow on the way to where the run settles. Drawn from 2000
     random ones, 37 of which were `not_settled`."""
-    path = Path(__file__).parent / "data" / "turns_where_friction_turns_round.csv"
+    path = Path(__file__).parent / "data/turns_where_friction_turns_round.csv"
     table = np.genfromtxt(path, delimiter=",", names=True, deletechars="", dtype=float)
     conditions = ("configuration", "voltage", "payload", "adhesion", "open_left", "duty_left", "duty_right")
     values = {n: jnp.asarray(table[n]) for n in table.dtype.names if n not in conditions}

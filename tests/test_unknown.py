@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.data import rig_facts, robot_file
@@ -95,7 +96,7 @@ def test_no_number_rests_on_what_is_unknown(tmp_path, case):
         options = {"model": "drive", "profile": profile(times, demand=demand)}
     runs = [mm.simulate(r, mm.Conditions(**conditions), **options) for r in (robot, elsewhere(robot))]
     for one, other in zip(*(jax.tree.leaves((r.result, r.history, r.mission)) for r in runs), strict=True):
-        np.testing.assert_allclose(np.asarray(one), np.asarray(other), rtol=1e-9, atol=1e-12)
+        assert_allclose(one, other, rtol=1e-9, atol=1e-12)
     assert np.isfinite(runs[0].power_gear).all()
     if not more:
         assert np.isnan(runs[0].power_supply).all() and np.isnan(runs[0].voltage).all()
@@ -162,11 +163,11 @@ def test_a_study_of_what_is_unknown_is_refused(tmp_path):
 def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     read(tmp_path, BENCH, "motor_speed")
     _, out, _ = ends(mmrjax("simulate --robot rig.toml --motor-speed 3000 --out run"), code=0)
-    (head, _) = (tmp_path / "run" / "runs.csv").read_text(encoding="utf-8").splitlines()
+    (head, _) = (tmp_path / "run/runs.csv").read_text(encoding="utf-8").splitlines()
     columns = {"voltage_V", "power_supply_W", "efficiency_motor", "winding_settled_C", "permissible_time_s"}
     assert columns.isdisjoint(head.split(",")) and "power_motor_W" in head
     assert "not known, as the robot's file does not state motor.resistance, " in " ".join(out.split())
-    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "run/report.html").read_text(encoding="utf-8")
     assert "Not known, as the robot&#39;s file does not state motor.resistance, " in page
 
 

@@ -4,8 +4,8 @@ import dataclasses
 import types
 import warnings
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.data import effect_file
@@ -13,7 +13,6 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import effects
 from mmrjax.derived import turning_figures
 from mmrjax.effects.base import THE_SIDE
-from mmrjax.model import paper_robots
 from sweeps import config, inputs
 from sweeps.pages import page
 from sweeps.report import page_renderer
@@ -42,8 +41,7 @@ def of_file(tmp_path, text, **options):
     return inputs.load_robot(config.RobotPart(robot=str(path), **options))
 
 
-def test_effects_of_the_side_make_sides_unlike():
-    robot = paper_robots.nominal()
+def test_effects_of_the_side_make_sides_unlike(robot):
     assert robot.unlike == with_amplitudes(robot, dict.fromkeys(OF_SIDES, 0.0)).unlike == ()
     assert with_amplitudes(robot, {name: amplitude(name) for name in effects.OF_TURNS}).unlike == OF_SIDES
     curve = effects.CURVES_ROUND["curve_track_side"](amplitude=0.1)
@@ -53,13 +51,13 @@ def test_effects_of_the_side_make_sides_unlike():
 
 
 @pytest.mark.parametrize("conditions", [{}, {"duty": -0.5}])
-def test_straight_travel_of_unlike_sides_is_said_to_be_that(conditions):
-    unlike = with_amplitudes(paper_robots.nominal(), {"side_friction": 0.001})
+def test_straight_travel_of_unlike_sides_is_said_to_be_that(conditions, robot):
+    unlike = with_amplitudes(robot, {"side_friction": 0.001})
     with pytest.warns(UserWarning, match=r"^side_friction: the robot's sides differ, .* duty_left=1, duty_right=1"):
         mm.simulate(unlike, mm.Conditions(**conditions))
     with warnings.catch_warnings():  # which are errors
         mm.simulate(unlike, mm.Conditions(duty_left=1.0, duty_right=1.0))  # computed when it is asked for
-        mm.simulate(with_amplitudes(paper_robots.nominal(), {"side_friction": 0.0}), mm.Conditions(**conditions))
+        mm.simulate(with_amplitudes(robot, {"side_friction": 0.0}), mm.Conditions(**conditions))
 
 
 SIDE_RADIUS = 'base = "nominal"\n[effects.side_radius]\namplitude = 0.01\nconfigurations = ["4W2T"]\n'
@@ -96,7 +94,7 @@ def test_unlike_sides_turn_as_those_that_are_driven_alike(tmp_path):
     file = of_file(tmp_path, SIDE_RADIUS)
     asked = mm.Conditions(["6T2A", "4W2T"], voltage=33.0, duty_left=1.0, duty_right=1.0)
     rates = mm.simulate(file.robot, asked).reading["yaw_rate"]
-    np.testing.assert_allclose(
+    assert_allclose(
         turning_figures.turns_under_equal_commands(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12
     )
     assert abs(rates[0]) < 1e-9 and rates[1] > 0.01  # the left side's radius is the smaller

@@ -124,7 +124,7 @@ def test_a_propeller_has_a_load_with_the_square_of_speed_and_a_law_of_the_driver
     monkeypatch.chdir(tmp_path)
     stand_of_a_long_table(tmp_path)
     assert command(["loop", "runs.csv", "--robot", "rig.toml", "--out", "found"]) == 0
-    found = read_json(tmp_path / "found" / "result.json")
+    found = read_json(tmp_path / "found/result.json")
     amplitudes = {e["name"]: e["parameters"]["amplitude"] for e in found["effects"]}
     load, driver = amplitudes["churning"], amplitudes["duty_exponent"]  # ΔM = a ω², voltage as duty ** (1 + a)
     assert abs(load["value"] - 1.1e-7) < 3 * load["sd"] < 2e-8

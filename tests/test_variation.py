@@ -39,12 +39,12 @@ def test_point_is_the_robot_and_conditions_that_its_values_state(variation):
     assert (float(conditions.slope_deg), float(conditions.voltage), float(conditions.payload)) == (5.0, 33.0, 3.0)
 
 
-def test_configuration_is_an_index_and_total_mass_may_be_none_before():
-    variation = Variation(paper_robots.nominal(), ("configuration", "total_mass"))
+def test_configuration_is_an_index_and_total_mass_may_be_none_before(robot):
+    variation = Variation(robot, ("configuration", "total_mass"))
     _, conditions = variation.at(jnp.array([1.0, 12.5]), Conditions())
     assert int(conditions.configuration) == 1 and jnp.issubdtype(conditions.configuration.dtype, jnp.integer)
     assert float(conditions.total_mass) == 12.5
-    assert Variation(paper_robots.nominal(), ("total_mass",)).axes["total_mass"].value is None
+    assert Variation(robot, ("total_mass",)).axes["total_mass"].value is None
 
 
 @pytest.mark.slow
@@ -85,14 +85,13 @@ def test_axes_know_unit_bounds_prior_and_meaning(variation):
     assert slope.spec is None and slope.prior_sd is None and slope.bounds == quantities.CONDITIONS["slope_deg"].range
 
 
-def test_every_condition_has_words_and_limits():
+def test_every_condition_has_words_and_limits(robot):
     fields = {f.name for f in dataclasses.fields(Conditions)} - {"begin"}  # which of the beginnings is a run's
     assert set(CONDITIONS) == fields == {*quantities.CONDITIONS, "configuration"}
-    assert all(axis.meaning for axis in Variation(paper_robots.nominal(), tuple(CONDITIONS)).axes.values())
+    assert all(axis.meaning for axis in Variation(robot, tuple(CONDITIONS)).axes.values())
 
 
-def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
-    robot = paper_robots.nominal()
+def test_unknown_and_repeated_names_are_refused_with_those_that_are_near(robot):
     with pytest.raises(
         UsageError, match=r"motor\.resistanse: .*did you mean motor\.resistance.*allowed: .*slope_deg"
     ):

@@ -176,10 +176,10 @@ def test_constant_values_at_every_instant_are_those_of_a_constant_run():
 
 
 @pytest.mark.slow
-def test_runs_are_those_of_missions(simulated):
+def test_runs_are_those_of_missions(simulated, robot):
     """Of an engine with steps, events and friction at rest of its own. Its noise is all that remains."""
-    runs, observer = simulated, Histories.of(simulated, paper_robots.nominal())
-    truth = params.replace(paper_robots.nominal(), {k: jnp.asarray(v) for k, v in TRUTH.items()})
+    runs, observer = simulated, Histories.of(simulated, robot)
+    truth = params.replace(robot, {k: jnp.asarray(v) for k, v in TRUTH.items()})
     seen = np.asarray(eqx.filter_jit(observer)(truth).reading)
     sigma = (seen - runs.measured()) / runs.deviations()
     assert np.sum(sigma**2) < sigma.size + 4 * np.sqrt(2 * sigma.size)
@@ -303,16 +303,16 @@ def test_ends_are_those_of_stretches_driven_forwards(runs):
     assert np.isfinite(ends.mean).any(1).sum() >= 4
 
 
-def test_reach_takes_what_the_motors_were_given(observer):
+def test_reach_takes_what_the_motors_were_given(observer, robot):
     driven = observer.driven
     assert driven.shape[0] > 4 and (np.asarray(driven.voltage) > 0).all() and (np.asarray(driven.duty) == 1).all()
-    found = reach_of_table(paper_robots.nominal(), driven, ("speed",))
+    found = reach_of_table(robot, driven, ("speed",))
     assert found.voltages == (12.0, 15.0, 18.0, 24.0, 33.0) and found.used[0].slopes == (-4.0, -3.0, 0.0, 3.0, 4.0)
 
 
-def test_conditions_that_change_between_many_levels_are_few(observer, runs):
+def test_conditions_that_change_between_many_levels_are_few(observer, runs, robot):
     noisy = changed(runs, supply_voltage_V=runs["supply_voltage_V"] + 0.001 * np.arange(len(runs)))
-    varying = Histories.of(noisy, paper_robots.nominal())
+    varying = Histories.of(noisy, robot)
     assert len(np.unique(varying.driven.voltage)) <= 6
     assert varying.times.shape[1] < 1.5 * observer.times.shape[1]  # changes of a thousandth need no short steps
 
@@ -345,11 +345,11 @@ def written(tmp_path, header, *rows):
     return path
 
 
-def test_columns_of_the_driver_are_read(tmp_path):
+def test_columns_of_the_driver_are_read(tmp_path, robot):
     rows = ("a,0,6T2A,24,0,0,0,11,0.5,voltage", "a,1,6T2A,-12,0,0,5,11,-1,voltage", "a,2,6T2A,0,0,0,5,11,,brake",
             "a,3,6T2A,24,0,0,5,11,,coast")  # fmt: skip
     read = records.read_runs(written(tmp_path, f"{HEADER},duty,mode", *rows))
-    found = read.conditions(paper_robots.nominal())
+    found = read.conditions(robot)
     assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, -1, 1]
     assert found.voltage.tolist() == [24, -12, 0, 24] and applied_drive(read).tolist() == [12, 12, 0, 0]
     assert set(DRIVEN) <= set(MODES)
@@ -403,14 +403,11 @@ def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
 
 
 @pytest.mark.slow
-def test_payload_that_changes_acts_from_its_sample_on(runs):
+def test_payload_that_changes_acts_from_its_sample_on(runs, robot):
     payload = runs["payload_kg"] + 6.0 * (runs["time_s"] >= 1.25)
-    heavier = Histories.of(changed(runs, payload_kg=payload), paper_robots.nominal())
+    heavier = Histories.of(changed(runs, payload_kg=payload), robot)
     assert heavier.conditions.payload.shape == heavier.times.shape
-    seen, before = (
-        np.asarray(eqx.filter_jit(o)(paper_robots.nominal()).reading[:, 0])
-        for o in (heavier, Histories.of(runs, paper_robots.nominal()))
-    )
+    seen, before = (np.asarray(eqx.filter_jit(o)(robot).reading[:, 0]) for o in (heavier, Histories.of(runs, robot)))
     early = runs["time_s"] <= 1.25
     assert_allclose(seen[early], before[early], rtol=1e-9, atol=1e-12)
     assert np.abs(seen - before)[runs["time_s"] > 1.4].max() > 0.1  # [A]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import vibration
+from numpy.testing import assert_allclose
 
 from calibration.data.runs import Runs
 from calibration.discovery.discover import discover
@@ -33,7 +34,7 @@ def fig7(speed):
 @pytest.mark.parametrize(
     "place", ["docs/explanation/vibration.md", "docs/reference/effects.md", "mmrjax/effects/slip_effects.py"]
 )
-def test_the_equation_that_is_written_is_the_one_that_runs(place):
+def test_the_equation_that_is_written_is_the_one_that_runs(place, robot):
     """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""
     text = (ROOT / place).read_text("utf-8")
     (said,) = set(re.findall(r"ΔV = a (√.*?0\.05²\))", text))
@@ -44,10 +45,8 @@ def test_the_equation_that_is_written_is_the_one_that_runs(place):
     known = {"u": used, "p": exponent, "V_teor": speed, "V_1": first, "sqrt": np.sqrt, "abs": np.abs}
     expected = 0.03 * eval(said, {"__builtins__": {}}, known)
     effect = VibrationSlip(amplitude=0.03, exponent=exponent, speed_reference=first)
-    got = effect.term(
-        paper_robots.nominal(), Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed)
-    )
-    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    got = effect.term(robot, Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed))
+    assert_allclose(got, expected, rtol=1e-12)
     assert expected[6] / (0.03 * (speed / first) ** exponent * 19) < 0.72  # rounded off
 
 

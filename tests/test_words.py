@@ -240,7 +240,7 @@ SAMPLES = [
 ]
 
 
-RECORD = ROOT / "tests" / "record" / "pages" / "notes.txt"
+RECORD = ROOT / "tests/record/pages/notes.txt"
 
 
 def as_text():
@@ -318,13 +318,13 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
 
 
 def test_every_reason_and_every_doubt_has_its_words():
-    text = (ROOT / "calibration" / "discovery" / "standing.py").read_text(encoding="utf-8")
+    text = (ROOT / "calibration/discovery/standing.py").read_text(encoding="utf-8")
     assert all(f'"{why}"' in text for why in loop_words.REASONS if why)
     whys = {a.value for c in ast.walk(ast.parse(text)) if isinstance(c, ast.Call) for a in c.args[1:2]
             if ast.unparse(c.func) == "NameSupport" and isinstance(a, ast.Constant)}  # fmt: skip
     assert whys <= set(loop_words.REASONS)
     worst = NameTest("a", 0.0, 3.0, (), -99.0, 1, 0.0, 0.0, ("b",), True, varies=4.0, over="speed", offset=0.01)
-    schema = (ROOT / "docs" / "schemas" / "loop.schema.json").read_text(encoding="utf-8")
+    schema = (ROOT / "docs/schemas/loop.schema.json").read_text(encoding="utf-8")
     assert all(f'"{doubt}"' in schema for doubt in loop_words.DOUBTS)
     rests = dataclasses.replace(worst, root=4.0)  # below chance with all its rows it rests on none
     assert {*worst.fails, *rests.fails} == set(loop_words.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails

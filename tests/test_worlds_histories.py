@@ -199,7 +199,7 @@ def test_starts_of_the_papers_robot_pass_the_input_checks_and_are_reproducible(t
 
 
 @pytest.mark.slow
-def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
+def test_table_of_histories_passes_the_input_checks(quick, tmp_path, robot):
     for variety, stratum in ((1, "faults"), (2, "faults"), (2, "robots")):
         w = brief(world(stratum, variety, seed=4))
         made = histories.case(w, seed=1)
@@ -208,7 +208,7 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         kind = observers.observer_kind(runs)
         known = noise.noise_from_table(runs, kind.sizes(runs))
         assert runs.has("time_s") and len(runs) == made.label["rows"]
-        assert kind.check(runs, known) == kind.check_start(runs, known, paper_robots.nominal()) == []
+        assert kind.check(runs, known) == kind.check_start(runs, known, robot) == []
         assert np.isnan(runs.measured()).sum() == made.label["missing"]
         assert set(runs["configuration"]) <= set(w.machine.names.values())
         assert (made.label["missing"] > 0) == (w.missing > 0) and (made.label["outliers"] > 0) == (w.outliers > 0)

@@ -115,7 +115,7 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
     for w in worlds[::5]:
         c = rigs.case(w)
         c.write(tmp_path / "rig")
-        content = tomllib.loads((tmp_path / "rig" / "rig.toml").read_text(encoding="utf-8"))
+        content = tomllib.loads((tmp_path / "rig/rig.toml").read_text(encoding="utf-8"))
         assert content["base"] == "none" and content["channels"] == list(w.rig.channels)
         assert "nominal" not in c.toml and "6T2A" not in c.toml
         load = content[w.rig.name]
@@ -128,9 +128,9 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
             assert lead / 1e3 == pytest.approx(2 * np.pi * w.rig.stated["radius"], rel=1e-12)
             force = float(load["force_coulomb_N"].partition(" ")[0])
             assert force * w.rig.stated["radius"] == pytest.approx(w.rig.stated["loss_coulomb"], rel=1e-12)
-        label = read_json(tmp_path / "rig" / "label.json")
+        label = read_json(tmp_path / "rig/label.json")
         assert label["kind"] == "clean" and not label["effects"] and label["rows_lost"] == 0
-        with (tmp_path / "rig" / "table.csv").open(encoding="utf-8") as file:
+        with (tmp_path / "rig/table.csv").open(encoding="utf-8") as file:
             header, *rows = csv.reader(file)
         assert len(rows) == len(w.conditions)
         assert ("slope_deg" in header) == w.rig.vehicle

@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
+from tests.commands import read_json
 
 GRID = settled.table8(payloads=paper_robots.PAYLOADS_KG)
 CLEAN = readings(GRID, CLIMBING)[0]
@@ -244,7 +244,7 @@ def test_cases_are_reproducible_and_their_labels_tell_them_apart():
 def test_table_and_label_are_separate_files_and_the_table_passes_the_input_checks(tmp_path):
     narrow(["windage"], seed=9).write(tmp_path)
     assert "windage" not in (tmp_path / "table.csv").read_text()
-    assert json.loads((tmp_path / "label.json").read_text())["effects"][0]["name"] == "windage"
+    assert read_json(tmp_path / "label.json")["effects"][0]["name"] == "windage"
     runs = records.read_runs(tmp_path / "table.csv")
     assert len(runs) == 90 and runs.has("total_current_sd_A")
 

@@ -20,6 +20,8 @@ from calibration.inference.identifiability import Z95
 
 #: Units of position, with radians in one of them (of a length: 0).
 UNITS = {"rotation": 2 * np.pi, "rad": 1.0, "degree": np.pi / 180, "m": 0.0}
+#: Constants of the law. Only a lift and an arm have the last one.
+CONSTANTS = "kS", "kV", "kA", "kG"
 #: Names of the four tests, and what a log without them calls them.
 TESTS = {
     "quasistatic-forward": "slow-forward", "quasistatic-reverse": "slow-backward",
@@ -167,43 +169,32 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         largest_current = None if log.current is None else float(np.nanmax(np.abs(log.current)))
         limited = Remark("feedforward_limit", level=level, current=largest_current)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-    if level:
         windows = {key: x[windows["demand"] < level] for key, x in windows.items()}
     values, covariance, _ = _fit_constants(windows, mechanism)
     sds = np.sqrt(np.diag(covariance))
-    names = ("kS", "kV", "kA", "kG")[: len(values)]
-    constants = {name: float(x) for name, x in zip(names, values, strict=True)}
-    spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
+    constants, spread = (dict(zip(CONSTANTS, x.tolist(), strict=False)) for x in (values, sds))
     if mechanism == "simple":
         remarks += _direction_remarks(windows)
     remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
-    determined = 0 < Z95 * spread["kA"] < 0.5 * constants["kA"]
-    if not determined:
+    share = Z95 * spread["kA"] / constants["kA"]
+    if not (determined := 0 < share < 0.5):
         slow = [t for t in missing if t.startswith("dynamic")]
-        remarks.append(Remark("feedforward_no_kA", share=spread["kA"] * Z95 / abs(constants["kA"]), missing=slow))
+        remarks.append(Remark("feedforward_no_kA", share=abs(share), missing=slow))
     tolerances_used = tolerances or Tolerances()
-    tolerances_used = (
-        dataclasses.replace(tolerances_used, delay=delay + lag) if tolerances_used.delay is None else tolerances_used
-    )
-    gains = (
-        feedback_gains(constants["kV"], constants["kA"], tolerances_used)
-        if determined and constants["kV"] > 0
-        else {}
-    )
+    if tolerances_used.delay is None:
+        tolerances_used = dataclasses.replace(tolerances_used, delay=delay + lag)
+    gains = {}
+    if determined and constants["kV"] > 0:
+        gains = feedback_gains(constants["kV"], constants["kA"], tolerances_used)
     if gains and tolerances_used.delay:
         prompt = feedback_gains(constants["kV"], constants["kA"], dataclasses.replace(tolerances_used, delay=0.0))
         remarks.append(Remark("feedforward_gains_delayed", delay=tolerances_used.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
-    figures = {
-        "run": windows["run"],
-        "voltage_V": windows["u"] / windows["T"],
-        "velocity": windows["x"] / windows["T"],
-        "acceleration": windows["dv"] / windows["T"],
-        "direction": windows["s"] / windows["T"],
-        "quasistatic": windows["quasistatic"],
-    }
+    integrals = {"voltage_V": "u", "velocity": "x", "acceleration": "dv", "direction": "s"}
+    means = {name: windows[key] / windows["T"] for name, key in integrals.items()}
+    figures = {"run": windows["run"], **means, "quasistatic": windows["quasistatic"]}
     return Feedforward(
         mechanism, log.unit, constants, spread, gains, tolerances_used, delay, lag, missing, figures, tuple(remarks)
     )  # fmt: skip
@@ -297,7 +288,7 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
     """Integrals over time windows of motion in one direction: voltage u, path x, direction s, length T, change of
     speed dv.
     """
-    windows: list[dict[str, object]] = []
+    windows = []
     step, speeds = _median_time_step(log), np.asarray(log.velocity)
     smallest_speed = MOVES * np.nanmax(np.abs(speeds))
     count = max(FEWEST, round(WINDOW / step))
@@ -311,25 +302,16 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
         driven += np.maximum(instants - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
         ramp = _is_ramp(_driven_voltages(u))
-        for a in range(len(t) - count):
-            b = a + count
-            speeds_inside = v[a : b + 1]
-            if (
-                np.any(np.sign(speeds_inside) != np.sign(speeds_inside[0]))
-                or np.abs(speeds_inside).min() <= smallest_speed
-            ):
-                continue
-            length = t[b] - t[a]
-            if length > 3 * WINDOW and length > 2 * count * step:
-                continue
-            c, s = (length * np.mean(f(place[a : b + 1])) for f in (np.cos, np.sin))
-            windows.append({
-                "run": log.run[rows[0]], "row": rows[a], "count": count, "u": driven[b] - driven[a],
-                "x": path[b] - path[a], "T": length, "s": np.sign(speeds_inside[0]) * length, "dv": v[b] - v[a],
-                "cos": c, "sin": s, "quasistatic": ramp,
-            })  # fmt: skip
-    keys = ("run", "row", "count", "u", "x", "T", "s", "dv", "cos", "sin", "quasistatic")
-    return {key: np.array([w[key] for w in windows]) for key in keys}
+        inside = np.arange(len(t) - count)[:, None] + np.arange(count + 1)
+        signs, longest = np.sign(v[inside]), max(3 * WINDOW, 2 * count * step)
+        moves = (signs == signs[:, :1]).all(1) & (np.abs(v[inside]).min(1) > smallest_speed)
+        inside = inside[moves & (np.ptp(t[inside], axis=1) <= longest)]
+        u, x, dv, length = (signal[inside[:, -1]] - signal[inside[:, 0]] for signal in (driven, path, v, t))
+        c, s = (length * f(place[inside]).mean(1) for f in (np.cos, np.sin))
+        same = [np.full(len(u), value) for value in (log.run[rows[0]], count, ramp)]
+        windows.append((*same, rows[inside[:, 0]], u, x, dv, length, np.sign(v[inside[:, 0]]) * length, c, s))
+    keys = "run", "count", "quasistatic", "row", "u", "x", "dv", "T", "s", "cos", "sin"
+    return {key: np.concatenate(parts) for key, parts in zip(keys, zip(*windows, strict=True), strict=True)}
 
 
 def _driven_voltages(voltage: np.ndarray) -> np.ndarray:
