@@ -251,7 +251,7 @@ def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
     assert table(tmp_path / "r/runs.csv")[0]["slope_deg"] == "5"
 
 
-def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch):
+def test_full_disk_names_the_file_whichever_it_is(mmrjax, monkeypatch):
     """What the system says of a full disk names none."""
     honest = Path.write_text
 
@@ -347,7 +347,7 @@ def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
     assert "simulating" in done.stderr and "324/324" in done.stderr
 
 
-def test_help_is_quick_and_imports_no_jax():
+def test_help_is_quick():
     def counted():  # processor time of a count, 0.02 s on the machine for which the limit is stated
         start = time.process_time()
         sum(1 for _ in range(1_000_000))
@@ -367,8 +367,6 @@ def test_help_is_quick_and_imports_no_jax():
 
     for command in ([], ["simulate"], ["sweep"], ["compare"], ["reproduce"]):
         assert best([*command, "--help"]) < limit
-    probe = "import sys; import sweeps.cli; sys.exit('jax' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", probe]).returncode == 0
 
 
 @pytest.mark.parametrize("given", [None, "", "--xla_cpu_use_fusion_emitters=false"])

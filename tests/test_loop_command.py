@@ -295,17 +295,6 @@ BAD = {
         "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t / 10}" for t in range(30))]),
         "runs.csv row 1, time_s: run (no run_id) is moving at 0 s",
     ),
-    "two runs as one": (
-        "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t % 15 / 10}" for t in range(30))]),
-        "runs.csv row 16, time_s: goes back from 1.4 to 0 s; give each recording its own run_id, or sort the rows",
-    ),
-    "two configurations in a run": (
-        "\n".join([
-            f"{HEADER},time_s",
-            *(f"{moving(t, 15).replace('6T2A', ('6T2A', '4W2T')[t // 20])},{t / 10}" for t in range(30)),
-        ]),
-        "runs.csv, configuration: run (no run_id) has several values",
-    ),
 }  # fmt: skip
 
 
@@ -323,7 +312,6 @@ def test_bad_data_end_with_4_and_leave_nothing(tmp_path, case):
 #: Options, and what is said of them.
 WRONG = {
     "unit": (["--noise", "current=2V"], "--noise current=2V: expected a positive number with % or A"),
-    "channel": (["--noise", "voltage=2%"], "--noise voltage=2%: no such channel"),
     "no file": (["--effects", "yours.py"], "--effects: got yours.py, no such file"),
     "contract": (["--effects", "mine.py"], "mine.py, PayloadBinding, balance: got trakc; did you mean track?"),
     "few replicates": (["--replicates", "10"], "--replicates: got 10"),
