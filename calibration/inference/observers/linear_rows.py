@@ -107,8 +107,8 @@ class LinearRows(Observer):
             parts = []
             for at, member in zip(z, members, strict=True):
                 data = dataclasses.replace(problem.data, weight=jnp.asarray(weights[member]))
-                there = dataclasses.replace(problem, data=data)
-                parts.append(self.at(there, at, None if active is None else active[member]))
+                member_problem = dataclasses.replace(problem, data=data)
+                parts.append(self.at(member_problem, at, None if active is None else active[member]))
             return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
 
         steps = self.policy.steps if most is None else most
