@@ -27,21 +27,13 @@ OFF = ("off", "0", "no", "false")
 LIMIT = 4 * 2**30
 
 
-def cache_location(path: Path | None = None) -> Path | None:
-    """Folder of the cache, which need not exist yet. None if the cache is switched off or has no known place.
-
-    Args:
-        path: folder to hold caches. None takes it from the environment.
-    """
-    if path is None:
-        folder_text = os.environ.get(VARIABLE, "").strip()
-        if folder_text.lower() in OFF:
-            return None
-        if folder_text:
-            path = Path(folder_text)
-        else:
-            base = Path(os.environ.get("XDG_CACHE_HOME", ""))
-            path = (base if base.is_absolute() else Path("~/.cache")) / "mmrjax"
+def cache_location() -> Path | None:
+    """Folder of the cache, which need not exist yet. None if the cache is switched off or has no known place."""
+    folder_text = os.environ.get(VARIABLE, "").strip()
+    if folder_text.lower() in OFF:
+        return None
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    path = Path(folder_text or (base if base.is_absolute() else Path("~/.cache")) / "mmrjax")
     try:
         path = path.expanduser()
     except RuntimeError:  # nobody's home
@@ -144,9 +136,9 @@ def _delete_oldest(caches: Path) -> None:
             return
 
 
-def describe_cache(path: Path | None = None) -> str:
+def describe_cache() -> str:
     """Folder of the cache with number and size of its programs, or why it is not used."""
-    folder = cache_location(path)
+    folder = cache_location()
     if folder is None:
         return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
     if exposed := exposure_reason(folder):

@@ -214,18 +214,20 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
-    found = fit_smooth_surface(toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear))
-    assert found.evidence == pytest.approx(gained(toy, found.columns), rel=1e-6)
+    evidence, columns = fit_smooth_surface(
+        toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear)
+    )
+    assert evidence == pytest.approx(gained(toy, columns), rel=1e-6)
     sides = []
     for name in ("speed_motor", "slope"):
         x = toy.linear.variable(name)
         x = 2 * (x - x.min()) / np.ptp(x) - 1
         sides.append(legendre.legvander(x, PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)))
     raw = bases.place_signature(toy.linear, "track", np.einsum("ri,rj->rij", *sides).reshape(toy.rows, -1))
-    ratio = found.columns[:, 0] / raw[:, 0]
-    assert_allclose(found.columns, ratio[0] * raw, rtol=1e-9)
+    ratio = columns[:, 0] / raw[:, 0]
+    assert_allclose(columns, ratio[0] * raw, rtol=1e-9)
     for factor in (0.3, 0.6, 1.7, 3.0):
-        assert gained(toy, factor * found.columns) < found.evidence + 0.2  # of a grid, so nearly the largest
+        assert gained(toy, factor * columns) < evidence + 0.2  # of a grid, so nearly the largest
 
 
 def names_of(posterior, free):

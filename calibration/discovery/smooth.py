@@ -150,30 +150,19 @@ def _prior_root(length: float, happening: bool) -> np.ndarray:
     return np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)
 
 
-@dataclasses.dataclass(frozen=True)
-class SmoothSurface:
-    """A smooth discrepancy over two variables in a balance, linearised at a fit.
-
-    Attributes:
-        columns: sensitivity of the readings to each term, scaled by its prior sd, shape (readings, terms).
-        explained: decrease of χ² [σ²].
-        evidence: evidence as in `SmoothCurve`.
-    """
-
-    columns: np.ndarray
-    explained: float
-    evidence: float
-
-
 def fit_smooth_surface(
     linear: Linearization, balance: str, variables: tuple[str, str], counts: np.ndarray, project: Projection
-) -> SmoothSurface:
+) -> tuple[float, np.ndarray]:
     """Smooth discrepancy over two variables, as a sum of products of Legendre polynomials.
 
     The prior sd of a term decreases with its degree. The common size of all terms maximises the evidence.
 
     Args:
         counts: True for included rows, shape (rows,).
+
+    Returns:
+        Evidence as in `SmoothCurve`, and the sensitivity of the readings to each term, scaled by its prior sd, shape
+        (readings, terms).
     """
     weight = linear.at_points(counts).astype(float)
     bases, ways = zip(*(linear.curve_variable(balance, v) for v in variables), strict=True)
@@ -185,12 +174,11 @@ def fit_smooth_surface(
     columns = place_signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    best = (-np.inf, 0.0, 0.0)
+    best = -np.inf, 0.0
     for sigmas in SIZES:
         scale = sigmas * size
         information = np.eye(len(b)) + scale**2 * a
         z = np.linalg.solve(information, scale * b)
         evidence = scale * b @ z - np.linalg.slogdet(information)[1]
-        if evidence > best[0]:
-            best = float(evidence), scale, float(2 * scale * b @ z - scale**2 * z @ a @ z)
-    return SmoothSurface(best[1] * columns, best[2], best[0])
+        best = max(best, (float(evidence), scale))
+    return best[0], best[1] * columns

@@ -173,8 +173,8 @@ def _curve_evidence(
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known_curves], 2):
-            variables = fit_smooth_surface(linear, place, pair, included, project)
-            curves.append((variables.evidence, PlacedCurve(place, pair)))
+            evidence, _ = fit_smooth_surface(linear, place, pair, included, project)
+            curves.append((evidence, PlacedCurve(place, pair)))
     return curves
 
 

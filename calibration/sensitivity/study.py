@@ -26,17 +26,11 @@ Tell = Callable[[Remark | str], None]
 SILENCE = 10.0
 
 
-@dataclasses.dataclass(frozen=True)
-class PointSupply:
-    """Motor supply and ground at each point: battery (1) or external supply (0), charge drawn [C], adhesion ratio."""
-
-    battery: float = 0.0
-    discharge: float = 0.0
-    adhesion: np.ndarray | float = 1.0
-
-
 class Study:
-    """One robot with its uncertain inputs, operating points and outputs. The methods are functions of a study."""
+    """One robot with its uncertain inputs, operating points and outputs. The methods are functions of a study.
+
+    `battery` (1) or external supply (0), the charge drawn [C] and the adhesion ratio apply at each point.
+    """
 
     def __init__(
         self,
@@ -46,10 +40,12 @@ class Study:
         outputs: tuple[Quantity, ...],
         model: str = "steady",
         options: Mapping[str, float] | None = None,
-        supply: PointSupply | None = None,
         tell: Tell = lambda note: None,
+        *,
+        battery: float = 0.0,
+        discharge: float = 0.0,
+        adhesion: np.ndarray | float = 1.0,
     ) -> None:
-        supply = PointSupply() if supply is None else supply
         self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
         options = fidelities.fidelity_facts(model).resolved() if options is None else options
         self.model = Model(robot, inputs.columns, model, options, outputs)
@@ -59,9 +55,9 @@ class Study:
             np.nan_to_num(points.voltage),
             points.slope_deg,
             points.payload,
-            battery=supply.battery,
-            discharge=supply.discharge,
-            adhesion=supply.adhesion,
+            battery=battery,
+            discharge=discharge,
+            adhesion=adhesion,
             motor_speed=None if points.motor_speed is None else points.motor_speed * RPM,
         )
         self.evaluations, self.seconds = 0, 0.0

@@ -18,7 +18,7 @@ from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import CandidateRuns
 from calibration.sensitivity.result import METHODS, OperatingPoints
-from calibration.sensitivity.study import PointSupply, Study
+from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
@@ -71,9 +71,6 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     conditions = runs.conditions(robot)
     turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turn_columns), config)
-    supply = PointSupply(
-        float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion)
-    )
     study = Study(
         robot,
         inputs,
@@ -81,8 +78,10 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         outputs,
         config.model,
         config.options,
-        supply,
         report_in_words(print_message),
+        battery=float(config.battery),
+        discharge=config.discharge_mAh * COULOMB_PER_MAH,
+        adhesion=np.asarray(conditions.adhesion),
     )
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
         result = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)

@@ -63,7 +63,7 @@ def _draw_ground(axes: Any, found: ClimbResult, begin: float, end: float) -> Non
     axes.plot(*points.T, color=INK, lw=1.2)
 
 
-def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
+def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray) -> None:
     outlines = _belt_outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
@@ -72,9 +72,9 @@ def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE
     top = under + BODY_HEIGHT
     box = np.array([(-half, under), (half, under), (half + 0.01, top), (-half - 0.01, top)])
     box = box @ np.array([[cos, sin], [-sin, cos]]) + q[:2]
-    axes.add_patch(Polygon(box, facecolor=colour, edgecolor=INK, lw=0.8, alpha=0.55))
+    axes.add_patch(Polygon(box, facecolor=BLUE, edgecolor=INK, lw=0.8, alpha=0.55))
     for path, tips in outlines:
-        axes.add_patch(Polygon(path, facecolor=colour, edgecolor=INK, lw=1.4, alpha=0.35))
+        axes.add_patch(Polygon(path, facecolor=BLUE, edgecolor=INK, lw=1.4, alpha=0.35))
         axes.add_patch(Polygon(path, fill=False, edgecolor=INK, lw=1.2))
         if len(tips):
             axes.plot(*tips.T, ".", color=INK, ms=2.5)

@@ -371,9 +371,9 @@ def _shade_stages(axes: Axes, start: StartRun, scale: float = 1.0) -> None:
             )  # fmt: skip
 
 
-def _text_width_share(axes: Axes, text: str, size: float = 8.5) -> float:
-    """Approximate fraction of the axes' width that a bold text takes [-]."""
-    return 0.72 * size * len(text) / 72 * axes.figure.dpi / axes.bbox.width
+def _text_width_share(axes: Axes, text: str) -> float:
+    """Approximate fraction of the axes' width that a bold text of 8.5 points takes [-]."""
+    return 0.72 * 8.5 * len(text) / 72 * axes.figure.dpi / axes.bbox.width
 
 
 @dataclasses.dataclass(frozen=True)
