@@ -24,6 +24,7 @@ import xarray as xr
 from numpy.testing import assert_allclose
 from pyarrow import feather, parquet
 from test_more_formats import sysid_log, wpilog, write_xlsx
+from test_sources import COLUMNS, RIG
 
 from calibration.data import contents, input_files, robot_file
 from calibration.data import runs as records
@@ -36,21 +37,6 @@ from tests.commands import text_file
 SECONDS, HANGS, MEMORY = 5.0, 60, 2**31
 #: Mutations of each file.
 EACH = 16
-COLUMNS = {"time_s": "t", "supply_voltage_V": "volts", "total_current_A": "amps", "motor_speed_rpm": "rpm"}
-RIG = """
-base = "none"
-channels = ["total_current", "motor_speed"]
-[motor]
-resistance = "2 ± 20 %"
-torque_constant = "0.05 ± 20 %"
-[gearbox]
-ratio = 1
-efficiency_load = "1 ± 0"
-[bench]
-load = "shaft"
-inertia = 0.001
-loss_coulomb = "0.01 ± 50 %"
-"""
 
 
 @pytest.fixture(scope="module")
@@ -529,7 +515,7 @@ def test_times_that_are_not_finite_are_refused_without_a_warning(tmp_path, robot
     assert not asked(inspect)[0]
 
 
-def test_times_without_a_date_are_listed_and_refused(tmp_path, robot):
+def test_times_without_a_date_are_listed_and_refused(tmp_path):
     import datetime
 
     times = [datetime.time(0, 0, k) for k in range(4)]

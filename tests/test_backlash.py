@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from test_shaft import DRIVE
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
@@ -23,10 +24,6 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import Signals, State
 from tests.commands import read_rig, read_table, text_file
 
-DRIVE = {
-    "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
-    "motor.friction_coulomb": 2e-3, "motor.friction_viscous": 1e-6, "motor.inertia": 2e-6, "motor.inductance": 1e-3,
-}  # fmt: skip
 SAMPLES = np.linspace(0, 2, 201)
 TIMES = time_grid(SAMPLES, np.arange(0, 2, 0.5), change=(1e-5, 0.04))
 VOLTAGE = np.where(TIMES % 1.0 < 0.5, 6.0, -6.0)

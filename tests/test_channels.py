@@ -173,7 +173,7 @@ def test_a_table_takes_the_channels_of_the_robot_that_it_is_used_with(tmp_path, 
         narrow.of(bench)
 
 
-def test_what_is_imposed_is_kept_though_it_is_no_channel(tmp_path, bench):
+def test_what_is_imposed_is_kept_though_it_is_no_channel(bench):
     imposed = dataclasses.replace(bench.rig, imposed="motor_speed", channels=("total_current",))
     robot = dataclasses.replace(bench, rig=imposed)
     columns = {"motor_speed_rpm": 100.0 * np.arange(1, 13), "total_current_A": np.arange(1.0, 13)}

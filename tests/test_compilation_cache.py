@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from sweeps import compilation_cache
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Solves two runs with derivatives; `{more}` is put in before. Prints the answer and what the cache was asked.
 PROGRAM = """
 import json, sys

@@ -149,7 +149,7 @@ def test_steps_follow_a_goal(actuator):
     assert float(state.distance) == pytest.approx(own, abs=2e-3)
 
 
-def test_a_motor_that_is_off_coasts(actuator, tmp_path):
+def test_a_motor_that_is_off_coasts(actuator):
     log = {"time_s": np.arange(4) * 0.1, "goal_angle_deg": [0.0, 30, 30, 30], "output_angle_deg": [0.0, 0, 5, 20],
            "mode": ["voltage", "voltage", "coast", "voltage"]}  # fmt: skip
     robot = actuator()

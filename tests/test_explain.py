@@ -50,7 +50,7 @@ def test_an_effect_of_ones_own_may_go_with_anything():
 
 
 @pytest.mark.slow
-def test_a_typical_size_is_simulated(robot):
+def test_a_typical_size_is_simulated():
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._change_sentences(effects.BY_NAME["series_resistance"]()))
     assert len(changes) == 2 and changes[0].startswith(

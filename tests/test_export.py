@@ -401,7 +401,7 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
     assert not actuator.state["current"][1].any() and actuator.state["current"][0].any()
 
 
-def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain, tmp_path):
+def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain):
     drive, runs, known = plain
     names = ("motor.resistance", "motor.friction_coulomb")
     at = priors.parameter_coordinates(drive.file.robot, names, {})

@@ -106,7 +106,7 @@ def test_models_headers_and_pages_of_an_export_have_names_as_words(drive):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_toml_and_json_keep_every_name(name, tmp_path):
+def test_toml_and_json_keep_every_name(name):
     shown = name.encode("utf-8", "replace").decode()
     assert tomllib.loads(f"a = {writing.toml_value({name: [name]})}")["a"] == {shown: [shown]}
     given = configuration.Simulate.model_construct(robot=shown)

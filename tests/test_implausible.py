@@ -5,7 +5,8 @@ import functools
 
 import numpy as np
 import pytest
-from synthetic import FEW, SETTLED, small, table
+from synthetic import FEW, SETTLED, table
+from test_stated_values import LOOKS
 from worlds import laws, settled, tables
 
 from calibration.discovery import findings
@@ -50,10 +51,6 @@ def traced(looks="few"):
 def unnamed(looks="few"):
     """Their result. Made once for all files."""
     return HOT[looks][0].result(*traced(looks))
-
-
-#: Who looks, and at which runs.
-LOOKS = {"few": (FEW, small), "many": (SETTLED, settled.table8)}
 
 
 @pytest.fixture(scope="module", params=["few", "many"])

@@ -356,10 +356,6 @@ WRONG_ROBOT = {
 WRONG_CALL = {
     "model: got fast; allowed: steady, drive, track": dict(model="fast"),
     "model: got stedy; did you mean steady? allowed: steady, drive, track": dict(model="stedy"),
-    "model steady, duration: got 5.0; this fidelity has no such option; its options: none": dict(duration=5.0),
-    "model drive, step: got 0.001; this fidelity has no such option; its options: duration": dict(
-        model="drive", step=1e-3
-    ),
     "model drive, patience: got 3; this fidelity has no such option; its options: duration": dict(
         model="drive", patience=3
     ),
@@ -490,7 +486,7 @@ def test_wrong_arguments_are_refused_in_a_sentence(case, robot, table):
     assert words in str(refusal.value) and len(str(refusal.value)) <= LONGEST
 
 
-def test_lazy_and_masked_tables_are_read_as_others(robot, table):
+def test_lazy_and_masked_tables_are_read_as_others(table):
     """A lazy frame is collected. A masked reading is missing."""
     wanted = mm.read_runs(table).columns
     lazy = mm.read_runs(pl.from_pandas(table).lazy()).columns

@@ -60,7 +60,7 @@ def test_page_of_one_axis_has_one_band(page):
 
 
 @pytest.mark.slow
-def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, tmp_path, monkeypatch):
+def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, monkeypatch):
     monkeypatch.setattr(campaign_report, "THINNED", 60)
     monkeypatch.setattr(campaign_report, "CHUNKS", 6)
     assert "quantiles and figures of 60 points drawn at random" in " ".join(page().text.split())

@@ -268,7 +268,7 @@ def test_what_is_refused(mmrjax, tmp_path, options, code, says):
     assert not (tmp_path / "x").exists() and not (tmp_path / "x.partial").exists()
 
 
-def test_a_parameter_without_a_prior_of_some_width_is_refused(mmrjax, tmp_path):
+def test_a_parameter_without_a_prior_of_some_width_is_refused(mmrjax):
     got, _, err = mmrjax("sensitivity --parameters motor.friction_viscous --set motor.friction_viscous=0 --out x")
     assert got == 2 and "--parameters motor.friction_viscous: its prior has no width" in err
 

@@ -244,20 +244,6 @@ def test_numbers_are_described_once():
     assert {f"energy_to_{name}" for name in energy.SINKS} < {o.name for o in OUTPUTS}
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"profile": SHORT, "model": "steady"}, r"model: got steady with a profile; expected drive"),
-        ({"profile": SHORT, "duration": 3.0}, r"duration: got 3.0 with a profile"),
-        ({"profile": "patrol"}, r"profile: got str; expected mmrjax.profile"),
-        ({"start": missions.Start()}, r"start: got one without a profile"),
-    ],
-)
-def test_wrong_use_is_said(robot, given, message):
-    with pytest.raises(mm.UsageError, match=message):
-        mm.simulate(robot, mm.Conditions(), **given)
-
-
 # --- sweeps ---------------------------------------------------------------------------------------------------------
 
 PLAN = """\

@@ -74,7 +74,7 @@ def test_steps_are_runs_of_drive(robot):
 
 
 @pytest.mark.parametrize("dt", [0.05, 0.02])
-def test_starts_are_as_accurate_as_stated(dt, robot, in_steps):
+def test_starts_are_as_accurate_as_stated(dt, in_steps):
     """Largest error of the speed at any step, compared with steps of 1 ms."""
     for conditions in (RUNS["tracked"], mm.Conditions("4W2T", voltage=33.0)):
         found, exact = (in_steps(conditions, length) for length in (dt, 1e-3))

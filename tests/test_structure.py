@@ -6,7 +6,6 @@ import graphlib
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import PurePosixPath
 
 import pytest
@@ -24,10 +23,6 @@ HEAVY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "matplot
 def walked(tree):
     """Every node of a module, which all rules go through, or of a part of one."""
     return list(ast.walk(tree))
-
-
-Breach = tuple[int, str]
-Rule = Callable[[PurePosixPath, ast.Module], Iterator[Breach]]
 
 
 def imports(tree, package):

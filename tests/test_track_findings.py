@@ -205,7 +205,7 @@ def test_belt_is_tight_above_and_slack_below(runs):
     assert tension[7] - tension[0] == pytest.approx(force, rel=0.15)
 
 
-def test_averages_are_over_whole_periods(runs, robot):
+def test_averages_are_over_whole_periods(runs):
     for k in TRACKED:
         window = 0.4 * 1.5 * runs.result.theoretical_speed[k]
         assert runs.steady.periods[k] == int(window / 0.035)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from worlds import turning as world
+from worlds.turns import NOISE, SDS, SHOWN
 
 import mmrjax as mm
 from calibration.data import runs as records
@@ -21,10 +22,6 @@ from tests.commands import csv_text, text_file
 
 CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
-SHOWN = (*CURRENTS, *MOTION)
-#: Sds of the instruments, in the units of the columns.
-SDS = dict(zip(SHOWN, (0.02, 0.02, 8.0, 8.0, 0.01), strict=True))
-NOISE = ",".join(f"{name}={sd}{channels.find_channel(name).unit}" for name, sd in SDS.items())
 #: Duties of left and right side.
 DUTIES = (
     (1.0, 1.0), (1.0, 0.7), (1.0, 0.3), (1.0, 0.0), (1.0, -0.5), (1.0, -1.0), (0.6, 0.5), (0.3, 0.7), (0.1, 0.8),

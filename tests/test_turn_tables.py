@@ -109,7 +109,7 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
     assert [c.name for c in records.read_runs(path, robot=robot).channels] == ["yaw_rate"]
 
 
-def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, capsys, monkeypatch, robot):
+def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tmp_path, monkeypatch, robot):
     path, reads = tmp_path / "turns.csv", []
     read = records.read_runs
     monkeypatch.setattr(records, "read_runs", lambda *told, **how: reads.append(told) or read(*told, **how))

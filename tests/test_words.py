@@ -6,7 +6,6 @@ import dataclasses
 import inspect
 import re
 import string
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,8 +37,8 @@ from calibration.words.note_words import NOTES
 from mmrjax.model import channels
 from sweeps import console
 from sweeps.pages.words import FILES
+from tests.commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Notes of every kind; their sentences are in `tests/record/pages/notes.txt`, which `python tests/test_words.py` writes.
 SAMPLES = [
     Remark("feedforward_sign"),
@@ -684,7 +683,7 @@ def test_what_would_measure_is_found_by_either_end_of_a_name():
     assert table_words.would_measure("x.y") == "runs under conditions in which it has an effect"
 
 
-def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monkeypatch, capsys):
+def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(capsys):
     text = "- " + "a sentence that goes on " * 8 + "\n" + "x" * 100
     lines = console.wrap_for_terminal(text).split("\n")
     assert all(len(line) <= 80 for line in lines[:-1]) and lines[-1] == "x" * 100 and lines[1].startswith("  ")
