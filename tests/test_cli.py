@@ -125,16 +125,6 @@ def test_bad_usage_ends_with_2_and_one_sentence(mmrjax, tmp_path, case):
     assert {p.name for p in tmp_path.iterdir()} == {*FILES}
 
 
-def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
-    (tmp_path / "mine.partial").mkdir()
-    (tmp_path / "mine.partial/thesis.txt").write_text("years of work")
-    ends(
-        mmrjax("simulate --no-report --out mine --force"),
-        "mine.partial already exists and was not created by mmrjax",
-    )
-    assert (tmp_path / "mine.partial/thesis.txt").read_text() == "years of work"
-
-
 def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
     (tmp_path / "runs.csv").write_text(f"{HEADER},run_id,time_s\n6T2A,15,13.1,0,5,2.75,4800,400,a,0.1\n")
     ends(

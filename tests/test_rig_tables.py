@@ -235,6 +235,11 @@ REFUSED = {
         f"{BENCH}900,0.4\n-900,-0.4\n",
         r"row 2, total_current_A: got -0.4; expected no negative reading",
     ),
+    "two runs as one": (
+        lambda: bench("voltage"),
+        "time_s,supply_voltage_V,total_current_A\n" + "".join(f"{k % 15 / 10},9,{k}\n" for k in range(30)),
+        r"row 16, time_s: goes back from 1\.4 to 0 s; give each recording its own run_id, or sort the rows",
+    ),
     "a log without its time": (
         lambda: bench("voltage", ("output_speed", "output_angle")),
         "t,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n",

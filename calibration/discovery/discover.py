@@ -301,9 +301,7 @@ class LoopInput:
             return None
         space = known.screened.base.space
         equations = space.with_noise(self.noise.sd, space.weight)
-        # By the programs of the first verdict, if it needed one: another would be compiled for half a minute.
-        simulated = known.searched is not None and known.searched.room
-        confirm = functools.partial(_smallest_confirmed, run.space, self.settings) if simulated else None
+        confirm = functools.partial(_smallest_confirmed, run.space, self.settings) if self.known_room else None
         traced = dataclasses.replace(self, equations=equations, known=None, confirm=confirm).trace()
         refuted = run.contradicts and traced.verdict != "none"
         return dataclasses.replace(traced, verdict="place") if refuted else traced
@@ -321,12 +319,18 @@ class LoopInput:
             """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
             return self.keep(name if name == "ranking" else f"windows {name}", make)
 
-        confirm = functools.partial(_best_simulated_size, self.space, self.settings)
-        equations = dataclasses.replace(equations, keep=keep, confirm=confirm)
+        confirm = functools.partial(_best_simulated_size, self.space.with_room(self.known_room), self.settings)
+        simulates = self.known is None or self.known_room
+        equations = dataclasses.replace(equations, keep=keep, confirm=confirm if simulates else None)
         traced = equations.trace()
         slides = self.robot.has_ground and self.robot.rig.imposed == "voltage"  # which equations do not show
         begin = None if slides else _delayed_by_rows(self, traced.screened.base.candidate)
         return _confirm_by_simulation(self, equations, traced), begin
+
+    @property
+    def known_room(self) -> Names:
+        """Effects in the simulation program of the known results. Another program takes half a minute to compile."""
+        return () if self.known is None or self.known.searched is None else self.known.searched.room
 
     @functools.cached_property
     def space(self) -> CandidateSpace:
@@ -830,7 +834,7 @@ def _smallest_confirmed(
         return searched
     alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
     sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
-    sizes = [[c for c in sets if not space.room or {*c.effects} <= {*space.room}] for sets in sizes]
+    sizes = [[c for c in sets if _has_room(space, c)] for sets in sizes]
     space = space.with_noise(noise.sd, screened.base.space.weight)
     space = space.with_room([*space.room, *(name for sets in sizes for c in sets for name in c.effects)])
     for sets in filter(None, sizes):
@@ -843,6 +847,11 @@ def _smallest_confirmed(
     return searched
 
 
+def _has_room(space: CandidateSpace, fit: Candidate) -> bool:
+    """True if the program of a log's simulations has room for a set of effects, or has not been determined."""
+    return not space.room or {*fit.effects} <= {*space.room}
+
+
 def _best_simulated_size(
     space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
     noise: Noise,
@@ -853,8 +862,8 @@ def _best_simulated_size(
 
     Args: as for `_smallest_confirmed`, of the windows. The noise of the simulated log is that of `space`.
     """
-    sets = best_of_each_size(searched)
-    space = space.with_room([name for c in sets for name in c.effects])
+    sets = [c for c in best_of_each_size(searched) if _has_room(space, c)]
+    space = space.with_room([*space.room, *(name for c in sets for name in c.effects)])
     searched = dataclasses.replace(searched, room=space.room)
     if len(sets) < 2:
         return searched

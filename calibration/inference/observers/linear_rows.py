@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate
+from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate, with_effects
 from calibration.inference.observers.time_histories import Histories, HistoriesLinearization
 from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
 from calibration.inference.problem import Data, Observation, Problem
@@ -106,21 +106,16 @@ class LinearRows(Observer):
         def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
             parts = []
             for at, member in zip(z, members, strict=True):
-                coordinates, data = problem.coordinates, problem.data
-                if active is not None:
-                    coordinates = coordinates.with_effects(jnp.asarray(active[member]))
-                data = dataclasses.replace(data, weight=jnp.asarray(weights[member]))
-                parts.append(jax.device_get(_evaluated(self, coordinates, data, jnp.asarray(at))))
-            return jax.tree.map(lambda *x: np.stack(x), *parts)
+                data = dataclasses.replace(problem.data, weight=jnp.asarray(weights[member]))
+                member_problem = dataclasses.replace(problem, data=data)
+                parts.append(self.at(member_problem, at, None if active is None else active[member]))
+            return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
 
         steps = self.policy.steps if most is None else most
         return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
-        coordinates = problem.coordinates
-        if active is not None:
-            coordinates = coordinates.with_effects(jnp.asarray(active))
-        return _evaluated(self, coordinates, problem.data, jnp.asarray(z))
+        return _evaluated(self, with_effects(problem, active).coordinates, problem.data, jnp.asarray(z))
 
 
 class LinearHistories(LinearRows, Histories):

@@ -1218,46 +1218,32 @@ def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | No
     weights, made = np.asarray(weights), threading.Event()
 
     def evaluate_one(z: np.ndarray, member: int) -> tuple[np.ndarray, np.ndarray, Observation]:
-        slots = None if active is None else np.asarray(active)[member][None]
-        return jax.device_get(_evaluate(problem, z[None], weights[member][None], slots)[:3])
+        data = dataclasses.replace(problem.data, weight=weights[member])
+        slots = None if active is None else np.asarray(active)[member]
+        return _evaluate_at(with_effects(dataclasses.replace(problem, data=data), slots), z)[:3]
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         with Threads(CORES if made.is_set() else 1) as cores:
             results = list(cores.map(evaluate_one, z, members))
         made.set()  # the first call has compiled the program
-        return jax.tree.map(lambda *x: np.concatenate(x), *results)
+        return jax.tree.map(lambda *x: np.stack(x), *results)
 
     return evaluate
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _evaluate(
-    problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
-) -> tuple[Array, Array, Observation, LinearisedRun]:
-    """Result of `linearise_rollout` for members of a search, and their simulated runs."""
-
-    def evaluate_member(
-        z: Array, weight: Array, which: Array | None
-    ) -> tuple[Array, Array, Observation, LinearisedRun]:
-        problem_there = problem
-        if which is not None:
-            problem_there = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        observe: Histories = problem.observe.with_simulated_runs(problem_there.robot(z))  # type: ignore[attr-defined]
-        problem_there = dataclasses.replace(problem_there, observe=observe)
-        assert observe.known is not None
-        data = dataclasses.replace(problem.data, weight=weight)
-        r, jacobian, observation = linearise_rollout(problem_there, z, data)
-        penalties = adhesion_penalty_slice(data)  # negative, because adhesion is not penalised
-        return *zero_inactive_residuals(r, jacobian, penalties), observation, observe.known
-
-    return jax.vmap(evaluate_member)(z, weights, active)
+def _evaluate(problem: Problem, z: Array) -> tuple[Array, Array, Observation, LinearisedRun]:
+    """Result of `linearise_rollout` at z, and the simulated runs."""
+    observe: Histories = problem.observe.with_simulated_runs(problem.robot(z))  # type: ignore[attr-defined]
+    assert observe.known is not None
+    r, jacobian, observation = linearise_rollout(dataclasses.replace(problem, observe=observe), z, problem.data)
+    penalties = adhesion_penalty_slice(problem.data)  # negative, because adhesion is not penalised
+    return *zero_inactive_residuals(r, jacobian, penalties), observation, observe.known
 
 
 def _evaluate_at(problem: Problem, z: Numbers) -> tuple[Numbers, Numbers, Observation, LinearisedRun]:
-    """Result of `_evaluate` at one point, for the effects in the slots of the problem, as NumPy arrays."""
-    at = z, problem.data.weight, getattr(problem.coordinates, "active", None)
-    evaluated = _evaluate(problem, *jax.tree.map(lambda x: np.asarray(x)[None], at))
-    return jax.tree.map(lambda x: x[0], jax.device_get(evaluated))
+    """Result of `_evaluate`, as NumPy arrays."""
+    return jax.device_get(_evaluate(problem, jnp.asarray(z)))
 
 
 @functools.partial(compiled, options=SELDOM)
