@@ -269,7 +269,7 @@ OPTIONS = {
     ("sweep", "--dry-run"): ["--voltages", "--slopes", "--payloads", "--configurations", "--chunk", "--shard",
                              "--scheduler", "--outputs", "--export", "--config"],
     ("loop", "measured"): ["--prior", "--noise", "--seed", "--replicates", "--forbid", "--prefer", "--within", "--rows"],
-    ("calibrate", "measured"): ["--free", "--fix", "--starts", "--population", "--members"],
+    ("calibrate", "measured"): ["--free", "--fix", "--starts", "--population"],
     ("sensitivity",): ["--method", "--parameters", "--vary", "--evaluations", "--candidates"],
     ("climb",): ["--step", "--stairs", "--gap", "--terrain", "--sequence", "--find"],
     ("render", "x.png"): ["--time"],

@@ -167,9 +167,9 @@ def test_users_own_effects_travel_to_the_workers(tmp_path, two_workers):
     (tmp_path / "sealed.toml").write_text("[effects.seal_drag]\namplitude = 0.05\n")
     config = 'effects = ["mine.py"]\nrobot = "sealed.toml"\n' + CONFIG.replace("chunk = 40", "chunk = 100")
     (tmp_path / "plan.toml").write_text(config)
-    done = command(tmp_path, "--scheduler", two_workers.address, "--out", "there")
+    done = command(tmp_path, "--trust", "--scheduler", two_workers.address, "--out", "there")
     assert done.returncode == 0, done.stderr
-    assert command(tmp_path, "--out", "here").returncode == 0
+    assert command(tmp_path, "--trust", "--out", "here").returncode == 0
     assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
 
 
