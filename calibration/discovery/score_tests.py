@@ -85,9 +85,9 @@ class ProjectionFactors(eqx.Module):
     def of(linear: Linearization) -> ProjectionFactors:
         """Factors of a linearisation."""
         jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
-        right_sides = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
-        solved = solve_lower(jacobian.T @ jacobian, right_sides)
-        half, step = solved[:, :-1], solved[:, -1]
+        normal = jacobian.T @ jacobian
+        # Apart, because only the second depends on the table of a bootstrap.
+        half, step = solve_lower(normal, jacobian[:readings].T), solve_lower(normal, (jacobian.T @ e)[:, None])[:, 0]
         return ProjectionFactors(half, step, e[:readings] - half.T @ step)
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
