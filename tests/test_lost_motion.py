@@ -199,5 +199,5 @@ def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(
     monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
     robot = SimpleNamespace(has_ground=False)
     given = discover.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
-    given.__dict__["space"] = None
+    given.__dict__["space"] = SimpleNamespace(with_room=lambda names: None)
     assert given.trace_windows() == (["ranking", "windows base", "windows search 0"], "fit")

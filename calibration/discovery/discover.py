@@ -739,7 +739,7 @@ def equations_of_log(given: LoopInput) -> LoopInput | None:
         return None
     bare = space.bare
     motions = [c.settled for c in bare.channels if c.zero_at_rest]
-    # With every row, windows of an angle alone are biased: EMPS had half of its mass.
+    # With every row of an angle alone, the class of EMPS is tentative, and a pendulum leaves twice its noise.
     if given.runs.log is not None and (any(motions) or not motions):
         sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
         bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
