@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from test_log_kinds import carriage, servo, written
+from worlds import logs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -233,6 +234,23 @@ def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
     if kind == "servo":  # whose log has no noise
         assert np.all(np.abs(found.z) < 0.1)
     assert found is not None and np.all(np.abs(found.z) < 4)
+
+
+@pytest.mark.parametrize("imposed, every, seed", [("voltage", 0.005, 714), ("motor_current", 0.005, 739)])
+def test_noise_of_an_angle_alone_does_not_shrink_an_inertia(tmp_path, imposed, every, seed):
+    """Its derivative contained that noise, so inertias were too small by 3 to 18 posterior sds."""
+    case = logs.case(logs.rig(np.random.default_rng([41, 0, seed]), imposed, every, alone=True), "", 0.0, seed)
+    case.write(tmp_path)
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs, sd = (
+        records.read_runs(tmp_path / "table.csv", robot=robot).of(robot),
+        case.rig.noise("output_angle") * np.pi / 180,
+    )
+    problem = posed(runs, robot, sd).bare
+    fit, k = weak_form.fit_weak_form(problem), problem.coordinates.names.index("bench.inertia")
+    sds = np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian)))
+    low, value, high = (float(problem.coordinates.value(fit.z + x * sds)[k]) for x in (-1, 0, 1))
+    assert abs(value - case.label["constants"]["inertia"]) < 2.5 * (high - low) / 2
 
 
 def test_a_log_that_does_not_show_its_states_is_none(space):
