@@ -346,8 +346,8 @@ class _LogArrays:
         self.measured, self.sd = (np.asarray(x, float) for x in (problem.data.measured, problem.data.sd))
         states = [k for k in (plan.current, plan.motion if plan.mechanical else -1, *plan.others) if k >= 0]
         weight = np.asarray(problem.data.weight)
-        self.every = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
-        self.each = [rows[np.all(weight[rows][:, states] > 0, 1)] for rows in self.every]
+        of_runs = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
+        self.each = [rows[np.all(weight[rows][:, states] > 0, 1)] for rows in of_runs]
         long = [np.diff(self.time[rows]) for rows in self.each if len(rows) > 1]
         self.step = float(np.median(np.concatenate(long))) if long else 1.0
 
@@ -418,24 +418,23 @@ class _LogArrays:
 
     def course(self, cells: list[np.ndarray]) -> ImposedCourse:
         """Imposed quantities over time. `cells`: intervals of the points of each run."""
-        observe, runs = self.observe, len(cells)
-        imposed = {n: x for n in IMPOSED if (x := getattr(observe.conditions, n)) is not None and np.ptp(x) > 0}
+        times_of_runs = np.asarray(self.observe.times)
+        imposed = {n: np.asarray(x, float) for n in IMPOSED if (x := getattr(self.observe.conditions, n)) is not None}
         changing = {
-            n: np.asarray(x, float) if np.ndim(x) > 1 else np.full((runs, 1), 1.0) * np.c_[x]
+            n: np.broadcast_to(x if x.ndim > 1 else x.reshape(-1, 1), times_of_runs.shape)
             for n, x in imposed.items()
+            if np.ptp(x) > 0
         }
         linear = self.problem.base.rig.between_rows == "linear"
         knots, drive_changes = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
-        for run, cell in enumerate(cells):
-            times = np.asarray(observe.times[run])
+        for run, (times, cell) in enumerate(zip(times_of_runs, cells, strict=True)):
             instants = np.flatnonzero(np.diff(times, prepend=-1.0) > 0)
             times, period = times[instants], times[-1] + 1.0
             time = np.r_[-period, times, times[-1] + period]
             begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
-                of_run = np.broadcast_to(x[run], observe.times[run].shape)[instants]
-                padded = of_run[np.r_[0, 0 : len(of_run), -1]]
+                padded = x[run, instants[np.r_[0, 0 : len(instants), -1]]]
                 lines = linear or name in ("motor_speed", "motor_acceleration")
                 mean = 0.5 * (padded[1:] + padded[:-1]) if lines else padded[:-1]
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
