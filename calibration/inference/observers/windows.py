@@ -193,7 +193,7 @@ def problem_of_windows(
     data = dataclasses.replace(data_from_readings(none, np.ones_like(none), size), centre=jnp.asarray(fit.centre))
     reading_slopes = tuple(np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True))
 
-    def linearised(unknown: np.ndarray) -> WindowsLinearization:
+    def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
         factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
         white = np.stack([np.linalg.inv(x) for x in factors])
         arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
@@ -205,20 +205,22 @@ def problem_of_windows(
         errors = whole(fit.read.f[..., None], fit.read.y[..., None])[:, 0]
         prior = np.concatenate([np.zeros(len(run)), fit.origin - fit.centre])
         jacobian = np.concatenate([whole(*terms.by_z), np.zeros((len(run), size)), np.eye(size)])
-        return WindowsLinearization(
+        linear = WindowsLinearization(
             jnp.asarray(np.concatenate([errors, prior])), jnp.asarray(jacobian),
             finite_or_zero(jnp.asarray(whole(*terms.by_effects))), jnp.zeros((len(PROBED), 0)), data.weight,
             jax.tree.map(jnp.asarray, terms.signals), integrals, finite_or_zero(jnp.stack(reading_slopes)),
             fit.rows.time, fit.rows.angle, jnp.asarray(run),
             channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
+        return linear, factors
 
-    linear = linearised(unknown := np.zeros(len(places)))
+    linear, factors = linearised(unknown := np.zeros(len(places)))
+    of_readings = factors
     for _ in range(ROUNDS):  # the intensity depends on the weights of the windows, which depend on it
-        before, unknown = unknown, _unexplained(linear, parts, unknown, sd, fit, np.asarray(data.weight))
+        before, unknown = unknown, _unexplained(linear, parts, factors, of_readings, size, np.asarray(data.weight))
         if np.allclose(unknown, before, rtol=SAME):
             break
-        linear = linearised(unknown)
+        linear, factors = linearised(unknown)
     middle = np.take_along_axis(windows.rows, np.argmax(windows.weight, 1)[:, None], 1)[:, 0]
     table = {name: jnp.asarray(x) for name, x in columns(np.asarray(fit.rows.first)).items()}
     table |= {c.column: fit.rows.shown[:, k] for k, c in enumerate(problem.channels)}
@@ -231,13 +233,15 @@ def problem_of_windows(
 
 
 def _unexplained(
-    linear: WindowsLinearization, parts: list[RunWindows], unknown: np.ndarray, sd: np.ndarray, fit: WeakFormFit,
-    weight: np.ndarray,
+    linear: WindowsLinearization, parts: list[RunWindows], factors: list[np.ndarray], of_readings: list[np.ndarray],
+    size: int, weight: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Intensity of the disturbance of each equation that neither the readings nor a few effects explain.
 
     Args:
-        unknown: intensity for which the windows are weighted.
+        factors: Cholesky factors of the covariance that weights the windows of each part.
+        of_readings: the same factors for the noise of the readings alone.
+        size: number of base coordinates.
     """
     readings, places = linear.readings, linear.integrals.places
     columns, e = (np.asarray(x) for x in (linear.jacobian, linear.residual))
@@ -250,9 +254,6 @@ def _unexplained(
         norm = np.where(norm > 1e-3 * np.linalg.norm(signatures, axis=0), norm, np.inf)
         best = int(np.argmax(np.abs(rest.T @ left) / norm))
         columns = np.concatenate([columns, signatures[:, [best]]], 1)
-    factors, of_readings = (
-        [covariance_factor(fit.plan, w, sd, fit.smooth, x) for w in parts] for x in (unknown, 0.0 * unknown)
-    )
     by_window = left[:readings].reshape(linear.rows, -1)[:, list(places)]
     plain = [
         (x @ by_window[k].T.ravel()).reshape(len(places), -1).T
@@ -261,7 +262,7 @@ def _unexplained(
     noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in of_readings]
     unit = [np.tile(np.sum(w.weight**2 / w.steps, 1)[:, None], len(places)) for w in parts]
     counts = weight[:, places[0]] > 0
-    free = counts.sum() / max(counts.sum() - (fit.z.size + FITTED) / len(places), 1.0)
+    free = counts.sum() / max(counts.sum() - (size + FITTED) / len(places), 1.0)
     of_windows = (np.concatenate(x)[counts] for x in (plain, noise, unit))
     defect, variance, per_intensity = of_windows
     return disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
