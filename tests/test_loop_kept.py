@@ -15,8 +15,8 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover as room
-from calibration.discovery import kept
 from calibration.discovery.kept import OutOfTime
+from calibration.inference import population
 from mmrjax.compile import programs
 from sweeps import config
 from sweeps import stage_files as kept_stages
@@ -212,4 +212,4 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
 
 def test_nothing_is_kept_where_nobody_asks():
-    assert kept.compute_without_storing("base", lambda: 3) == 3
+    assert population.compute_without_storing("base", lambda: 3) == 3

@@ -23,7 +23,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
 from calibration.described import describe, report_in_words
-from calibration.discovery import findings, kept, menu, prediction, preference, scales
+from calibration.discovery import findings, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
@@ -37,7 +37,6 @@ from calibration.discovery.description import missed_channels, remaining_errors,
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
-from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.log_simulation import LogSimulation, refine_by_simulation, simulate_models
 from calibration.discovery.loop_notes import (
@@ -87,6 +86,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.linear_rows import problem_of_readings
 from calibration.inference.observers.windows import Windows, problem_of_windows
+from calibration.inference.population import StoreStage, compute_without_storing
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from calibration.inference.simulation_errors import channel_errors
@@ -143,7 +143,7 @@ def discover(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
-    keep: StoreStage = kept.compute_without_storing,
+    keep: StoreStage = compute_without_storing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
     """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
@@ -253,7 +253,7 @@ class LoopInput:
     notes: Notes = ()
     at_first: Notes = ()
     progress: Tell = lambda note: None
-    keep: StoreStage = kept.compute_without_storing
+    keep: StoreStage = compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
     equations: CandidateSpace | None = None

@@ -21,7 +21,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark, progress_remark
-from calibration.inference.population import StoreStage
+from calibration.inference.population import StoreStage, compute_without_storing
 from calibration.inference.result import CalibrationResult
 from mmrjax.effects import UNNAMED
 from mmrjax.model import channels
@@ -75,7 +75,7 @@ def fit_track_model(
     noise: str | None = None,
     population: int | None = None,
     generations: int | None = None,
-    keep: StoreStage = lambda name, make: make(),
+    keep: StoreStage = compute_without_storing,
     seed: int = 0,
     tell: Callable[[Remark | str], None] = lambda note: None,
 ) -> TrackModelResult | None:

@@ -36,7 +36,7 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
-from calibration.inference.population import GENERATIONS, LEAST, StoreStage
+from calibration.inference.population import GENERATIONS, LEAST, StoreStage, compute_without_storing
 from calibration.inference.preparation import PreparedInput, prepare_input
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import calibration_remarks, row_numbers
@@ -70,7 +70,7 @@ def calibrate(
     starts: int | None = None,
     population: int | None = None,
     generations: int | None = None,
-    keep: StoreStage = lambda name, make: make(),
+    keep: StoreStage = compute_without_storing,
     seed: int = 0,
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,

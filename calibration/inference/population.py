@@ -112,6 +112,11 @@ Objective = Callable[[np.ndarray, MemberObservations], Float[np.ndarray, " membe
 StoreStage = Callable[[str, Callable[[], Any]], Any]
 
 
+def compute_without_storing(name: str, make: Callable[[], Any]) -> Any:
+    """Computes the result of a stage without storing it."""
+    return make()
+
+
 def simulate_members(
     posed: Problem,
     points: np.ndarray,
@@ -194,7 +199,7 @@ def run_evolution(
     generations: int,
     beside: np.ndarray | None = None,
     tell: Callable[[Remark], None] = lambda step: None,
-    keep: StoreStage = lambda name, make: make(),
+    keep: StoreStage = compute_without_storing,
 ) -> Population:
     """Searches by generations: each is drawn around the best members of the generations before.
 
