@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import input_files
-from calibration.data.sources.recorded_signals import Load, Signal
+from calibration.data.sources.recorded_signals import Signal
 
 #: Longest list whose elements become signals.
 MOST = 64
@@ -23,13 +24,8 @@ def signals_of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
 
     file = parquet.ParquetFile(path)
     rows, schema = file.metadata.num_rows, file.schema_arrow
-    size = input_files.VALUE * rows * file.metadata.num_columns
-    input_files.check_declared(name, file.metadata.num_columns, size, path.stat().st_size)
-
-    def column(field: str) -> Load:
-        return lambda: values_of_arrow_column(file.read([field], use_threads=True).column(0))
-
-    return tuple(s for field in schema for s in _signals(field, rows, column(field.name), file.read))
+    input_files.check_declared(name, len(schema), input_files.VALUE * rows * len(schema), path.stat().st_size)
+    return _signals(schema, rows, lambda k: file.read([schema.names[k]], use_threads=True).column(0))
 
 
 def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
@@ -39,66 +35,51 @@ def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     """
     import pyarrow as pa
 
-    def reader(file: Any, **options: Any) -> Any:
-        stream = file.read(6) != b"ARROW1"
-        file.seek(0)
-        return (pa.ipc.open_stream if stream else pa.ipc.open_file)(file, **options)
+    opened = pa.ipc.open_file if input_files.first_bytes(path, name).startswith(b"ARROW1") else pa.ipc.open_stream
 
     def column(k: int) -> Any:
         with pa.OSFile(str(path)) as file:
-            return reader(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all()
+            return opened(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all().column(0)
 
     with pa.OSFile(str(path)) as file:
-        schema = reader(file).schema
+        schema = opened(file).schema
     input_files.check_declared(name, len(schema))
-    rows = column(0).num_rows if len(schema) else 0
-
-    def values(k: int) -> Load:
-        return lambda: values_of_arrow_column(column(k).column(0))
-
-    def whole(k: int) -> Callable[[list[str]], Any]:
-        return lambda names: column(k)
-
-    return tuple(s for k, field in enumerate(schema) for s in _signals(field, rows, values(k), whole(k)))
+    return _signals(schema, len(column(0)) if len(schema) else 0, column)
 
 
 def signals_of_arrow_table(table: Any) -> tuple[Signal, ...]:
     """Signals of a `pyarrow.Table`."""
-
-    def column(field: str) -> Load:
-        return lambda: values_of_arrow_column(table.column(field))
-
-    return tuple(
-        s for field in table.schema for s in _signals(field, table.num_rows, column(field.name), table.select)
-    )
+    return _signals(table.schema, table.num_rows, table.column)
 
 
-def _signals(field: Any, rows: int, load: Load, read: Callable[[list[str]], Any]) -> list[Signal]:
-    """Signals of a column. A column of lists has one signal for each element, `name[0]`."""
-    import pyarrow.types as kinds
+def _signals(schema: Any, rows: int, column: Callable[[int], Any]) -> tuple[Signal, ...]:
+    """Signals of columns. A column of lists has one signal for each element, `name[0]`.
 
-    kind = field.type
-    if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
-        return [_signal(field, rows, load)]
+    Args:
+        column: function that reads a column by its index.
+    """
     import pyarrow as pa
+    import pyarrow.types as kinds
     from pyarrow import compute
 
-    column = read([field.name]).column(0)
-    lengths = compute.unique(compute.list_value_length(column)).to_pylist()
-    if len(lengths) != 1 or not lengths[0]:
-        why = "holds lists of several lengths; expected one length in every row"
-        return [Signal(field.name, rows, load, refused=why)]
+    signals = []
+    for k, field in enumerate(schema):
+        kind, whole = field.type, functools.partial(column, k)
+        if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
+            signals.append(_signal(field, rows, whole))
+            continue
+        lengths = compute.unique(compute.list_value_length(whole())).to_pylist()
+        if len(lengths) != 1 or not lengths[0]:
+            why = "holds lists of several lengths; expected one length in every row"
+            signals.append(Signal(field.name, rows, whole, refused=why))
+            continue
+        for j in range(min(lengths[0], MOST)):
+            element = functools.partial(lambda read, j: compute.list_element(read(), j), whole, j)
+            signals.append(_signal(pa.field(f"{field.name}[{j}]", kind.value_type), rows, element))
+    return tuple(signals)
 
-    def element(k: int) -> Load:
-        return lambda: values_of_arrow_column(compute.list_element(column, k))
 
-    return [
-        _signal(pa.field(f"{field.name}[{k}]", kind.value_type), rows, element(k))
-        for k in range(min(lengths[0], MOST))
-    ]
-
-
-def _signal(field: Any, rows: int, load: Load) -> Signal:
+def _signal(field: Any, rows: int, column: Callable[[], Any]) -> Signal:
     import pyarrow.types as kinds
 
     kind, metadata = field.type, field.metadata or {}
@@ -109,6 +90,7 @@ def _signal(field: Any, rows: int, load: Load) -> Signal:
     number = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind) or kinds.is_decimal(kind)
     timed = kinds.is_timestamp(kind) or kinds.is_duration(kind)
     refused = "" if words or number or timed or kinds.is_null(kind) else f"holds {kind}; expected numbers or words"
+    load = lambda: values_of_arrow_column(column())  # noqa: E731
     return Signal(field.name, rows, load, unit, words=words, refused=refused)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -34,21 +34,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     library = type(source).__module__.partition(".")[0]
     kind = type(source).__name__
     if library == "pandas" and kind == "DataFrame":
-        signals = []
-        for level in range(source.index.nlevels):
-            index = source.index.get_level_values(level)
-            has_named_index = index.name is not None or index.dtype.kind in "mM"
-            if has_named_index:
-                signals.append(_of_series(str(index.name or "time"), index, len(source)))
-        signals += [
-            _of_series(
-                ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column),
-                source.iloc[:, j],
-                len(source),
-            )
-            for j, column in enumerate(source.columns)
-        ]
-        return "the DataFrame", tuple(signals)
+        return "the DataFrame", tuple(_of_frame(source))
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
         try:
             frame = source.collect() if kind == "LazyFrame" else source
@@ -58,9 +44,7 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     if library == "pyarrow" and kind in ("Table", "RecordBatch"):
         import pyarrow as pa
 
-        return "the Arrow table", columnar.signals_of_arrow_table(
-            source if kind == "Table" else pa.Table.from_batches([source])
-        )
+        return "the Arrow table", columnar.signals_of_arrow_table(pa.table(source))
     if library == "xarray" and kind in ("Dataset", "DataArray"):
         return f"the {kind}", _of_xarray(
             source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
@@ -78,29 +62,18 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     raise BadData(f"the source: got {kind}; expected {EXPECTED}")
 
 
-def _of_series(name: str, series: Any, rows: int) -> Signal:
-    dtype = series.dtype
-    kind = getattr(dtype, "kind", "O")
-    if refused := "" if kind == "O" else refused_type(dtype):
-        return Signal(name, rows, lambda: np.empty(0), refused=refused)
-    if kind in "mM":  # a time zone does not change elapsed times
-        return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=f"{kind}8[ns]")))
-    words = str(dtype) in ("str", "string", "category") or str(dtype).startswith("string")
-    if kind == "O" and not words:
-        kinds = {type(value) for value, is_missing in zip(series, series.isna(), strict=True) if not is_missing}
-        if kinds and kinds <= {str}:
-            words = True
-        elif kinds and not kinds <= {int, float, bool, np.float64, np.int64}:
-            return Signal(name, rows, lambda: np.empty(0), refused="holds objects; expected numbers or words")
-    if words:
-        return Signal(name, rows, _words(series), words=True)
-    return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=float, na_value=np.nan)))
+def _of_frame(frame: Any) -> Iterator[Signal]:
+    """Signals of a pandas DataFrame, and of its index if that has a name or times."""
+    import pyarrow as pa
 
-
-def _words(series: Any) -> Load:
-    return lambda: np.array(
-        ["" if is_missing else str(value) for value, is_missing in zip(series, series.isna(), strict=True)]
-    )
+    levels = [frame.index.get_level_values(level) for level in range(frame.index.nlevels)]
+    named = [(level.name or "time", level) for level in levels if level.name is not None or level.dtype.kind in "mM"]
+    for title, series in (*named, *((title, frame.iloc[:, j]) for j, title in enumerate(frame.columns))):
+        name = ".".join(filter(None, map(str, title if isinstance(title, tuple) else (title,))))
+        try:
+            yield from columnar.signals_of_arrow_table(pa.table([pa.array(series, from_pandas=True)], [name]))
+        except pa.ArrowException:  # complex numbers, or objects of several kinds
+            yield Signal(name, len(frame), lambda: np.empty(0), refused=refused_type(series.dtype))
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
