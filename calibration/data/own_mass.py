@@ -13,7 +13,8 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
+from calibration.data.named_arrays import check_rows
 from calibration.data.runs import Runs
 from calibration.data.surface_labels import rows_of_scaled_adhesion
 from mmrjax.model import params
@@ -57,14 +58,10 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     low, high = next(
         p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
     ).spec.bounds
-    wrong = np.flatnonzero((own_masses < low) | (own_masses > high))
-    if wrong.size:
-        row = int(wrong[0])
-        raise BadData(
-            f"{runs.source} row {row + 1}, total_mass_kg: got {runs['total_mass_kg'][row]:g} "
-            "with a payload of "
-            f"{runs['payload_kg'][row]:g} kg; expected {low:g} to {high:g} kg without the payload"
-        )
+    wrong, payload = (own_masses < low) | (own_masses > high), runs["payload_kg"]
+    end = f"expected {low:g} to {high:g} kg without the payload"
+    why = lambda row: f" with a payload of {payload[row]:g} kg; {end}"  # noqa: E731
+    check_rows(runs.source, runs.columns, [("total_mass_kg", wrong, why)])
     masses = {}
     for index in np.unique(configuration_index):
         is_own_row = configuration_index == index

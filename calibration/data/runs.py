@@ -337,6 +337,7 @@ def single_run(cells: Json, layout: Layout | None) -> Runs:
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
-        raise BadConfiguration(row_checks.too_light_message("option", cells["total_mass_kg"], cells["payload_kg"]))
+        total = f"option, total_mass_kg: got {cells['total_mass_kg']:g}"
+        raise BadConfiguration(total + row_checks.too_light(cells["payload_kg"]))
     columns = {c: np.array([cells[c]]) if isinstance(cells.get(c), float) else v for c, v in columns.items()}
     return Runs("the options", columns, layout=layout)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import Columns, delimited, input_files, named_arrays
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.named_arrays import column_texts
+from calibration.data.named_arrays import Check, check_rows, column_texts
 from calibration.data.sources import reading
 from mmrjax.climbing import terrain
 from mmrjax.climbing.climb_simulation import ON_GROUND, LeverSequence, roller_clearance
@@ -127,19 +127,15 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Leve
     column_sets = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
     columns, names = _read_columns(path, "--sequence", column_sets)
     abscissa = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
-    if (falls := np.flatnonzero(np.diff(abscissa) <= 0)).size:
-        raise BadData(
-            f"{path.name} row {falls[0] + 3}, {names[0]}: got {columns[names[0]][falls[0] + 1]:g} after "
-            f"{columns[names[0]][falls[0]]:g}; expected increasing values"
-        )
+    falls = np.diff(columns[names[0]], prepend=-np.inf) <= 0
+    before = np.roll(columns[names[0]], 1)
+    checks: list[Check] = [(names[0], falls, lambda row: f" after {before[row]:g}; expected increasing values")]
     over_time = names[0] == "time_s"
     if names[1:] == volts:
-        for name in volts:
-            for k, value in enumerate(columns[name]):
-                if abs(value) > HIGHEST:
-                    raise BadData(
-                        f"{path.name} row {k + 2}, {name}: got {value:g} V; expected -{HIGHEST:g} to {HIGHEST:g} V"
-                    )
+        allowed = f" V; expected -{HIGHEST:g} to {HIGHEST:g} V"
+        checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in volts]
+    check_rows(path.name, columns, checks, 2)
+    if names[1:] == volts:
         front, rear = (jnp.asarray(columns[name]) for name in volts)
         return LeverSequence(jnp.asarray(abscissa), front, rear, jnp.asarray(begins), over_time)
     for name in angles:
