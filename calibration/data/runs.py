@@ -94,8 +94,7 @@ def read_runs(
         is_plain_file = isinstance(source, str | Path) and not opening.files_of_group(str(source))
         if is_plain_file and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        reading_found = reading.read_columns(source, layout, preset, between)
-        arrays, mapped = reading_found.arrays, reading_found.mapped
+        arrays, mapped = reading.read_columns(source, layout, preset, between)
     has_known_columns = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
     if not has_known_columns and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
