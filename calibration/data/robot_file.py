@@ -238,8 +238,8 @@ def _robot_before_parameters(
     sds = stated.split_values_and_sds(tables, where)
     values = dict(_flatten(tables))
     sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
-    loads = loads_from_tables(base, content, sds, where)
-    rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
+    loads, travels, linear, lacking = loads_from_tables(base, content, sds, where)
+    rig = rig_file.parse_rig(content, where, list(loads), travels=travels, inherits=base is not None)
     if "controller" in content and not rig.follows_goal:
         raise BadConfiguration(
             f"{where}, controller: cannot be combined with imposed = {toml_value(rig.imposed)}; a controller needs "
@@ -247,11 +247,9 @@ def _robot_before_parameters(
         )
     controller = Controller() if rig.follows_goal else None
     if base is not None:
-        robot = dataclasses.replace(
-            base, configurations=Configurations(loads.by_name), rig=rig, controller=controller
-        )
-        return robot, sds, loads.linear
-    robot = paper_robots.blank_robot(Configurations(loads.by_name), rig=rig)
+        robot = dataclasses.replace(base, configurations=Configurations(loads), rig=rig, controller=controller)
+        return robot, sds, linear
+    robot = paper_robots.blank_robot(Configurations(loads), rig=rig)
     robot = dataclasses.replace(robot, controller=controller)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     file_values = dict(_flatten(content))
@@ -263,10 +261,10 @@ def _robot_before_parameters(
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
     missing = [name for name in rig_file.required_parameters(rig, file_values.items()) if name not in file_values]
-    if not loads.travels and "speed" in rig.channels:
-        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in file_values]
-    rig_file.reject_missing([*missing, *loads.missing], parameters, where, file_values)
-    return robot, sds, loads.linear
+    if not travels and "speed" in rig.channels:
+        missing += [f"{name}.radius" for name in loads if f"{name}.radius" not in file_values]
+    rig_file.reject_missing([*missing, *lacking], parameters, where, file_values)
+    return robot, sds, linear
 
 
 def _scaled_effect(library: Library, name: str, factors: Any, where: str) -> type[effects.Effect]:
