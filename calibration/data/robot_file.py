@@ -546,21 +546,20 @@ def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tu
         part, _, key = name.partition(".")
         return getattr(getattr(owner, part), key, None)
 
-    for name, (_, _, unit, meaning) in RATINGS.items():
+    for name in (*RATINGS, *SWITCHES, *CHOICES):
         part, _, key = name.partition(".")
-        rating = value(robot, name)
+        setting, meaning = value(robot, name), SWITCHES.get(name, "")
+        differs = setting != value(nothing, name)
         must_state = key == "capacity_curve" and part in stated  # otherwise it would follow from the capacity
-        if rating is not None and (inherits or must_state or rating != value(nothing, name)):
-            stated = stated | {part}
-            yield part, f"{key} = {rating!r}  # [{unit}] {meaning if inherits else meaning.partition(';')[0]}"
-    for name, meaning in SWITCHES.items():
-        part, _, key = name.partition(".")
-        if inherits or value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {str(value(robot, name)).lower()}  # {meaning}"
-    for name, (_, meaning) in CHOICES.items():
-        part, _, key = name.partition(".")
-        if value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {toml_value(value(robot, name))}  # {meaning}"
+        if setting is None or not (differs or must_state or (inherits and name not in CHOICES)):
+            continue
+        stated = stated | {part}
+        if name in RATINGS:
+            _, _, unit, words = RATINGS[name]
+            meaning = f"[{unit}] {words if inherits else words.partition(';')[0]}"
+        elif name in CHOICES:
+            meaning = CHOICES[name][1]
+        yield part, f"{key} = {toml_value(setting)}  # {meaning}"
 
 
 def _flatten(content: Json, prefix: str = "") -> list[tuple[str, Any]]:

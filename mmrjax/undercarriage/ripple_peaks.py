@@ -23,26 +23,16 @@ from mmrjax.undercarriage.running_gear import TEETH_PULLEY
 Series = Float[np.ndarray, " samples"]
 
 
-class Ripple(NamedTuple):
-    """Periodic fluctuation of a signal about its mean.
-
-    Attributes:
-        mean: mean [unit of the signal].
-        amplitude: half of the peak-to-peak value, relative to the mean [-].
-        period: period of repetition [s]. NaN: no repetition within half the record.
-    """
-
-    mean: float
-    amplitude: float
-    period: float
-
-
-def measure_ripple(time: Series, values: Series) -> Ripple:
+def measure_ripple(time: Series, values: Series) -> tuple[float, float, float]:
     """Ripple of evenly sampled `values`, with a linear drift removed.
 
     Two events per pitch (a grouser lands in front, another lifts at the rear) make a harmonic the strongest
     line of the spectrum. The period is therefore the first lag with an autocorrelation of at least 0.9 of the
     largest. It is refined by a parabola and by counting on to the last such repetition.
+
+    Returns:
+        Mean [unit of the signal], half of the peak-to-peak value relative to the mean [-], and period of repetition
+        [s]. NaN: no repetition within half the record.
     """
     time, values = np.asarray(time, float), np.asarray(values, float)
     detrended = values - np.polyval(np.polyfit(time, values, 1), time)
@@ -60,7 +50,7 @@ def measure_ripple(time: Series, values: Series) -> Ripple:
         near = np.abs(good / fundamental - period_counts) < 0.2
         last = good[near][-1]
         period = float(_parabola_vertex(agreement, last) / np.round(last / fundamental) * (time[1] - time[0]))
-    return Ripple(float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period)
+    return float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period
 
 
 def measure_fluctuation(time: Series, values: Series) -> tuple[float, float, float]:
