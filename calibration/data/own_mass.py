@@ -14,8 +14,7 @@ import numpy as np
 
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.named_arrays import check_rows
-from calibration.data.runs import Runs
-from calibration.data.surface_labels import rows_of_scaled_adhesion
+from calibration.data.table import Runs, rows_of_scaled_adhesion
 from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH
 from mmrjax.model.robot import Robot

@@ -29,14 +29,13 @@ from calibration.data import (
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
-from calibration.data.computed_columns import drop_computed_torques
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.invalid_readings import drop_computed_torques, without_unread
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
-from calibration.data.sources.in_memory import EXPECTED
+from calibration.data.sources.columnar import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
-from calibration.data.unread_rows import without_unread
 from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import STARTS

@@ -43,7 +43,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
 
     Args:
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
-            (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
+            (`columnar.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
         layout: layout of the table's robot.
         columns: names of the source's columns, in addition to those in the robot file, over which they take
             precedence.
