@@ -282,7 +282,7 @@ def loop_parameter_names(
         drive, chassis: further parameters that the data determine, see `Observer.free`.
         idle: as in `names_to_fit`.
     """
-    present = set(configurations)
+    present, fields = set(configurations), parameters_by_name(robot)
     names = [
         name
         for c in robot.configurations
@@ -290,7 +290,7 @@ def loop_parameter_names(
         for name in (
             *friction_names(robot, c),
             *([f"{c}.radius"] if robot.shows_travel else []),
-            *(f"{c}.{n}" for n in chassis if _parameter_is_nonzero(robot, c, n)),
+            *(f"{c}.{n}" for n in chassis if f"{c}.{n}" in fields and float(fields[f"{c}.{n}"].value) != 0.0),
         )
     ]
     names = [n for n in names if _leading_parameter(robot, n) is None]
@@ -315,12 +315,6 @@ def _leading_parameter(robot: Robot, name: str) -> str | None:
     configuration, _, key = name.partition(".")
     leader = dict(robot.rig.surfaces).get(configuration)
     return None if leader is None or key.startswith(GROUND) else f"{leader}.{key}"
-
-
-def _parameter_is_nonzero(robot: Robot, configuration: str, name: str) -> bool:
-    """True if a load has a parameter of this name that is not zero."""
-    field = parameters_by_name(robot).get(f"{configuration}.{name}")
-    return field is not None and float(field.value) != 0.0
 
 
 #: Parameters of the drive that act only on the voltage.

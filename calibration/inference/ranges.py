@@ -79,7 +79,9 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
             continue
         units = _possible_units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (
-            unknown or kind.axis or _may_be_slip(robot, channel, factor)
+            unknown
+            or kind.axis
+            or (not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1)
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _range_factor(measured[:, k], possible[1:2, :, k])
@@ -190,11 +192,6 @@ def _possible_units(channel: Channel, measured: np.ndarray, possible: np.ndarray
         other_units["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     distance = {unit: abs(math.log(_range_factor(measured / f, possible))) for unit, f in other_units.items()}
     return sorted((u for u, x in distance.items() if x < math.log(ALIKE)), key=distance.__getitem__)
-
-
-def _may_be_slip(robot: Robot, channel: Channel, factor: float) -> bool:
-    """True if a low speed may be due to slip of tracks or wheels on an unspecified ground."""
-    return not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1
 
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:

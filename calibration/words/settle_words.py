@@ -102,30 +102,23 @@ def sentence_on_few_settled_runs(found: Settled, fewest: int, loop: str) -> str:
     )
 
 
-def glitch_sentences(found: Settled) -> list[str]:
-    """Sentences on the readings that means leave out because they are far from the others, one for each channel."""
-    sentences = []
+def settle_remarks(found: Settled) -> list[str]:
+    """Sentences on what should be looked at."""
+    remarks = []
+    if found.gaps:
+        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}. No segment spans such a gap")
     for channel in (s.channel for s in found.signals):
         glitch_stretches = [s for s in found.kept if channel.name in s.glitches]
         if glitch_stretches:
             counts = [s.glitches[channel.name] for s in glitch_stretches]
             worst = glitch_stretches[counts.index(max(counts))]
-            sentences.append(
+            remarks.append(
                 f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
                 f"{count_noun(len(glitch_stretches), 'settled run')} left out of the mean, because they are far from "
                 f"the readings next to them. Most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
                 f"({100 * max(counts) / len(worst.rows):.2g} %). Check the instrument, or log a mean if it "
                 "delivers pulses"
             )
-    return sentences
-
-
-def settle_remarks(found: Settled) -> list[str]:
-    """Sentences on what should be looked at."""
-    remarks = []
-    if found.gaps:
-        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}. No segment spans such a gap")
-    remarks += glitch_sentences(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:

@@ -220,19 +220,17 @@ def _operating_condition_lines(name: str, library: Library) -> Iterator[Line]:
 def _output_lines(name: str, library: Library) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
         yield "is", f"{o.label} [{o.unit_shown}]"
-        if (meaning := _attribute_description(Result, o.name)) and o in outputs.FURTHER:
-            yield "equation", meaning
+        # The description is in the docstring of the class.
+        text = " ".join((inspect.getdoc(Result) or "").partition("Attributes:")[2].split())
+        match = re.search(
+            rf"(?:^|[.\]] |, |; )(?:\w+, )*{o.name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text
+        )
+        if match is not None and o in outputs.FURTHER:
+            yield "equation", match[1].rstrip(".")
         source_words = (
             "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
         )
         yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else source_words}"
-
-
-def _attribute_description(kind: type, name: str) -> str:
-    """Description of an attribute, from the docstring of its class."""
-    text = " ".join((inspect.getdoc(kind) or "").partition("Attributes:")[2].split())
-    match = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
-    return "" if match is None else match[1].rstrip(".")
 
 
 def _parameter_lines(name: str, library: Library) -> Iterator[Line]:

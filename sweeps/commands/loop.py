@@ -100,7 +100,15 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         def keep(name: str, make: Callable[[], T]) -> T:
             result = stages[name] = folder.stage(name, make)
             if name == "ranking":
-                _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
+                # The ranking by regression is the first answer.
+                ranking: EffectRanking = stages[name]
+                first_line, *lines = loop_words.ranking_lines(ranking, brief=not beside.verbose)
+                timed(first_line)
+                for line in lines:
+                    print_message(line)
+                answer = loop_words.regression_verdict(ranking)
+                content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(ranking)}
+                folder.write_json(store.SCREENING_FILE, content)
             if name == "verdict":
                 timed(f"{loop_words.verdict_line(stages[name])}. Next: held-out errors and other noise levels")
             return result
@@ -168,17 +176,6 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, handler_before)
-
-
-def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
-    """Prints the ranking by regression, the first answer, and writes it to the run folder."""
-    first_line, *lines = loop_words.ranking_lines(found, brief=brief)
-    timed(first_line)
-    for line in lines:
-        print_message(line)
-    answer = loop_words.regression_verdict(found)
-    content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
-    folder.write_json(store.SCREENING_FILE, content)
 
 
 def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:

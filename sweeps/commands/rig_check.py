@@ -358,23 +358,6 @@ def check_document(found: RigCheck) -> Document:
     sds = ("" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact" for o in found.origins)
     numbers = [(o.name, o.value, sd, o.unit, o.why) for o, sd in zip(found.origins, sds, strict=True)]
     follows = [(fact.what, fact.value, "LOOK" if fact.odd else "ok") for fact in found.facts]
-    return Document(
-        found.file,
-        f"{found.file}: {found.statement()}",
-        (
-            Note(" ".join(found.understood()), terminal=True),
-            Table("channels", columns("channel", "column", "sign", "step |", "sd"), blocks, "channels"),
-            Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
-            Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
-            *remarks(found.remarks()),
-            *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
-        ),
-        brief=_brief(found),
-    )
-
-
-def _brief(found: RigCheck) -> Names:
-    """Lines printed below the answer: the rig, columns of the table, and what to check."""
     table: Names = ()
     if found.runs is not None:
         used = [
@@ -387,7 +370,19 @@ def _brief(found: RigCheck) -> Names:
     notes = found.remarks()
     check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
     further_remarks = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
-    return " ".join(found.understood()), *table, f"{check} --verbose prints all tables{further_remarks}."
+    return Document(
+        found.file,
+        f"{found.file}: {found.statement()}",
+        (
+            Note(" ".join(found.understood()), terminal=True),
+            Table("channels", columns("channel", "column", "sign", "step |", "sd"), blocks, "channels"),
+            Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
+            Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
+            *remarks(found.remarks()),
+            *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
+        ),
+        brief=(" ".join(found.understood()), *table, f"{check} --verbose prints all tables{further_remarks}."),
+    )
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from calibration.data import Json, Names
+from calibration.data import Json
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -61,7 +61,18 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     file = load_robot(config)
     if config.method not in METHODS:
         raise BadConfiguration(f"--method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
-    ranges = _varied_ranges(config.vary)
+    ranges: dict[str, tuple[float, float]] = {}
+    for text in config.vary:
+        name, _, ends = text.partition("=")
+        low, _, high = ends.partition(":")
+        if name in ranges:
+            raise BadConfiguration(f"--vary {name}: given twice; give it once")
+        try:
+            ranges[name] = float(low), float(high)
+        except ValueError:
+            raise BadConfiguration(
+                f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
+            ) from None
     freed = [name for name in ranges if name in OF_TURNS]
     robot = showing_turns(file.robot, freed)
     outputs = chosen_outputs(config.outputs, robot, bool(freed))
@@ -100,23 +111,6 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
             page=document,
             runs=runs,
         )
-
-
-def _varied_ranges(vary: Names) -> dict[str, tuple[float, float]]:
-    """Range of each varied condition, from options `name=low:high`."""
-    ranges: dict[str, tuple[float, float]] = {}
-    for text in vary:
-        name, _, ends = text.partition("=")
-        low, _, high = ends.partition(":")
-        if name in ranges:
-            raise BadConfiguration(f"--vary {name}: given twice; give it once")
-        try:
-            ranges[name] = float(low), float(high)
-        except ValueError:
-            raise BadConfiguration(
-                f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
-            ) from None
-    return ranges
 
 
 def _operating_points(

@@ -149,9 +149,21 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
     texts = texts_of(drive)
     checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
     if follows_angle or (drive.loose and drive.controller is None):
-        checks |= _start_difference(
-            drive, texts, GOAL if follows_angle else volts, motor.ratio if follows_angle else 1.0
+        command = GOAL if follows_angle else volts
+        times = np.linspace(0.0, START, 26)
+        controller = drive.controller
+        conditions = (
+            Conditions(voltage=command)
+            if controller is None
+            else Conditions(voltage=controller.supply_voltage, goal=command)
         )
+        run = drive_batch(
+            drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
+        )
+        native = np.asarray(run.signals.angle)[0]
+        mujoco_angles = mujoco.angles_in_mujoco(texts, command * (motor.ratio if follows_angle else 1.0), times)
+        share = 100 * float(np.sqrt(np.mean((mujoco_angles - native) ** 2)) / np.sqrt(np.mean(native**2)))
+        checks |= {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(
@@ -180,24 +192,6 @@ def _check_in_mujoco(
         "speed, law against native [%]": apart(law.speed, native.speed),
         "speed, MuJoCo C against native [%]": apart(mujoco_results.speed, native.speed),
     }
-
-
-def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
-    """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
-    times = np.linspace(0.0, START, 26)
-    controller = drive.controller
-    conditions = (
-        Conditions(voltage=command)
-        if controller is None
-        else Conditions(voltage=controller.supply_voltage, goal=command)
-    )
-    run = drive_batch(
-        drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
-    )
-    native = np.asarray(run.signals.angle)[0]
-    mujoco_angles = mujoco.angles_in_mujoco(texts, command * ratio, times)
-    share = 100 * float(np.sqrt(np.mean((mujoco_angles - native) ** 2)) / np.sqrt(np.mean(native**2)))
-    return {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
 
 
 def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:

@@ -339,9 +339,11 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
         rate = None
         if effect.memory_size is not None:
             rate = lambda r, s, alone=alone: alone(r)[0].rate(r, s)  # noqa: E731
+        equation, *further = (inspect.getdoc(type(effect).plain or type(effect)) or effect.name).split("\n\n")
+        meaning = further[0] if further and not further[0].startswith("Source") else ""
         yield _trace_part(
-            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], *effect_docstring(effect),
-            variable.get(effect.balance, ""), value, rate, effect.name,
+            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], " ".join(equation.split()),
+            " ".join(meaning.split()), variable.get(effect.balance, ""), value, rate, effect.name,
         )  # fmt: skip
 
 
@@ -358,20 +360,6 @@ def _trace_part(
         slope = trace(rate, name, balance, f"memory.{name}")
         part = dataclasses.replace(part, rate=trace(rate, name, balance), rate_slope=slope)
     return part
-
-
-def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
-    """Equation and meaning of an effect, from its docstring."""
-    kind = effect if isinstance(effect, type) else type(effect)
-    paragraphs = (inspect.getdoc(kind.plain or kind) or kind.name).split("\n\n")
-    head = " ".join(paragraphs[0].split())
-    second = " ".join(paragraphs[1].split()) if len(paragraphs) > 1 else ""
-    return head, "" if second.startswith("Source") else second
-
-
-def memory_grows(part: Part) -> bool:
-    """True if a part's memory grows without limit, as a phase does. Instead of a settled value it has the mean 0."""
-    return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
 
 
 def channels_of(joint: DriveJoint) -> tuple[Any, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -164,11 +163,10 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     radius = float(joint.load.radius)
     drive_signals = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
     command = robot.driver.voltage(*map(jnp.asarray, drive_signals))
-    measured = (
-        _measured_readings(moving_runs, channels)
-        if data is not None
-        else np.full((len(moving_runs), len(channels)), np.nan)
-    )
+    measured = np.full((len(moving_runs), len(channels)), np.nan)
+    if data is not None:
+        by_name = {c.name: moving_runs.measured()[:, k] for k, c in enumerate(moving_runs.channels)}
+        measured = np.stack([by_name.get(c.name, x) for c, x in zip(channels, measured.T, strict=True)], -1)
     return ComparisonRuns(
         joint, source, moving_runs, conditions, is_moving, signals, native[is_moving], measured, np.asarray(command),
         radius * np.asarray(signals.demand),
@@ -206,11 +204,6 @@ def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
     torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
     output_torque = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
     return np.clip(output_torque, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
-
-
-def _measured_readings(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
-    by_name = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
-    return np.stack([by_name.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
 
 
 def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:

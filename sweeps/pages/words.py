@@ -169,11 +169,6 @@ OUTCOMES = {
 NO_TURN = "there is no settled turn. With --model drive, simulate computes the turn over time"
 
 
-def reason_without_value(outcome: str) -> str:
-    """Reason why a quantity has no value, in one line."""
-    return OUTCOMES.get(outcome) or status_meaning(outcome)
-
-
 def short_status(status: str) -> str:
     """A status as figures show it."""
     return STATUSES.get(status, (status, ""))[0]

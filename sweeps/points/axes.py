@@ -19,7 +19,7 @@ from calibration.data.input_errors import BadConfiguration, allowed_words, state
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
+from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.rig import IMPOSED
 from mmrjax.model.robot import Robot
 from sweeps.config_campaign import Campaign
@@ -156,11 +156,6 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
         )
 
 
-def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
-    """Adhesion of each configuration on a surface, relative to that on the bench."""
-    return tuple(adhesion_ratio(surface, tracked) for tracked in robot.configurations.tracked)
-
-
 def _known_axis(name: str, robot: Robot, where: str) -> Axis:
     names = variation.variable_names(robot)
     if name not in names:
@@ -203,7 +198,20 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
         )
         values = np.array([_configuration(n, robot, where) for n in names])
     elif isinstance(stated, dict):
-        values = _range_values(stated, where)
+        _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
+        start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
+        number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
+        scale = stated.get("scale", "linear")
+        if scale not in ("linear", "log"):
+            raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
+        if start > stop or (start == stop) != (number == 1):
+            raise BadConfiguration(
+                f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at "
+                "least 2 values, or a single value"
+            )
+        if scale == "log" and start <= 0:
+            raise BadConfiguration(f"{where}.start: got {start:g}; expected a number above 0 with scale log")
+        values = np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
     elif isinstance(stated, str):
         values = np.array(parse_axis(where, stated))
     else:
@@ -219,23 +227,6 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
 
 
 _RANGE = ("start", "stop", "number", "scale")
-
-
-def _range_values(stated: Json, where: str) -> np.ndarray:
-    _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
-    start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
-    number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
-    scale = stated.get("scale", "linear")
-    if scale not in ("linear", "log"):
-        raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
-    if start > stop or (start == stop) != (number == 1):
-        raise BadConfiguration(
-            f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at "
-            "least 2 values, or a single value"
-        )
-    if scale == "log" and start <= 0:
-        raise BadConfiguration(f"{where}.start: got {start:g}; expected a number above 0 with scale log")
-    return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
 
 
 def _check_keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
@@ -290,25 +281,21 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in overrides.items()}
     joint = None
     if "posterior" in stated:
-        joint = _posterior(stated["posterior"], robot, f"{where}.posterior", data)
+        from calibration.data import posterior_file
+
+        folder, place = stated["posterior"], f"{where}.posterior"
+        if not isinstance(folder, str):
+            raise BadConfiguration(f"{place}: got {folder!r}; expected a run folder of calibrate or loop")
+        path = Path(folder)
+        path = path / posterior_file.FILE if path.is_dir() else path
+        joint = posterior_file.read_posterior(path)
+        joint.check(robot, place)
+        data.append(str(path))
     if not marginals and joint is None:
         raise BadConfiguration(
             f"{where}: nothing to sample; give a table `over` of names and distributions, or `posterior`"
         )
     return Samples(design, number, seed, marginals, joint)
-
-
-def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Any:
-    from calibration.data import posterior_file
-
-    if not isinstance(stated, str):
-        raise BadConfiguration(f"{where}: got {stated!r}; expected a run folder of calibrate or loop")
-    path = Path(stated)
-    path = path / posterior_file.FILE if path.is_dir() else path
-    posterior = posterior_file.read_posterior(path)
-    posterior.check(robot, where)
-    data.append(str(path))
-    return posterior
 
 
 #: Keys of each distribution.

@@ -27,7 +27,7 @@ from mmrjax.undercarriage.ripple_peaks import (
     strongest_resonances,
 )
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Cell, Document, Section, Table, remarks
+from sweeps.report.document import Cell, Document, Section, remarks
 
 SAID = 3  # most ranges to avoid in a sentence
 
@@ -273,7 +273,16 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
     values = passing.name, 1000 * passing.travel
     figure = catalogue.figure("resonance.map", found, finding=found.statement(), words=values)
     endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
-    peaks, end_note = _peaks(found), catalogue.note("resonance.ended", 100 * TAIL)
+    peak_rows = [
+        (
+            Cell(SIGNALS[p.signal].label, "bad" if p in found.strong else ""), p.payload,
+            p.speed / MM, f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none",
+            p.frequency, p.mode or "none",
+        )
+        for p in found.peaks
+    ]  # fmt: skip
+    peaks = catalogue.table("resonance.peaks_found", peak_rows)
+    end_note = catalogue.note("resonance.ended", 100 * TAIL)
     folded = count_noun(len(peaks.rows), "peak") if len(peaks.rows) > UNFOLDED else ""
     rows = []
     for payload, modes in found.modes.items():
@@ -304,16 +313,3 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
             Section("How the runs ended", (end_note, endings), "ended"),
         ),
     )
-
-
-def _peaks(found: ResonanceResult) -> Table:
-    strong = found.strong
-    rows = [
-        (
-            Cell(SIGNALS[p.signal].label, "bad" if p in strong else ""), p.payload,
-            p.speed / MM, f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none",
-            p.frequency, p.mode or "none",
-        )
-        for p in found.peaks
-    ]  # fmt: skip
-    return catalogue.table("resonance.peaks_found", rows)

@@ -1115,7 +1115,12 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            slow = _may_pass_rest(speeds, SLOW[rig.imposed])
+            # True between rows where a run may pass through rest. All True if no reading can tell.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+                is_moving = np.abs(speeds) > SLOW[rig.imposed] * np.nanmax(np.abs(speeds), 0, initial=0.0)
+            ways = np.where(is_moving, np.sign(speeds), 0.0)
+            slow = ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
             early_steps = int(np.ceil(early / _usual_interval(row_steps)))
             slow = np.convolve(slow, np.ones(early_steps + 1))[early_steps:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
@@ -1123,20 +1128,6 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             longest = np.minimum(longest, ELASTIC / elastic)
         found.append(longest)
     return found
-
-
-def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
-    """True between rows where a run may pass through rest. All True if no reading can tell.
-
-    Args:
-        speeds: readings that are 0 at rest, or rates of readings, shape (rows, channels).
-        share: a run may pass through rest below this share of the largest reading.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-        is_moving = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
-    ways = np.where(is_moving, np.sign(speeds), 0.0)
-    return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 
 def _common_length(instants: int) -> int:
