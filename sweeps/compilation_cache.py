@@ -101,8 +101,7 @@ def _is_unsafe(folder: str) -> bool:
         from sweeps.console import print_message
 
         print_message(
-            f"compiled programs are not cached: {reason}. Set {VARIABLE} to a folder of your own, or remove write "
-            "access for others (chmod go-w)"
+            f"compiled programs are not cached: {reason}. Set {VARIABLE} to a folder of yours, or chmod go-w it"
         )
     return bool(reason)
 

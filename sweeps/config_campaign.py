@@ -111,9 +111,7 @@ class StoreOptions(FolderPart):
                 "idle", f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8"
             )
         if self.shard is not None and self.scheduler is not None:
-            raise PydanticCustomError(
-                "idle", "`shard`: not allowed with `scheduler`, which distributes the chunks; give one of them"
-            )
+            raise PydanticCustomError("idle", "`shard`: not allowed with `scheduler`; give one of them")
         return self
 
     @property

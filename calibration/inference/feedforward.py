@@ -154,8 +154,8 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     if len(windows["u"]) < WINDOWS:
         lacking = f"; missing: {', '.join(missing)}" if missing else ""
         raise BadData(
-            f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected the four tests of "
-            f"SysId{lacking}"
+            f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected SysId's four "
+            f"tests{lacking}"
         )
     if _fit_constants(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))

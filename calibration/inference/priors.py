@@ -369,8 +369,8 @@ def choose_free_names(
     names = [n for n in dict.fromkeys(free_names if free else default) if n not in fixed]
     if not names and not fix:
         raise BadConfiguration(
-            "no parameter to fit: every loss in the robot's file is zero or exact, so it is fixed, and no value "
-            "has a ±; give unknown values one, or name a parameter with --free"
+            "no parameter to fit: every loss is zero or exact, and no value has a ±; give values a ±, or name a "
+            "parameter with --free"
         )
     if not names:
         raise BadConfiguration("--fix leaves no parameter to fit; name at least one with --free")
@@ -466,9 +466,7 @@ def parameter_coordinates(
     fields = parameters_by_name(robot)
     for name in names:
         if name in robot.rig.exact and name not in stated:
-            raise BadConfiguration(
-                f"--free {name}: the robot's file states it as exact (± 0); state how sure it is with --prior"
-            )
+            raise BadConfiguration(f"--free {name}: the robot's file states ± 0; state its ± with --prior")
     for name in stated:
         if name not in fields:
             raise BadConfiguration(
@@ -525,8 +523,8 @@ def _coordinate_of_parameter(
         raise BadConfiguration(f"--prior {parameter.name}: got a standard deviation of {sd:g}; expected more than 0")
     if sd <= 0:
         raise BadConfiguration(
-            f"--free {parameter.name}: its prior has no width (nominal value 0 with a relative sd); "
-            f"state one with --prior {parameter.name}=value±sd"
+            f"--free {parameter.name}: its prior has no width (value 0 with a relative sd); state one with "
+            f"--prior {parameter.name}=value±sd"
         )
     if spec.relative_sd is None or low < 0 or mean <= 0:
         return mean, sd, low, high, False

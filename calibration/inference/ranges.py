@@ -212,11 +212,9 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     measured_ratio = float(np.median(turns)) if turns.size else ratio
     if abs(math.log(measured_ratio * ratio)) < math.log(SAID):
         raise BadData(
-            f"{runs.source}: the motor turns about {float(f'{measured_ratio:.2g}'):g} times for one turn "
-            "of the output, "
-            f"but gearbox.ratio is {float(f'{ratio:.4g}'):g}: is it upside down? expected motor "
-            "turns per turn "
-            "of the output"
+            f"{runs.source}: the motor turns about {float(f'{measured_ratio:.2g}'):g} times for one turn of the "
+            f"output, but gearbox.ratio is {float(f'{ratio:.4g}'):g}: is it upside down? expected motor turns "
+            "per output turn"
         )
 
 
@@ -230,9 +228,8 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
             f"{runs.source}, total_mass_kg: about {float(f'{ratio:.2g}'):g} times too {size} for this robot "
-            f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check the "
-            "unit, kg, and the "
-            "mass in the robot's file"
+            f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check its unit, kg, and "
+            "the robot's mass"
         )
 
 

@@ -146,7 +146,7 @@ def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
 
 #: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
-    "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides and unused columns first",
+    "undescribed": "This model does not describe these runs: {large}. Check units, signs and unused columns first",
     "not converged": "No verdict: the search did not converge ({every})",
     "worse": "Not adequate: the fit has larger errors than the robot file as given ({every})",
 }

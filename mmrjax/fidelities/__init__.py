@@ -111,9 +111,7 @@ class FidelityFacts:
                 continue
             if name not in values:
                 option_names = ", ".join(values) or "none"
-                raise ValueError(
-                    f"{name}: got {value!r}; this fidelity has no such option; its options: {option_names}"
-                )
+                raise ValueError(f"{name}: got {value!r}; this fidelity has the options: {option_names}")
             values[name] = float(value)
         for option in self.options:
             value = values[option.name]
@@ -134,7 +132,7 @@ _STEP = Option("step", "s", 1e-4, 0.01, "integration step")
 TABLE: dict[str, FidelityFacts] = {
     "steady": FidelityFacts(
         "mmrjax.fidelities.steady",
-        "the operating point as a root of the balances, with implicit derivatives",
+        "the operating point, a root of the balances with implicit derivatives",
         chunk=(262_144, 4_194_304),
         effort=Effort(starts=64, profiles=True, blocks=True),
     ),
@@ -150,7 +148,7 @@ TABLE: dict[str, FidelityFacts] = {
     ),
     "track": FidelityFacts(
         "mmrjax.fidelities.track",
-        "half a robot as multibody dynamics in MuJoCo MJX, with individual contacts",
+        "half a robot in MuJoCo MJX, with individual contacts",
         chunk=(512, 16_384),
         effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration_option(1.5, 3600.0), _STEP),

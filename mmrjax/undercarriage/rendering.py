@@ -106,7 +106,7 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
     """
     gear = robot.running_gear
     if not np.isfinite(np.asarray(run.q)).all():
-        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
+        raise ValueError("run: its coordinates are not finite; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)

@@ -46,8 +46,8 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     for r in demands.each:
         if lacking and r.name in OF_HEAT:
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: depends on the winding temperature, for which the robot's file "
-                f"lacks {', '.join(lacking)}; add them, or remove the requirement"
+                f"{demands.source}, {r.name}: needs the winding temperature, for which the robot's file lacks "
+                f"{', '.join(lacking)}; add them, or remove the requirement"
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as report:

@@ -130,7 +130,7 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
 
 def _histories_sentence(effect: type[Effect]) -> str:
     if effect.transient:
-        return ". It is visible only in time histories, not in settled runs"
+        return ". Only time histories show it"
     return f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
 
 
@@ -192,7 +192,7 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
     if c.other_units:
         yield "other units", ", ".join(c.other_units)
-    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, which is assumed if you give no noise"
+    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, assumed without a stated noise"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
     sensor_effects = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if sensor_effects:
@@ -274,9 +274,7 @@ EXPLAINED: dict[str, Explain] = {
     "verdict of a climb": _explain_by_table(
         {name: meaning for name, (_, meaning) in VERDICTS.items()}, "verdict of result.json of mmrjax climb"
     ),
-    "flag": _explain_by_table(
-        words.FLAGS, "column flags of runs.csv, counts in result.json. A run may have several flags"
-    ),
+    "flag": _explain_by_table(words.FLAGS, "column flags of runs.csv, counts in result.json"),
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,

@@ -137,7 +137,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
-            print_output("The track model was not run: no error remains in the slip, track or ground balance.")
+            print_output("No error remains in the slip, track or ground balance for the track model.")
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
@@ -184,12 +184,12 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
         return
     stored_stages = [name for name in stages if folder.keeps(name)]
     if not stored_stages:
-        print_message(f"{', '.join(stages)} could not be saved. The same command starts from the beginning")
+        print_message(f"{', '.join(stages)} could not be saved. The same command starts anew")
         return
     print_message(f"kept: {', '.join(stored_stages)}. To continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        print_message(f"{loop_words.verdict_line(traced)}. Held-out errors and other noise levels are still missing")
+        print_message(f"{loop_words.verdict_line(traced)}. Held-out errors and other noise levels are missing")
         return
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):

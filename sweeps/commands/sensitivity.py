@@ -134,9 +134,7 @@ def _operating_points(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration(
-            "--vary voltage: has no effect on battery power, where the state of charge sets the voltage"
-        )
+        raise BadConfiguration("--vary voltage: has no effect on a battery, whose charge sets it")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
@@ -164,10 +162,7 @@ def _uncertain_inputs(
     robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
-            raise BadConfiguration(
-                "--posterior: cannot be combined with --parameters, since both choose the "
-                "uncertain inputs; give one of them"
-            )
+            raise BadConfiguration("--posterior: cannot be combined with --parameters; give one of them")
         return uncertain_inputs.inputs_from_posterior(robot, posterior_beside_robot(file), ranges)
     names = config.parameters or uncertain_inputs.default_input_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)

@@ -204,19 +204,18 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
         )
     if robot.unlike:
         raise BadConfiguration(
-            f"{file.name}: {', '.join(robot.unlike)} makes the two sides differ, but an export describes one "
-            "drive on one joint; export a separate robot file for each side, without this effect"
+            f"{file.name}: {', '.join(robot.unlike)} makes the sides differ, but an export is one drive; export "
+            "a file for each side, without this effect"
         )
     if robot.controller is not None and not robot.controller.supply_voltage:
         raise BadConfiguration(
-            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it to convert duty "
-            "to voltage; add it [V]"
+            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it; add it [V]"
         )
     if robot.rig.imposed != "voltage" and robot.controller is None:
         imposed_words = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(
-            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal, the command of an "
-            f"exported drive. With an imposed {imposed_words}, the runs contain no information on the winding"
+            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal. With an imposed "
+            f"{imposed_words}, runs do not show the winding"
         )
     if lacking := [n for n in ("motor.resistance", "motor.torque_constant") if n in robot.rig.unknown]:
         raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing; the drive law needs it; add it")

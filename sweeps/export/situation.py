@@ -145,7 +145,7 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
                 "points; give a table of runs, or add the limit"
             )
         runs = export_grid(joint)
-        source = "a grid of operating points in both directions, without readings"
+        source = "a grid in both directions, without readings"
     else:
         runs = _runs_of_joint(data, joint)
         source = runs.source
@@ -157,7 +157,7 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
     is_moving = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
     if not is_moving.any():
-        raise BadData(f"{source}: the model settles in none of these runs, so no comparison is possible")
+        raise BadData(f"{source}: the model settles in none of these runs")
     signals = jax.tree.map(lambda x: x[is_moving] if np.shape(x) else x, signals)
     moving_runs = runs.where(is_moving)
     radius = float(joint.load.radius)
@@ -211,15 +211,9 @@ def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
-        raise BadData(
-            f"{runs.source}: its runs drive the two sides independently, but an export describes one drive; "
-            "expected straight travel"
-        )
+        raise BadData(f"{runs.source}: its runs drive the sides differently; expected straight travel")
     if levers := [name for name in runs.axes if name.startswith("lever")]:
-        raise BadData(
-            f"{runs.source}, {levers[0]}: lever angles shift the load between drives, but an export describes one "
-            "drive; expected runs without lever columns"
-        )
+        raise BadData(f"{runs.source}, {levers[0]}: an export is one drive; expected runs without lever columns")
     if runs.sampled:
         from calibration.data import settling
 

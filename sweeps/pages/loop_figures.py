@@ -228,8 +228,8 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({place_in_words(r.balance)})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: misfit that the effect alone explains, limited to a plausible size [σ]")
-    axes.set_title("blue: found; light blue: indistinguishable from a found effect in these data")
+    axes.set(xlabel="score: misfit that the effect alone explains at a plausible size [σ]")
+    axes.set_title("blue: found; light blue: indistinguishable from a found effect")
     return fig
 
 

@@ -108,8 +108,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
             raise BadConfiguration(f"{where}, {name}: given twice; give it once, under conditions, axes or samples")
     if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
         raise BadConfiguration(
-            f"{where}: voltage has no effect on battery power, where the state of charge sets it; remove voltage "
-            "or battery"
+            f"{where}: voltage has no effect on a battery, whose charge sets it; remove one of the two"
         )
     _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
@@ -151,7 +150,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
     imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
     if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
-            f"{where}, conditions.surface: got {surface}; each surface of a rig is a configuration "
+            f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations "
             f"({', '.join(robot.configurations)}); vary or set configuration"
         )
 

@@ -27,7 +27,7 @@ VERDICTS: dict[str, tuple[str, str]] = {
     "stalls": ("stalls", "the robot and its tracks stop: the motors cannot turn the tracks"),
     "slides": ("slides", "the robot stops while its tracks slip: the ground has too little grip"),
     "hangs": ("hangs", "the robot stops with its body on an edge, or has fallen into a gap"),
-    "unfinished": ("is under way", "the robot was still moving when the time ended. Use a longer --duration"),
+    "unfinished": ("is under way", "the robot was still moving at the end. Use a longer --duration"),
     "failed": ("failed", "the simulation broke down, or the levers would start below the ground"),
 }
 

@@ -118,8 +118,8 @@ def _summary(channel: Channel, table: Columns) -> Json:
 
 
 _FITS = {
-    "these": "This robot was fitted to these rows, so the errors are not predictions.",
-    "others": "This robot was fitted to other rows, so the errors are those of a prediction.",
+    "these": "This robot was fitted to these rows: errors are not predictions.",
+    "others": "This robot was fitted to other rows: errors are predictions.",
     "": "",
 }
 

@@ -143,7 +143,7 @@ class ResonanceResult:
         """Sentences on speeds to avoid, the most important first."""
         low, high = self.speeds
         if not np.isfinite(low):
-            return [f"No run of {self.configuration} travels, so there is no ripple (status gives the reason)."]
+            return [f"No run of {self.configuration} travels (see status)."]
         parts = []
         mode_resonances, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
         if mode_resonances:
@@ -153,8 +153,8 @@ class ResonanceResult:
             peaks = {s.label: float(np.nanmax(self.table[f"{n}_ripple_percent"])) for n, s in SIGNALS.items()}
             largest = ", ".join(f"{label} {ripple_percent(peak)}" for label, peak in peaks.items())
             parts.append(
-                f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: no ripple peak is at a "
-                f"natural frequency (largest ripple: {largest})."
+                f"No speed to avoid between {span_text(low, high)} mm/s: no ripple peak is at a natural "
+                f"frequency (largest ripple: {largest})."
             )
         if bare:
             also = "Ripple also peaks" if mode_resonances else "Ripple peaks"
@@ -176,7 +176,7 @@ class ResonanceResult:
             )
         if self.passing.name == "teeth":
             parts.append(
-                f"This configuration has no grousers on the ground. The belt's teeth cause its ripple, one every "
+                "Without grousers on the ground, the belt's teeth cause the ripple, one every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
         return parts
@@ -260,7 +260,7 @@ def span_text(low: float, high: float, unit: float = MM) -> str:
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"
 
 
-_FEW = "travels, but fewer than {} {} passed while ripple was measured. Use a longer --duration"
+_FEW = "travels, but fewer than {} {} passed. Use a longer --duration"
 #: Most peaks that are not folded.
 UNFOLDED = 30
 

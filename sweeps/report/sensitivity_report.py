@@ -97,7 +97,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     """Sentence on the most important inputs for an output, with its spread."""
     share, row = study.overall_share, study.row
     if not _any_influence(study):
-        return "No value at any of these operating points, or no input changes it."
+        return "No value at these operating points, or no input changes it."
     order = np.argsort(-share, kind="stable")[:3]
     top = [k for k in order if share[k] >= NEGLIGIBLE] or order[:1]
     who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
