@@ -58,7 +58,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     units = row_of_units(header, body[0]) if body else ()
     if units:
         body = body[1:]
-        notes = (*notes, f"{name}: the row below the header contains units. Row numbers start below it")
+        notes = (*notes, f"{name}: the row below the header is units. Row numbers start below it")
     check_row_lengths(name, header, body)
     return NamedArrays(
         name,
@@ -206,8 +206,8 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
         rows = [[cell_word(cell.strip()) for cell in row] for row in csv.reader(lines, delimiter=mark)]
     except csv.Error as error:
         raise BadData(
-            f"{name}: cannot be read as CSV ({error}); look for a quotation mark that is not closed, or a cell of "
-            f"more than {csv.field_size_limit():,} characters"
+            f"{name}: cannot be read as CSV ({error}); look for an open quotation mark, or a cell of more than "
+            f"{csv.field_size_limit():,} characters"
         ) from error
     rows = [row for row in rows if any(row)]
     header_width = max((j + 1 for j, cell in enumerate(rows[0]) if cell), default=0) if rows else 0
@@ -228,7 +228,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
                 point.setdefault(j, []).append(cell)
             elif _BELOW.fullmatch(cell):
                 integer_columns.add(j)
-    expectation = "expected either decimal commas or decimal points in a column, and no thousands separators"
+    expectation = "expected decimal commas or decimal points, without thousands separators"
     for j in comma.keys() & point.keys():
         raise BadData(f"{name}, {_column(rows, j)}: got {comma[j][0]} and {point[j][0]}; {expectation}")
     for marked, other in ((point, comma), (comma, point)):

@@ -36,14 +36,14 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
         if not_read.any():
             rows = rows_text(np.flatnonzero(not_read).tolist(), *SHOWN)
             notes.append(
-                f"{runs.source}, {channel.column}: 0 in {rows} although the current is that of a turning motor. "
-                "These readings are treated as missing"
+                f"{runs.source}, {channel.column}: 0 in {rows} although the current is a turning motor's. These "
+                "readings count as missing"
             )
     if is_limited.any():
         rows = rows_text(np.flatnonzero(is_limited).tolist(), *SHOWN)
         notes.append(
-            f"{runs.source}, {rows}: the readings no longer change while the command rises, so the supply or the "
-            "driver is at a limit. These rows are set aside"
+            f"{runs.source}, {rows}: readings no longer change while the command rises: supply or driver is at a "
+            "limit. These rows are set aside"
         )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 

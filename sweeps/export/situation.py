@@ -141,8 +141,8 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     if data is None:
         if not Layout.of(robot).uses_paper_conditions and imposed.imposed_limit(robot) is None:
             raise BadConfiguration(
-                f"--data: not given, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
-                "points; give a table of runs, or add the limit"
+                f"--data: not given, and {joint.file.name} has no motor.voltage_limit; give a table of runs, or "
+                "add the limit"
             )
         runs = export_grid(joint)
         source = "a grid in both directions, without readings"
