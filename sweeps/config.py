@@ -217,7 +217,7 @@ class BatchPart(FidelityPart):
 class SupplyPart(Part):
     """Supply of the motors."""
 
-    battery: bool = option_field(False, "Supply the robot from its battery")
+    battery: bool = option_field(False, "Use the robot's battery")
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = option_field(
         0.0, "Charge taken from the battery before"
     )
@@ -321,7 +321,7 @@ class AxesPart(Part):
         None, "Imposed motor speeds (rpm)", usual="thirds of speed_limit"
     )
     payloads_kg: Several[Payload] | None = option_field(
-        None, "Additional load masses (kg), 0 for a rig", usual=_values_text(PAYLOADS_KG)
+        None, "Additional load masses (kg)", usual=_values_text(PAYLOADS_KG)
     )
     slopes_deg: Several[Slope] | None = option_field(
         None, "Slopes (deg), positive uphill. Default of a rig: 0", usual=_values_text(SLOPES_DEG)
@@ -418,7 +418,7 @@ class PosteriorPart(Part):
     """Uncertainty of results from the posterior of a calibrated robot."""
 
     posterior: Annotated[int, Field(ge=10, le=100_000)] | None = option_field(
-        None, "Report ± from this many draws of the posterior.nc of --robot"
+        None, "Report ± from this many draws of --robot's posterior.nc"
     )
 
 
@@ -546,7 +546,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     terrain: Path | None = option_field(
         None, "CSV of the ground with columns x_m and z_m, or x_mm and z_mm", format="path"
     )
-    nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Radius of the edges of a step or stairs")
+    nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Edge radius of steps and stairs")
     levers_front_deg: Angle | None = option_field(
         None,
         "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
@@ -740,14 +740,14 @@ class RequirementsPart(Part):
 class Check(RequirementsPart, RobotPart, OutputPart):
     """A check of a robot against requirements."""
 
-    changes: bool = option_field(True, "Search for changes that meet the missed requirements")
+    changes: bool = option_field(True, "Find changes that meet missed requirements")
 
 
 class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
     objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m) or cost (EUR)")
-    pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front instead")
+    pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front")
     motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all in the catalogue")
     starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Number of searches")
     seed: Seed = option_field(0, "Random seed of the starts")
@@ -774,7 +774,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
-        None, "Smallest total number of model evaluations", usual="1000000; for runs over time 100000"
+        None, "Least number of model evaluations", usual="1000000; for runs over time 100000"
     )
     seed: Seed = option_field(0, "Random seed of the sample")
     posterior: bool = option_field(False, "Use the posterior.nc of the calibrated --robot as inputs")

@@ -92,7 +92,7 @@ class StoreOptions(FolderPart):
     plan: Path | None = option_field(
         None, "TOML file with [axes] or [samples] (docs/reference/plans.md)", argument=True, metavar="[CONFIG.toml]"
     )
-    zarr: bool = option_field(False, "Write a Zarr store even for a small grid")
+    zarr: bool = option_field(False, "Write a Zarr store for small grids too")
     outputs: Names = option_field((), "Outputs to store, comma-separated", usual="the channels of its instruments")
     dry_run: bool = option_field(False, "Print points, chunks, size and expected time, and write nothing")
     export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. May be repeated")

@@ -239,7 +239,7 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
     if readings >= needed * channels_with_readings:
         return
     also = f" and estimate {levels} noise levels" if levels else ""
-    cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
+    cure = "fix some with --fix, or set --noise" if levels else "fix some with --fix"
     is_complete = readings == len(runs) * channels_with_readings
     rows = count_noun(len(runs), "row")
     have = (

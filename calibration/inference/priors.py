@@ -423,7 +423,7 @@ def parse_prior(text: str) -> tuple[str, float, float]:
     except ValueError:
         raise BadConfiguration(f"--prior {text}: {form}") from None
     if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
-        raise BadConfiguration(f"--prior {text}: the sd must be a positive number; {form}")
+        raise BadConfiguration(f"--prior {text}: expected a positive sd; {form}")
     return match["name"], mean, sd
 
 
@@ -520,7 +520,7 @@ def _coordinate_of_parameter(
     if not low <= mean <= high:
         raise BadConfiguration(f"--prior {parameter.name}: got {mean:g}; expected {low:g} to {high:g} {spec.unit}")
     if stated is not None and not 0 < sd < math.inf:
-        raise BadConfiguration(f"--prior {parameter.name}: got a standard deviation of {sd:g}; expected more than 0")
+        raise BadConfiguration(f"--prior {parameter.name}: got an sd of {sd:g}; expected more than 0")
     if sd <= 0:
         raise BadConfiguration(
             f"--free {parameter.name}: its prior has no width (value 0 with a relative sd); state one with "

@@ -91,7 +91,7 @@ def _act(act: menu.CalibrationAct) -> str:
             len(configurations), "in each configuration, "
         )
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
-        return f"Weigh the robot {configuration_words}{laden}to 20 g, and compare with the robot file"
+        return f"Weigh the robot {configuration_words}{laden}to within 20 g, and compare with the robot file"
     (kind,) = act.kinds
     if act.channel:
         return ACTS[kind].format(channels.find_channel(act.channel).label)
@@ -129,7 +129,7 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
         allowed: permitted temperature, None if unknown [°C].
     """
     settles = math.isfinite(temperature)
-    would = f"would reach {temperature:.0f} °C" if settles else "would burn out, as its temperature never settles"
+    would = f"would reach {temperature:.0f} °C" if settles else "would burn out"
     return f"a winding that stays energised {would}{'' if allowed is None else _temperature_limit(allowed)}"
 
 
@@ -157,7 +157,7 @@ def instruction_for_further_runs(what: SimpleNamespace) -> str:
         by_kind = _of_level(what)
     else:
         by_kind = {} if what.within.has_ground else _of_shaft(what)
-    last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its whole range"
+    last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
     return (_advice_by_variable(what) | by_kind).get(what.variable, last)
 
 
@@ -212,10 +212,13 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
             f"about {within.current * within.motors:.2g} A evenly"
         ),
         "speed_motor": f"Repeat on the level, unladen, with {crawl}",
-        "slope": f"Repeat at one voltage and payload with the slope from 0 to {what.slope:g} deg in steps of "
-        f"{angle:g} deg, and downhill",
-        "payload": f"Repeat at one voltage and slope with the payload from 0 to {what.payload:g} kg in steps of "
-        f"{mass:g} kg",
+        "slope": (
+            f"Repeat at one voltage and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} "
+            "deg, and downhill"
+        ),
+        "payload": (
+            f"Repeat at one voltage and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
+        ),
         "speed": (
             "Repeat on the level, unladen, with the speed in equal steps from a crawl to about "
             f"{within.speed:.2g} m/s at {high:g} V"
@@ -238,7 +241,7 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
     turning = f"with the {name}{_up_to(levels[0], what.runs, levels[1])}"
     words = {
         "speed_motor": f"{level} {turning}",
-        "speed": f"{level} {turning}, which also varies the travelling speed",
+        "speed": f"{level} {turning}",
         "slope": f"Repeat at one {name} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
         "payload": f"Repeat at one {name} and slope with the payload from 0 to {what.payload:g} kg",
         "time": f"Repeat at one {name} for ten minutes from a cold start, and again while warm",
@@ -319,8 +322,7 @@ VARY = {
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "duty": "the duty at one supply voltage",
     "configuration": "the configuration", "direction": "the direction of travel",
-    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to resolve one "
-                                                                    "revolution",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough for one revolution",
     THE_SIDE: "nothing: compare both sides straight and in turns both ways",
     "position": "the position: cover the whole travel in both directions at one voltage",
     "": "nothing: its share is the same in every run",
@@ -345,7 +347,7 @@ def effect_declarations(effect: type[Effect]) -> Iterator[str]:
         "only on the battery" * effect.needs_battery,
         "only in runs in both directions" * effect.needs_reverse,
         "only at a duty below 1" * effect.needs_duty,
-        "same direction in forward and backward travel" * effect.odd_in_travel,
+        "same direction both ways" * effect.odd_in_travel,
         f"only on {effect.movers}" * bool(effect.movers),
         f"proportional to `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
     ]

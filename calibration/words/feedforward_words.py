@@ -35,7 +35,7 @@ MEANT = dict(
 
 
 def _unit(ratio: float, near: float) -> str:
-    told = f"it is probably {MEANT[near]}" if near else "check the gear ratio and the wheel size in the conversion"
+    told = f"it is probably {MEANT[near]}" if near else "check gear ratio and wheel size in the conversion"
     return (
         f"The velocity is {ratio:.4g} times the rate of the position: {told}. The constants use the position's unit."
     )

@@ -89,7 +89,7 @@ def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> st
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
     """Agreement of searches from many starts."""
     if starts == 1:
-        return "one search was made, which did not converge" if open else "one search was made"
+        return "one search was made and did not converge" if open else "one search was made"
     if agree == starts:
         return f"all {starts} searches end at the same optimum"
     if open == starts:
@@ -138,7 +138,7 @@ def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
-        "repeats": "the residuals exceed the scatter of repeated runs",
+        "repeats": "the residuals exceed the scatter of repeats",
         "follow": f"{whose} depend on {test.variable}",
         "remember": f"{whose} show autocorrelation",
     }[test.what]
@@ -179,7 +179,7 @@ def adequacy_verdict(found: Adequacy) -> str:
         )
     p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
     if not found.adequate:
-        why = f"{chi2}, {p}" if found.noise_known else f"{p}, with the noise estimated from the residuals"
+        why = f"{chi2}, {p}" if found.noise_known else f"{p}, with estimated noise"
         return (
             f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing, which "
             "parameters may absorb. Run mmrjax loop to find it"
@@ -298,7 +298,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         "delay = '0 ± 0'"
     ),
     "shifted": lambda channel, share, shift: (
-        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is that of readings "
+        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is explained by readings "
         f"{abs(1e3 * shift):.2g} ms {'late' if shift > 0 else 'early'}. To fit this delay, set [rig] delay = "
         f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s]'
     ),
@@ -309,7 +309,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "prior_of_product": (
         "{name} has the prior {mean:.3g} ± {sd:.2g}, which other fidelities use for its product with the guide "
-        "share. Here the guides carry {share:.0%} of the weight"
+        "share. In the track model the guides carry {share:.0%} of the weight"
     ),
     "no_prediction": lambda kind, rows, total: (
         f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because "

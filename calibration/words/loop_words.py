@@ -54,7 +54,7 @@ def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
     text = _verdict(said)
     if said.aside:
         share = 100 * said.aside / said.of
-        text = f"{said.aside} of {said.of} rows ({share:.0f} %) are outliers and are set aside. {text}"
+        text = f"{said.aside} of {said.of} rows ({share:.0f} %) are set aside as outliers. {text}"
     if said.noise:
         text = f"{text} But {'. '.join(map(describe, said.noise))}"
     if said.cluster is not None:
@@ -97,7 +97,7 @@ def _evidence(said: loop_notes.VerdictSummary) -> str:
     remaining = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms" for m in said.missed
     ]
-    unseen = f", but on unseen runs this model still misses {', '.join(remaining)}" * bool(remaining)
+    unseen = f", but on unseen runs it still misses {', '.join(remaining)}" * bool(remaining)
     return f"family-wise p {p_value(said.p)}{unseen}"
 
 
@@ -117,9 +117,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
         if n and c[n:]
     )
     return {
-        "none": f"Yes, as far as these runs can show{noises}: the residuals are consistent with noise.",
+        "none": f"Yes, as far as these runs show{noises}: the residuals are consistent with noise.",
         "undescribed": f"No verdict{noises}: this model does not describe these runs.",
-        "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
+        "open": f"Perhaps. The answers{noises} differ: they depend on the noise.",
         "named": f"No: {_are_missing(laws)}{noises}.",
         "class": f"No: {_are_missing(laws)}{noises}.",
         "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
@@ -157,9 +157,9 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
     ]
-    check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
+    check = [f"unused columns that vary ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
-    check += ["units, signs and sides of the columns"]
+    check += ["units, signs and sides of columns"]
     if not place_words:
         return "This model does not describe these runs: it lacks backlash. Add backlash first."
     return (
@@ -292,7 +292,7 @@ def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:5]
     if not beyond:
-        return [f"{first}. No effect explains more than chance would"]
+        return [f"{first}. No effect explains more than chance"]
     if brief:
         return [f"{first}. Strongest alone: {', '.join(e.name for e in beyond)}"]
     lines = [
@@ -314,7 +314,7 @@ def regression_verdict(found: EffectRanking) -> str:
     lacks = lacks if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
     numbers = f". Parameters [SI]: {numbers}" if numbers else ""
-    return f"regression only, not confirmed by simulation: {lacks}{numbers}"
+    return f"regression only, not confirmed: {lacks}{numbers}"
 
 
 #: Remark beside a regression that sees nothing, where the simulation does.
@@ -331,7 +331,7 @@ def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
 
 def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> str:
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
-    also = f" (or {', '.join(others)}, which these data cannot distinguish from it)" if others else ""
+    also = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
     family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
         f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
@@ -513,12 +513,12 @@ NO_FORMULA = "no single term explains 90 % of the curve"
 #: Reasons for or against names.
 REASONS = {
     "": "",
-    "implausible": "every effect that explains the discrepancy has an implausible size",
+    "implausible": "every effect that explains it has an implausible size",
     "larger": "{effects} would explain more, but only at an implausible size",
     "better curve": "a {curves} explains the data better than {effects}",
     "curve alone": "a single {curves} leaves no significant misfit",
     "none by itself": "{lost}",
-    "beside": "each effect, added to the fit of the others, explains more than chance would: {strengths}",
+    "beside": "each effect, added to the others, explains more than chance: {strengths}",
 }
 
 
@@ -732,7 +732,7 @@ def track_model_answer(found: TrackModelResult) -> str:
     constants_count = len(found.constants) - len(found.known_from_rows)
     undetermined = f"These rows do not determine {constants_count} of {len(found.constants)} constants"
     return (
-        f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains this error "
+        f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains it "
         f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}. {undetermined}{on}"
     )
 
@@ -780,7 +780,7 @@ def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
 
 def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
     """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is a tenth of a run or more."""
-    why = "a longer one is not searched. Check the clocks of the columns"
+    why = "a longer delay is not searched. Check the clocks of the columns"
     return (
         f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms "
         f"{'later' if delay > 0 else 'earlier'} than its column states, and "
@@ -847,11 +847,11 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
-    "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
+    "unshown": lambda source, why: f"{source}: effects are simulated, in minutes, because {UNSHOWN[why]}",
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted",
     "outstanding": lambda factors, word: (
         f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "
-        f"{word} noise. The same command without --within does"
+        f"{word} noise. The same command without --within tests it"
     ),
     "too_few_replicates": "{settled} bootstrap tables are too few for some evidence. Use --replicates 500",
     "rests_on": sentence_on_single_run,

@@ -103,7 +103,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "sampling": lambda method, points: f"{METHODS[method]}, over {points} operating points",
     "points_left_out": points_left_out,
     "sample_left_out": lambda points, share, outputs: (
-        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, not travelling there "
+        f"at {points} operating points up to {100 * share:.1f} % of the sample does not travel and is left out "
         f"({', '.join(outputs)})"
     ),
     "inert": "these inputs are not sampled, because no output depends on them: {inputs}",

@@ -12,11 +12,11 @@ from mmrjax.errors import count_noun
 OF_LEVELS = ("changes", "short", "settling", "accelerates")
 #: Finding and advice for each of `settling.REASONS`.
 WHY = {
-    "changes": ("the imposed quantity changes all the time", "hold it at each level for a while"),
+    "changes": ("the imposed quantity always changes", "hold it at each level for a while"),
     "short": ("the level is held too briefly", "hold it longer, or set a smaller --shortest"),
     "settling": ("still changes at the end of its level", "hold the level longer, or set a larger --drift"),
     "accelerates": ("still accelerates at the end of its level", "hold the level longer, or set a larger --drift"),
-    "idle": ("nothing drives the motors", "nothing, as settled runs need a driven motor"),
+    "idle": ("nothing drives the motors", "nothing, settled runs need a driven motor"),
     "rest": ("the drive does not move", "nothing, friction holds the drive"),
     "stuck": (
         "shows one number for a long time: saturated or frozen",
@@ -26,7 +26,7 @@ WHY = {
         "has many readings far from the others",
         "repair the instrument, or log a mean of pulses",
     ),
-    "unread": ("no channel has enough readings", "log more readings, or remove the rows without them"),
+    "unread": ("no channel has enough readings", "log more readings, or remove these rows"),
     "undriven": ("the driver brakes or coasts", "nothing, a fit to the log uses them"),
 }
 
@@ -78,7 +78,7 @@ def levels_and_samples(found: Settled) -> str:
     return (
         f"Neighbouring samples are one level if the imposed quantity differs by less than {50 * found.drift:g} % "
         f"or its noise. Its first samples are left out until every channel stays within {100 * found.drift:g} % "
-        "of its end, or its noise."
+        "of its last value, or its noise."
     )
 
 

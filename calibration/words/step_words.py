@@ -10,7 +10,7 @@ STEPS = {
     "sds": "the stated sds do not fit the residuals: refitting with theirs",
     "bootstrap": "bootstrap of {} tables: the misfit of a complete model",
     "effects": "something is missing: fitting every candidate effect",
-    "more effects": "{}: not everything is explained, fitting further effects",
+    "more effects": "{}: fitting further effects",
     "alone": "outliers found: fitting again without them",
     "mechanism": "mechanisms that explain most of the misfit",
     "alike": "effects that explain as much as {}",
@@ -29,9 +29,9 @@ STEPS = {
     # requirements and sizing
     "requirement": "requirement {} of {}: {}",
     "changes": "changes that would meet missed requirement {} of {}: {}",
-    "designs": "1 of 4, random designs for every combination of parts",
+    "designs": "1 of 4, random designs of every combination",
     "descents": "2 of 4, {} searches by gradients",
-    "whole": "3 of 4, catalogue ratios and whole numbers of cells",
+    "whole": "3 of 4, makers' ratios and whole cells",
     "refined": "4 of 4, the best {} designs, with ratio and number of cells continuous",
     # a calibration
     "optimum": "optimum found, now {}",

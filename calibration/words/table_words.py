@@ -144,7 +144,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "repeats": differing_repeats,
     "larger_noise": (
         "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much as the "
-        "{source} noise predicts, so its sd is multiplied by it. Check the repeats, or set --noise"
+        "{source} noise predicts, so its sd is multiplied by this. Check the repeats, or set --noise"
     ),
     "unused": unused_columns,
     "no_load_gives": (

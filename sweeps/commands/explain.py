@@ -54,7 +54,7 @@ def explain_name(name: str | None, files: Names) -> int:
     if name is None:
         for kind, those in names.items():
             print_output(_wrapped(kind, ", ".join(those)))
-        print_output("mmrjax explain NAME says what one means.")
+        print_output("mmrjax explain NAME explains one.")
         return 0
     explained = False
     for kind, about in EXPLAINED.items():

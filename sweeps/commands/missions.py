@@ -137,7 +137,7 @@ def _check_battery_charge(robot: Robot, config: configuration.Simulate) -> None:
     if config.battery and config.discharge_mAh >= capacity:
         raise BadConfiguration(
             f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
-            "mission begins"
+            "mission"
         )
 
 
@@ -151,7 +151,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
     if len(too_low):
         raise BadConfiguration(
             f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[too_low[0]]:.4g} V, below its "
-            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
+            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission"
         )
 
 

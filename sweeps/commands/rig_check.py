@@ -113,7 +113,7 @@ class RigCheck:
         if self.unmarked:
             lines = ", ".join(map(str, self.unmarked))
             count = count_noun(len(self.unmarked), "line")
-            notes.append(f"{count} with a number equal to the template's example: {lines}. Check that it is yours")
+            notes.append(f"{count} with the template's example: {lines}. Check that it is yours")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(

@@ -119,7 +119,7 @@ def _operating_points(
     """Grid of operating points. For a condition with --vary it contains one value, the middle of the range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
-        raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
+        raise BadConfiguration("sensitivity: this robot imposes the motor current; use simulate or sweep")
     usual_axes: dict[str, tuple[float, ...]] = {}
     if layout.uses_paper_conditions:
         usual_axes = CORNERS if config.method in ("sobol", "morris") else WHOLE

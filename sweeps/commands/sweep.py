@@ -59,8 +59,7 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = not options.of_store and (count <= TABLE or config.posterior is not None)
     if not options.of_store and not small:
-        print_message(f"{count:,} points: too many for runs.csv ({TABLE:,}), so results go to {STORE}. --export csv adds a "
-            "CSV")  # fmt: skip
+        print_message(f"{count:,} points: too many for runs.csv ({TABLE:,}), see {STORE} or add --export csv")
     for note in notes:
         print_message(note)
     if small:

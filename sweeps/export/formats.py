@@ -31,7 +31,7 @@ FORMATS = {
     "onnx": "an ONNX model of one time step, for Isaac Lab, Unity or C++",
     "mjlab": "an actuator configuration for law_source, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
-    "randomization": "samples from the posterior, as parameters of MuJoCo and of the actuator",
+    "randomization": "samples from the posterior, for MuJoCo and the actuator",
 }
 #: Goal of a start in MuJoCo [rad], and its length [s].
 GOAL, START = 0.5, 0.5
@@ -110,8 +110,8 @@ def notes_for_file_head(runs: ComparisonRuns) -> list[str]:
     command = runs.command
     return [
         f"Seen: {count_noun(len(command), 'run')} of {runs.source}, {np.min(command):.4g} to "
-        f"{np.max(command):.4g} V, {np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Other "
-        "conditions were not tested. LAW.md lists the equations, the intervals and the approximations."
+        f"{np.max(command):.4g} V, {np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Nothing "
+        "else was tested. LAW.md lists equations, intervals and approximations."
     ]
 
 

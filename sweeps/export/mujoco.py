@@ -30,7 +30,7 @@ FIRST = (3, 7, 0)
 #: Effects for which the format has a term, and the term.
 TERMS = {
     "series_resistance": "resistance",
-    "supply_sag": "resistance, for all motors together at equal currents",
+    "supply_sag": "resistance of all motors together",
     "armature_inductance": "inductance",
     "rotating_inertia": "armature of the joint",
     "thermal_drift": "thermal",
@@ -185,7 +185,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
             EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if joint.loose:
-        how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
+        how = "a joint for the motor's side, and a tendon with a range or a stiffness"
         fates.append(EffectFate(PLAY, HELD, how))
     if controller := joint.controller:
         fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki), controller.rate))

@@ -10,7 +10,7 @@ VERDICTS = {("climb", "converged"): "have a verdict"}
 STATUSES: dict[str, tuple[str, str]] = {
     "converged": ("settled", "found a steady operating point"),
     "stalled": ("stands", "static friction holds the robot, or the motors cannot turn the load"),
-    "slides": ("slides", "traction demand above the adhesion limit μ_s N: tracks or wheels spin"),
+    "slides": ("slides", "traction demand above the adhesion limit μ_s N, so tracks or wheels spin"),
     "not_settled": (
         "not settled",
         "still accelerates at the end (use a longer --duration), or the turn has no steady state (use --model drive)",
@@ -21,7 +21,7 @@ STATUSES: dict[str, tuple[str, str]] = {
         "tips over",
         "the centre of mass is outside the base of support, or inertia carries the robot over",
     ),
-    "reverses": ("reverses", "found a steady operating point, travelling backward"),
+    "reverses": ("reverses", "found a steady operating point backward"),
     "rolls_back": (
         "rolls back",
         "gravity drives the robot downhill at a steady speed",
@@ -42,24 +42,24 @@ FILES = {
     "draws.npz": "samples from the posterior, for NumPy",
     "LAW.md": "description of the drive law",
     "robot.toml": "the robot, for --robot of every command",
-    "runs.csv": "every run, one row each",
+    "runs.csv": "every run",
     "windows.csv": "windows of a log: voltage, velocity, acceleration",
     "feedforward.json": "feedforward constants, gains and remarks",
     "rows.csv": "readings and residuals of every row",
     "comparison.csv": "readings and errors of every row",
     "history.csv": "state and readings at every instant",
-    "reactions.csv": "loads inside the running gear at every instant",
+    "reactions.csv": "loads inside the running gear",
     "segments.csv": "energy, distance and peaks of every segment",
-    "requirements.csv": "every requirement, one row each",
+    "requirements.csv": "every requirement",
     "requirements.toml": "the requirements as given",
     "posterior.nc": "posterior of the fitted parameters, for --posterior",
     "points.csv": "outputs at every operating point",
     "turns.csv": "settled turns",
     "posture.csv": "posture: lever angles and contact loads",
-    "derivatives.csv": "every derivative, one row each",
+    "derivatives.csv": "every derivative",
     "modes.csv": "natural frequencies of the chassis",
     "peaks.csv": "peaks of the ripple, with their speeds",
-    "indices.csv": "every sensitivity index, one row each",
+    "indices.csv": "every sensitivity index",
     "settled.csv": "the settled runs, for loop and calibrate",
     "stretches.csv": "every stretch of the log, and why it was left out",
     "results.zarr/": "outputs of every point",
@@ -90,7 +90,7 @@ SINKS = {
     "battery": "battery cells", "other": "other consumers", "driver": "motor driver",
     "winding": "windings, brushes, leads", "motor": "motor friction", "gearbox": "gearboxes",
     "track": "tracks and guides", "sliding": "sliding over the ground", "rolling": "rolling resistance",
-    "lift": "lift (net of energy recovered downhill)",
+    "lift": "lift (net of recovery downhill)",
 }  # fmt: skip
 
 
@@ -141,9 +141,9 @@ FLAGS = {
     "current_limited": "the motor driver limits the current",
     "gearbox_overload": "the torque is above the continuous rating of the gearbox",
     "too_hot": "the winding is hotter than permitted",
-    "demand_missed": "the robot did not reach the commanded speed",
+    "demand_missed": "the commanded speed was not reached",
     "voltage_rising": "a cell voltage rises during discharge",
-    "current_returned": "current flows back into the external supply",
+    "current_returned": "current flows back into the supply",
 }
 
 

@@ -99,7 +99,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     }
     samples = _sampled_design(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
-        raise BadConfiguration(f"{where}: no [axes] or [samples]; specify at least one quantity to vary")
+        raise BadConfiguration(f"{where}: no [axes] or [samples]; vary at least one quantity")
     design = Design(axes, samples)
     fixed, surface = _fixed_conditions(config.conditions, robot, f"{where}, conditions")
     fixed |= task.further({**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where)
@@ -205,8 +205,8 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
             raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
         if start > stop or (start == stop) != (number == 1):
             raise BadConfiguration(
-                f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at "
-                "least 2 values, or a single value"
+                f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and 2 "
+                "values or more"
             )
         if scale == "log" and start <= 0:
             raise BadConfiguration(f"{where}.start: got {start:g}; expected a number above 0 with scale log")
@@ -220,7 +220,7 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
     if len(values) > LONGEST:
         raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (except in [samples])")
     if len(np.unique(values)) < len(values):
-        raise BadConfiguration(f"{where}: got a value twice; expected different values")
+        raise BadConfiguration(f"{where}: got a value twice; give it once")
     _check_within(values, axis, where)
     return values
 

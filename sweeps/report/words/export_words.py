@@ -77,7 +77,7 @@ def export_statement(found: Export) -> str:
     return (
         f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
         f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is "
-        f"{channels_shown or 'unknown, since these runs contain neither its current nor its speed'}."
+        f"{channels_shown or 'unknown: these runs have neither current nor speed'}."
     )
 
 
@@ -105,7 +105,7 @@ def export_remarks(found: Export) -> list[str]:
     if dropped_names:
         said.append(f"dropped: {', '.join(dropped_names)}")
     if drive.idle:
-        said.append(f"{', '.join(drive.idle)}: not exported, since it has no effect in {drive.configuration}")
+        said.append(f"{', '.join(drive.idle)}: not exported: no effect in {drive.configuration}")
     if found.posterior is None and drive.file.source.endswith(".toml"):
         said.append("no posterior.nc next to the robot's file: intervals come from the priors")
     return said
