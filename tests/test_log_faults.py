@@ -117,7 +117,7 @@ def test_an_error_in_the_first_sample_after_each_step_is_named_with_its_share(ro
     assert (note.channel, note.rows, note.share) == (runs.channels[1].name, len(steps), pytest.approx(share))
     text = describe(note)
     rest = np.delete(off[:, 1], steps + late)
-    assert f"the rms error falls to {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} % of it" in text
+    assert f"the rms error falls to {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} %" in text
     assert f"{share:.0%} of the squared error" in text and "0 ± 0.02" in text and len(text) <= 400
     off[:, 1] = 5.0
     assert error_after_steps(runs, off) == []  # an error everywhere

@@ -158,7 +158,7 @@ def test_posterior_of_another_robot_is_refused(robot, posterior, fitted):
 
 def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
     path = tmp_path / room.FILE
-    with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc that calibrate and loop write"):
+    with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc next to robot\.toml"):
         room.read_posterior(path)
     path.write_text("nothing of the kind")
     with pytest.raises(BadData, match="not a readable posterior"):

@@ -250,7 +250,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     (["--configurations", "8W"], 2, "configurations: got 8W; the robot has no such configuration"),
     (["--noise", "curent=1%"], 2, "--noise curent=1%: no such channel; did you mean current?"),
     (["--candidates", "none.csv"], 4, "none.csv: no such file"),
-    (["--posterior"], 2, "--posterior: nominal has no posterior; expected --robot FOLDER/robot.toml, written by calibrate or loop"),
+    (["--posterior"], 2, "--posterior: nominal has no posterior; expected --robot FOLDER/robot.toml of calibrate or loop"),
     pytest.param(["--slopes", "40", "--outputs", "speed"], 2, "too many robots do not travel at any operating point",
                  marks=pytest.mark.slow),
     pytest.param(["--parameters", "motor.inductance", "--outputs", "speed"], 2,

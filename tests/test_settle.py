@@ -568,7 +568,7 @@ def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
     said = words.sentence_on_few_settled_runs(found, 6, loop)
     assert (
-        "run it on the log as it is: mmrjax loop log.csv. With calibrate" in said
+        "run it on the log as it is: mmrjax loop log.csv." in said
         and words.sentence_on_few_settled_runs(found, 3, loop) == ""
     )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]

@@ -22,10 +22,10 @@ WOULD_MEASURE = {
 }
 #: Losses that data do not distinguish without variation of a condition.
 ALIKE = {
-    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses act alike",
-    "slope": "without slopes, rolling resistance and Coulomb losses act alike",
-    "voltage": "at one voltage, constant losses and those that grow with speed act alike",
-    "speed": "at one speed, constant losses and those that grow with speed act alike",
+    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses are indistinguishable",
+    "slope": "without slopes, rolling resistance and Coulomb losses are indistinguishable",
+    "voltage": "at one voltage, constant losses and losses that grow with speed are indistinguishable",
+    "speed": "at one speed, constant losses and losses that grow with speed are indistinguishable",
 }
 
 
@@ -138,9 +138,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "unmeasured": lambda name: (
         f"{name} keeps its prior value, because these data do not determine it. It needs {would_measure(name)}"
     ),
-    "constant": lambda column, value, alike: (
-        f"{column} is {value:g} in every row: {ALIKE[alike]}, so only priors distinguish them"
-    ),
+    "constant": lambda column, value, alike: f"{column} is {value:g} in every row: {ALIKE[alike]}",
     "repeats": differing_repeats,
     "larger_noise": (
         "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much as the "

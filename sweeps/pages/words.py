@@ -75,8 +75,8 @@ FILES = {
 LOOP_VERDICTS = {
     "none": "the residuals of the fitted model are consistent with noise",
     "undescribed": (
-        "in one channel, the refit's error or estimated noise exceeds a quarter of the measured rms, and no set "
-        "of effects halves it on unseen runs and brings it below a quarter"
+        "in one channel, the refit's error or estimated noise exceeds a quarter of the measured rms. No set of "
+        "effects halves it on unseen runs and brings it below a quarter"
     ),
     "place": "a term is missing in one equation, or in one of several that data cannot distinguish",
     "unnamed": "former word for place. Up to schema mmrjax.loop/3 it also meant mechanism",

@@ -405,8 +405,8 @@ class Histories(Observer):
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
                         f"{runs['time_s'][first]:g} s ({runs[column][first]:g} {unit}); a history begins at "
-                        "rest. If it began earlier, add a row then without readings; if it began in motion, set "
-                        'start = "measured" or "free" in the robot\'s file; if it is settled, give one row a '
+                        "rest. If it began earlier, add a row then without readings. If it began in motion, set "
+                        'start = "measured" or "free" in the robot\'s file. If it is settled, give one row a '
                         "run, without time_s"
                     )
         remarks: list[Remark | str] = []
