@@ -45,7 +45,7 @@ OUTPUTS: dict[str, tuple[str, str]] = {
     "margin_success": ("-", "smoothed smallest of the four margins, above 0 if it gets over"),
     "margin_reach": (
         "-",
-        "distance of its centre of mass past the obstacle, over half the wheelbase; 1 if over",
+        "distance of its centre of mass past the obstacle, over half the wheelbase, 1 if over",
     ),
     "margin_upright": ("-", "margin to the tipping pitch, of that pitch"),
     "margin_grip": ("-", "unused share of the ground's friction limit"),

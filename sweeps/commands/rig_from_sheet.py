@@ -98,7 +98,7 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         "motor.friction_viscous": StatedNumber(
             0.0,
             "N·m·s",
-            "Coulomb and viscous friction are not separated; ± as if half were viscous",
+            "Coulomb and viscous friction are not separated, ± as if half were viscous",
             f"{0.5 * constant**2 * idle / back_emf:.2g}",
         ),
     }

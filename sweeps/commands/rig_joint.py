@@ -128,7 +128,7 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict
         ("loss_coulomb", "N·m", torque * limit),
         ("loss_viscous", "N·m·s", torque * constant * ratio),
     ):
-        name, reason = f"{losses}.{key}", f"not in the model; ± is {100 * UNSTATED:g} % of the stall torque"
+        name, reason = f"{losses}.{key}", f"not in the model, ± is {100 * UNSTATED:g} % of the stall torque"
         if name in freed and freed[name].value != 0:
             continue
         if width > 0:

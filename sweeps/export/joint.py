@@ -321,7 +321,7 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
         ("gear_idle", "idle", "N·m", "M_i = M_rf0 sign ω + K_fr ω", "idle friction of the gearbox, at its input",
          "", lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction)),
         ("gear_efficiency", "efficiency", "-", "η_rm where power flows to the wheel, 1/η_b where it flows back",
-         "transmitted share of torque; `load`: torque at its input", "",
+         "transmitted share of torque, `load`: torque at its input", "",
          lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction)),
         ("output_friction", "track", "N·m", friction,
          "friction between the gearbox and the wheel's rim, at the wheel", "pull",

@@ -249,7 +249,7 @@ def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], what: s
         meets = f"{members[0].mode} at {span_text(first, last, 1)} Hz meets " if members[0].mode else ""
         order = f"{members[0].order} × {what}" if members[0].order else f"{span_text(first, last, 1)} Hz"
         how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
-        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
+        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}, ripple up to: {how})")
     others_text = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
     return "; ".join(texts) + others_text
 
