@@ -127,7 +127,7 @@ class Preset:
                 missing_words = " or ".join(by_name[needs].theirs)
                 raise BadData(
                     f"{name}: has no {missing_words}; --columns {self.name} needs it for {needs}, because "
-                    f"{present[own_column]} by itself does not give the motor voltage; record {missing_words}, or "
+                    f"{present[own_column]} alone does not give the motor voltage; record {missing_words}, or "
                     "set imposed to the speed or the current in the rig's file"
                 )
 

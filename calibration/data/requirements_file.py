@@ -145,9 +145,7 @@ def load_requirements(path: Path | None) -> Requirements:
         packaged = resources.files("calibration") / "data" / "aims" / f"{PAPER}.toml"
         return parse_requirements(packaged.read_text("utf-8"), f"{PAPER}.toml")
     if not path.is_file():
-        raise BadConfiguration(
-            f"{path}: no such file; expected a TOML file of requirements (see docs/howto/requirements.md)"
-        )
+        raise BadConfiguration(f"{path}: no such file; expected a TOML file (docs/howto/requirements.md)")
     return parse_requirements(toml_text(path, path), path.name)
 
 

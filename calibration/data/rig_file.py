@@ -51,7 +51,7 @@ _LEAST = {"mass_kg", *_TRAVEL}  # must be greater than 0
 #: Default values of a robot without a base, each with its reason. It has no limits and no other losses
 #: (`robots.blank`).
 DEFAULTS: dict[str, tuple[float, str]] = {
-    "motor.inertia": (0.0, "not stated: only the load's inertia counts; time histories from rest need the motor's"),
+    "motor.inertia": (0.0, "not stated: only the load's inertia counts; histories from rest need the motor's"),
     "battery.current_other": (0.0, "not stated: no other consumers on the battery"),
 }
 #: Time constant L / R assumed if the inductance is not stated [s]. Small motors have 0.05 to 1 ms.
@@ -116,8 +116,7 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
         raise BadConfiguration(
-            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of the "
-            "two: the travel per turn, or the radius of a drum or pulley"
+            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of the two"
         )
     if "mass_kg" not in values:
         raise BadConfiguration(f"{where}.mass_kg: missing; expected the mass that it moves [kg]")
@@ -338,9 +337,8 @@ def reject_missing(
         near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
         misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
         raise BadConfiguration(
-            f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter (mmrjax '
-            "rig new "
-            f"writes a file with all of them){misspelt}"
+            f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter '
+            f"(mmrjax rig new writes them){misspelt}"
         )
 
 

@@ -142,8 +142,8 @@ def reject_impossible(robot: Robot, asked: Requirements) -> None:
         if SLOPE in r.quantity.axes and e.slope_deg[1] > steepest:
             raise BadConfiguration(
                 f"{requirement_place}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
-                f"{_configuration_name(robot, e)} up to {steepest:.1f} deg at most (adhesion {friction:.2f}), "
-                "whatever drives it"
+                f"{_configuration_name(robot, e)} up to {steepest:.1f} deg (adhesion {friction:.2f}), whatever "
+                "drives it"
             )
 
 

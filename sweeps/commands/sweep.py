@@ -59,8 +59,7 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = not options.of_store and (count <= TABLE or config.posterior is not None)
     if not options.of_store and not small:
-        print_message(f"{count:,} points: too many for runs.csv (limit {TABLE:,}), so results go to {STORE}. "
-             "Add --export csv to get a CSV as well")  # fmt: skip
+        print_message(f"{count:,} points: too many for runs.csv ({TABLE:,}), see {STORE} or add --export csv")
     for note in notes:
         print_message(note)
     if small:
@@ -179,9 +178,8 @@ def _reject_without_space(size: int, share: float, path: Path) -> None:
     needed, free = math.ceil(size * share) + MARGIN, _free_bytes(path)
     if needed > free:
         raise BadConfiguration(
-            f"--out: the results would take {bytes_text(needed)} (uncompressed); {_existing_parent(path)} has "
-            f"{bytes_text(free)} "
-            'free; choose another disk, fewer points or outputs, or storage = "float32"'
+            f"--out: results need {bytes_text(needed)} (uncompressed); {_existing_parent(path)} has "
+            f'{bytes_text(free)} free; choose another disk, fewer points or outputs, or storage = "float32"'
         )
 
 
@@ -241,7 +239,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
         count = len(store.done())
         raise DiskFull(
             f"{store.partial}: {error.strerror} after {count} of {len(job.blocks)} chunks. Free some space, and "
-            "the same command resumes from there"
+            "the same command resumes"
         ) from error
 
 
@@ -276,8 +274,10 @@ def finish_sweep(
                 )
     done = store.done()
     if not store.finished:
-        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, "
-                     "or the same command without --shard, completes the sweep")  # fmt: skip
+        print_output(
+            f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, or the "
+            "command without --shard, completes the sweep"
+        )
         return DONE
     if options.export:
         from sweeps.points import export

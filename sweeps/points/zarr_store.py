@@ -356,7 +356,7 @@ class SweepStore(Folder):
             records = self._records().get(damaged_chunk, [])
             damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
-            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to repeat the sweep")
+            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to start again")
 
     # --- chunks -----------------------------------------------------------------------------------
 
