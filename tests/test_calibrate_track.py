@@ -62,7 +62,7 @@ def test_in_track_the_guide_friction_stands_for_the_product(base):
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
     assert priors.parameters_by_name(base)[GUIDE_SHARE].value == 0.3
-    assert "fit guide_friction there" in table_words.would_measure(GUIDE_SHARE)
+    assert "in track, fit guide_friction" in table_words.would_measure(GUIDE_SHARE)
 
 
 @pytest.fixture(scope="module")

@@ -452,7 +452,7 @@ REFUSED = {
         f"prior's sd {sd}": (
             lambda r, t, sd=sd: priors.parameter_coordinates(r, [FREE], {FREE: (0.6, sd)}),
             BadConfiguration,
-            f"{FREE}: got a standard deviation of {sd}; expected more than 0",
+            f"{FREE}: got an sd of {sd}; expected more than 0",
         )
         for sd in (-0.1, 0, np.nan)
     },

@@ -198,7 +198,7 @@ REFUSED = {
     ),
     "picture without inertia": (
         "wheeled", False, "render x.png --voltage 9 --set rover.inertia=0",
-        r"--model track: rover\.inertia: got 0; this model needs",
+        r"--model track: rover\.inertia: got 0; expected the inertia",
     ),
     "running gear of a bench": (
         "bench", False, "simulate --voltage 9 --model track", r"--model track: the robot's load is a shaft",

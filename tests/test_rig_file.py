@@ -510,7 +510,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
     assert (code, err) == (0, "")
     assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
     assert "10 lines with the template's example number" in out
-    assert "382 rpm/V" in out and "LOOK" not in out and "No data given" in out
+    assert "382 rpm/V" in out and "LOOK" not in out and "Add a table" in out
 
 
 @pytest.mark.slow

@@ -242,7 +242,7 @@ REFUSED = {
     ),
     "thousands next to whole numbers": (
         f"{SEMICOLONS}\n6T2A;15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
-        r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* no thousands separators",
+        r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* without thousands separators",
     ),
     "commas and points in one column": (
         f"{SEMICOLONS}\n6T2A;15;13.1;0;5;2,75;4800;400\n6T2A;33;21.1;8;0;3.2;11590;970",

@@ -439,7 +439,7 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
     kept = np.setdiff1d(middle.rows, off) - 200
     assert middle.mean["motor_speed"] == pytest.approx(clean[kept].mean(), rel=1e-9)
     assert middle.sd["motor_speed"] < 3 * 0.5 / np.sqrt(len(kept)) + 1.0  # the start's lag included
-    said = [x for x in words.settle_remarks(found) if "far from the readings next to them" in x]
+    said = [x for x in words.settle_remarks(found) if "far from their neighbours" in x]
     assert len(said) == (count > 0)
 
 
@@ -474,8 +474,8 @@ def test_an_acceleration_that_takes_current_is_no_settled_run(tmp_path):
     assert not settled(tmp_path, robot).stretches[0].why
     heavy = acceleration_currents(robot)
     rate = 0.002 / 100 / 0.05 * np.pi / 30  # load's inertia at the motor over the torque constant, of an rpm a second
-    assert heavy["bench"].per_rate == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
-    slow = {"bench": settling.Inertia("motor_speed", "total_current", 0.02, 1e-3)}
+    assert heavy["bench"][2] == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
+    slow = {"bench": ("motor_speed", "total_current", 0.02, 1e-3)}
     with pytest.raises(BadData, match=r"never settles: .* motor_speed still changes by 4\.\d+ %"):
         settled(tmp_path, robot, inertia=slow)
 
@@ -568,12 +568,12 @@ def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
     said = words.sentence_on_few_settled_runs(found, 6, loop)
     assert (
-        "run it on the log as it is: mmrjax loop log.csv. With calibrate" in said
+        "run it on the log as it is: mmrjax loop log.csv." in said
         and words.sentence_on_few_settled_runs(found, 3, loop) == ""
     )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
     told = {row[0]: row[-1] for row in words.omitted_stretches(every, few=True)}
-    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing, as a fit to the log uses these samples"}
+    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing, a fit to the log uses them"}
     assert told[words.WHY["stuck"][0]] == words.WHY["stuck"][1]
 
 
@@ -667,7 +667,7 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
 
 
 @pytest.mark.parametrize(("levels", "said"), [
-    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row\. .* Log three levels or more"),
+    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row\. .* Log three or more"),
     ((6.0, 12.0), ""),
 ])  # fmt: skip
 def test_a_log_of_one_level_is_said_with_what_it_lacks(tmp_path, levels, said):

@@ -174,7 +174,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path, robot):
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
     monkeypatch.setattr(command, "MARGIN", 10**18)
-    ends(mmrjax("sweep --slopes 0,5 --out s"), "--out: the results would take")
+    ends(mmrjax("sweep --slopes 0,5 --out s"), "--out: results need")
     assert not list(tmp_path.iterdir())
 
 
@@ -808,7 +808,7 @@ def test_full_disk_is_refused_before_anything_is_written(sweep, monkeypatch, tmp
     usage = shutil.disk_usage(tmp_path)._replace(free=0)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     monkeypatch.setattr(zarr_store, "create_store", None)
-    ends(sweep("s"), "the results would take")
+    ends(sweep("s"), "results need")
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 

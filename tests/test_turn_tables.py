@@ -317,7 +317,7 @@ REFUSED = {
                            r"row 4, motor_current_left_A and motor_current_right_A: got 8 and -8 .* exchanged"),
     "duties exchanged": (DRIVEN, f"supply_voltage_V,duty_left,duty_right,{SPEEDS}",
                          [(24, b / 2000, a / 2000, a, b) for a, b, *_ in SOUND],
-                         "motor_speed_left_rpm and motor_speed_right_rpm: .* the left and right columns of one quantity are"),
+                         "motor_speed_left_rpm and motor_speed_right_rpm: .* left and right columns of one quantity are"),
     "no width": (KINEMATIC.replace('width = "0.555 ± 5 %"\n', ""), f"{SPEEDS},{READ}", SOUND,
                  r"the robot's file lacks rover.turning.width \[m\], needed for a turn"),
     "one motor": (KINEMATIC.replace("sides = 2", "sides = 1"), f"{SPEEDS},{READ}", SOUND,

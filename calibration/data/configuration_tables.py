@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 
 from calibration.data import Json, Names, rig_file
-from calibration.data.input_errors import BadConfiguration, stated_word
+from calibration.data.input_errors import BadConfiguration, stated_as, stated_names, stated_word
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.contact import Friction
@@ -42,24 +42,9 @@ _KINDS = ("load", "like", "movers")
 _EXAMPLE = 'configurations = ["rover"]'
 
 
-@dataclasses.dataclass(frozen=True)
-class ConfigurationLoads:
-    """Loads of a robot file, before the parameters that the file states are applied.
-
-    Attributes:
-        by_name: loads by name, in order.
-        travels: True if the loads travel, as vehicles and linear units do.
-        linear: names of linear units.
-        missing: required parameters that the file does not state.
-    """
-
-    by_name: dict[str, Load]
-    travels: bool
-    linear: frozenset[str]
-    missing: Names
-
-
-def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], where: str) -> ConfigurationLoads:
+def loads_from_tables(
+    base: Robot | None, content: Json, sds: dict[str, float], where: str
+) -> tuple[dict[str, Load], bool, frozenset[str], list[str]]:
     """Loads that a robot file states, in its order.
 
     It removes `configurations`, and each configuration's `load`, `like` and `movers`, from `content`, and replaces
@@ -71,6 +56,10 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
         content: content of the file.
         sds: stated standard deviations, by dotted name.
         where: beginning of the error message.
+
+    Returns:
+        Loads by name, in order, before the parameters that the file states are applied. True if the loads travel, as
+        vehicles and linear units do. Names of linear units. Required parameters that the file does not state.
 
     Raises:
         BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name. A table belongs to
@@ -95,9 +84,8 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
     missing: list[str] = []
     linear: set[str] = set()
     for name in names:
-        table, table_place = content.get(name, {}), f"{where}, {name}"
-        if not isinstance(table, dict):
-            raise BadConfiguration(f"{table_place}: got {table!r}; expected a table [{name}]")
+        table_place = f"{where}, {name}"
+        table = stated_as(content.get(name, {}), dict, table_place, f"a table [{name}]")
         kind = _load_kind(table, table_place)
         if kind == "linear":
             rig_file.linear_to_shaft(table, name, table_place, sds, _number_of_drives(content, base))
@@ -121,7 +109,7 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
             f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; a file can describe only one kind; use "
             "two files"
         )
-    return ConfigurationLoads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
+    return by_name, not shafts or bool(linear), frozenset(linear), missing
 
 
 def resolve_likes(content: Json, where: str) -> None:
@@ -212,20 +200,19 @@ def _list_in_words(names: list[str]) -> str:
     return f"{', '.join(names)} {'are' if len(names) > 1 else 'is'}"
 
 
-def _names(stated: Any, where: str) -> list[str]:
+def _names(stated: Any, where: str) -> Names:
     where = f"{where}, configurations"
-    if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
-        raise BadConfiguration(f"{where}: got {stated!r}; expected a list of at least one name, such as {_EXAMPLE}")
-    for name in stated:
-        if stated.count(name) > 1:
-            raise BadConfiguration(f"{where}: {name} is listed {stated.count(name)} times; name each once")
+    names = stated_names(stated, where, f"a list of at least one name, such as {_EXAMPLE}")
+    for name in names:
+        if names.count(name) > 1:
+            raise BadConfiguration(f"{where}: {name} is listed {names.count(name)} times; name each once")
         if name in TAKEN:
             raise BadConfiguration(f"{where}: {name} has another meaning in robot files; choose a different name")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise BadConfiguration(
                 f"{where}: got {name!r}; expected letters, digits, underscores and hyphens, as {_EXAMPLE}"
             )
-    return stated
+    return names
 
 
 def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassis:

@@ -201,7 +201,9 @@ def discover(
             tell(progress_remark("others"))
         for f, verdict in verdicts.items():
             try:
-                sensitivity.append(verdict_at_noise(f, verdict.result(left()), ready.numbers))
+                other = verdict.result(left())
+                adequate, summary = not other.ends.test.rejected_with_margin, verdict_summary(other, ready.numbers)
+                sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
     finally:  # an interruption or the time limit waits for none of them
@@ -1088,12 +1090,6 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
-
-
-def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
-    """Verdict and summary at another noise level."""
-    adequate = not traced.ends.test.rejected_with_margin
-    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate)
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:

@@ -96,8 +96,8 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
         for name in start if word == "start" else (word,):
             if not turns and name in of_turns and name not in channels.channel_names(robot.channels):
                 raise BadConfiguration(
-                    f"--outputs {name}: the robot travels straight; vary the drive of its sides independently, e.g. "
-                    f"--vary {OF_SIDES[0]}=0.2:0.8"
+                    f"--outputs {name}: the robot travels straight; drive its sides differently, e.g. --vary "
+                    f"{OF_SIDES[0]}=0.2:0.8"
                 )
             if name not in outputs:
                 raise BadConfiguration(
@@ -111,7 +111,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                 )
             if turns and row in derived.OF_STRAIGHT:
                 raise BadConfiguration(
-                    f"--outputs {word}: only for straight travel; the varied inputs make the robot turn"
+                    f"--outputs {word}: only for straight travel, but varied inputs make the robot turn"
                 )
             if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")

@@ -148,12 +148,9 @@ def _loss_derivatives(run: HalfRobotSystem, motion: PlaneMotion, sides: _Contact
     return jnp.stack([jnp.maximum(-jax.jvp(f, (zero,), (one,))[1], 0.0) for f in (along, shaft)])
 
 
-class _ContactLevers(eqx.Module):
-    """Motion of each contact along the robot, to its left and off the ground, per velocity of `OF_SIDE`."""
-
-    along: Float[Array, "2 contacts 8"]
-    across: Float[Array, "2 contacts 8"]
-    off: Float[Array, "2 contacts 8"]
+#: Motion of each contact along the robot, to its left and off the ground, per velocity of `OF_SIDE`, each of shape
+#: (2, contacts, 8).
+_ContactLevers = tuple[Array, Array, Array]
 
 
 def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactState) -> _ContactLevers:
@@ -165,7 +162,7 @@ def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactSta
     along: list[Any] = [cos * one, sin * one, none, -y * one, z, none, at.rate_x * front, at.rate_x * rear]
     across: list[Any] = [-sin * one, cos * one, none, x, none, -z, none, none]
     off: list[Any] = [none, none, one, none, -x, y * one, at.rate_z * front, at.rate_z * rear]
-    return _ContactLevers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
+    return jnp.stack(along, axis=-1), jnp.stack(across, axis=-1), jnp.stack(off, axis=-1)
 
 
 def generalized_forces(
@@ -174,9 +171,12 @@ def generalized_forces(
     """Generalized forces on q [N, N·m]."""
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     y, several = SIDES * _width(run), run.robot.sides / 2
-    lateral, yaw = balances.lateral_and_yaw_effects(run.robot, _with_lateral_moment(run, signals, at, pulled))
-    forward, normal, moment, rear = pulled.generalized.T
     assert pulled.aside is not None
+    moment_lateral = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
+    lateral, yaw = balances.lateral_and_yaw_effects(
+        run.robot, dataclasses.replace(signals, moment_lateral=moment_lateral)
+    )
+    forward, normal, moment, rear = pulled.generalized.T
     ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral
     turn = several * (jnp.sum(pulled.aside * at.lever_x) - y @ forward) - yaw
     roll_moment = several * (y @ normal - jnp.sum(pulled.aside * at.lever_z))
@@ -184,13 +184,6 @@ def generalized_forces(
     shafts = several * jnp.asarray(signals.torque_net), several * rear
     pulleys = [x[k] for k in range(2) for x in shafts]
     return jnp.stack([*body, several * jnp.sum(moment), roll_moment, *pulleys])
-
-
-def _with_lateral_moment(run: HalfRobotSystem, signals: Signals, at: ContactState, pulled: ContactPull) -> Signals:
-    """Signals with the moment of the lateral forces about the centre of mass."""
-    assert pulled.aside is not None
-    moment = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
-    return dataclasses.replace(signals, moment_lateral=moment)
 
 
 def damping_matrix(
@@ -202,18 +195,17 @@ def damping_matrix(
     contacts).
     """
     levers, touching = _contact_levers(run, motion, sides.at), sides.at
+    along, across, off = levers
     assert pulled.aside is not None
     sliding = jax.vmap(side_contacts.sliding_speeds)(signals, touching)
     weight = jnp.asarray(signals.adhesion)[:, None] * touching.force
     rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
     rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]
     least = jnp.maximum(touching.force, 1e-9)
-    moves = jnp.concatenate([levers.along, levers.across, levers.off], axis=1)
-    falls = touching.damped[..., None] * levers.off
+    moves = jnp.concatenate(levers, axis=1)
+    falls = touching.damped[..., None] * off
     pushes = [
-        rises[k, 0][..., None] * levers.along
-        + rises[k, 1][..., None] * levers.across
-        + (f / least)[..., None] * falls
+        rises[k, 0][..., None] * along + rises[k, 1][..., None] * across + (f / least)[..., None] * falls
         for k, f in enumerate((pulled.force, pulled.aside))
     ]
     side_matrices = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
@@ -321,9 +313,7 @@ def _damping_product(
     gained_forces = gained_forces.at[jnp.asarray([X, Y, YAW])].add(
         jnp.stack([cos * jnp.sum(rolling_damping), sin * jnp.sum(rolling_damping), -y @ rolling_damping])
     )
-    for lever, now, then in zip(
-        (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, touching.force), after, strict=True
-    ):
+    for lever, now, then in zip(levers, (pulled.force, pulled.aside, touching.force), after, strict=True):
         side_products = jnp.einsum("sci,sc->si", lever, now - then)
         gained_forces = gained_forces.at[OF_SIDE[0]].add(side_products[0]).at[OF_SIDE[1]].add(side_products[1])
     return run.robot.sides / 2 * gained_forces
@@ -338,10 +328,8 @@ def _state_after_step(
         of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
         return half_robot.other_states_after_step(*of_side, signals)
 
-    side_memories = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
-    after = HalfRobotState(
-        motion.q + run.step * v, v, side_memories.current, side_memories.discharge[0], side_memories.memory
-    )
+    current, discharge, memory = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
+    after = HalfRobotState(motion.q + run.step * v, v, current, discharge[0], memory)
     return after, _signals_after_step(run, motion, found, gained), found.pulled.guided
 
 
@@ -353,7 +341,7 @@ def contact_forces_after_step(
     Each has the shape (2, contacts).
     """
     of_side = gained[OF_SIDE]
-    along, across, off = (jnp.einsum("sci,si->sc", x, of_side) for x in (levers.along, levers.across, levers.off))
+    along, across, off = (jnp.einsum("sci,si->sc", x, of_side) for x in levers)
     down, least = at.damped * off, jnp.maximum(at.force, 1e-9)
     assert pulled.aside is not None
     ahead, aside = (

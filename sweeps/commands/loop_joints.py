@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import UnivariateSpline
 from scipy.ndimage import maximum_filter1d
 
-from calibration.data import Names, delimited
+from calibration.data import Names
 from calibration.data import runs as records
 from calibration.data.column_names import check_units
 from calibration.data.columns import CURRENT, LOAD, SPEED, Column
@@ -68,8 +68,7 @@ class Chain:
         for k, name in enumerate(names):
             if model.jnt_type[k] != int(library.mjtJoint.mjJNT_HINGE) or not name:
                 raise BadConfiguration(
-                    f"--model: {source.name}, joint {name or k + 1} slides, is free or has no name; expected only "
-                    "named hinges, whose measured angles give the whole motion"
+                    f"--model: {source.name}, joint {name or k + 1} is no named hinge; expected only named hinges"
                 )
             if driven.count(k) > 1:
                 raise BadConfiguration(
@@ -148,8 +147,7 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
         if column is None or clock is None:
             lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
             raise BadData(
-                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the "
-                "model, because every joint's torque depends on the whole motion"
+                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the model"
             )
         check_units(joint, [Column(ANGLE, c, units[c]) if c in units else None for c in joint.header])
         time = column_numbers(clock)
@@ -240,8 +238,8 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
     if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
         raise BadConfiguration(
             f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" '
-            'and channels = ["motor_current"]: the model\'s torque is valid only for the measured motion; '
-            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench writes a template"
+            f'and channels = ["motor_current"]; mmrjax rig new {joint}.toml --from {config.model} --joint '
+            f"{joint} --kind bench writes a template"
         )
     return one, robot
 
@@ -275,7 +273,7 @@ def run_joints(
     robots = {name: robot_of_joint(config, name) for name in joint_names}
     if not data.is_file():
         raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
-    log = reading.read_whole_table(data) or delimited.read_csv_columns(data, data.name)
+    log = reading.read_whole_table(data)
     runs = runs_of_joints(log, chain, {name: robot for name, (_, robot) in robots.items()})
     folder = beside.out or store.default_path("loop")
     code, rows = 0, []

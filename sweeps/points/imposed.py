@@ -138,7 +138,7 @@ def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> N
         BadConfiguration: there is one.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "the robot's load is a shaft, on which slope, payload, mass and surface have no effect; remove it"
+        why = "slope, payload, mass and surface do not act on a shaft; remove it"
         raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
 
 
@@ -165,8 +165,7 @@ def check_on_ground(robot: Robot, command: str) -> None:
     """
     if not robot.has_ground:
         raise BadConfiguration(
-            f"{command}: the robot's load is a shaft, without wheels or tracks on the ground; use simulate, "
-            "sweep, compare, calibrate, loop or sensitivity"
+            f"{command}: the robot's load is a shaft; use simulate, sweep, compare, calibrate, loop or sensitivity"
         )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
-from calibration.data.sources import in_memory
+from calibration.data.sources import columnar
 from calibration.data.sources.recorded_signals import Load, Signal, Source, plain_values, refused_type
 
 #: Separator between the path of a file and the path of signals in it.
@@ -126,8 +126,8 @@ def format_of(path: Path, name: str) -> Format | None:
             return BAG
         if parts := sorted(file.name for file in path.iterdir() if file.suffix in _RECORDINGS):
             raise BadData(
-                f"{name}: is a folder without {_METADATA}; expected that file of the bag, or the path of a "
-                f"recording, as {path / parts[0]}"
+                f"{name}: is a folder without {_METADATA}; expected that file of the bag, or a recording, as "
+                f"{path / parts[0]}"
             )
     begin = input_files.first_bytes(path, name)
     for magic, format_name in BEGINNINGS.items():
@@ -180,9 +180,9 @@ def open_object(source: Any) -> Source:
     """The signals of a table in memory.
 
     Raises:
-        BadData: for the same reasons as `in_memory.signals_of_object`.
+        BadData: for the same reasons as `columnar.signals_of_object`.
     """
-    kind, signals = in_memory.signals_of_object(source)
+    kind, signals = columnar.signals_of_object(source)
     return checked_source(kind, kind, signals)
 
 
