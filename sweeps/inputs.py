@@ -10,7 +10,7 @@ from calibration.data import Json, Names, effect_file, posterior_file, robot_fil
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced_levers
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
@@ -113,11 +113,7 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
         BadConfiguration: the robot does not have it. The message has `where` and the robot's configurations.
     """
     for name in names:
-        if name not in robot.configurations:
-            raise BadConfiguration(
-                f"{where}: got {name}; the robot has no such configuration; "
-                f"{allowed_words(name, robot.configurations)}"
-            )
+        stated_word(name, robot.configurations, where, f"got {name}; the robot has no such configuration")
 
 
 def check_surface(robot: Robot, names: Collection[str], surface: str | None) -> None:

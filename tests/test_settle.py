@@ -472,8 +472,8 @@ def test_an_acceleration_that_takes_current_is_no_settled_run(tmp_path):
     assert not settled(tmp_path, robot).stretches[0].why
     heavy = acceleration_currents(robot)
     rate = 0.002 / 100 / 0.05 * np.pi / 30  # load's inertia at the motor over the torque constant, of an rpm a second
-    assert heavy["bench"].per_rate == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
-    slow = {"bench": settling.Inertia("motor_speed", "total_current", 0.02, 1e-3)}
+    assert heavy["bench"][2] == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
+    slow = {"bench": ("motor_speed", "total_current", 0.02, 1e-3)}
     with pytest.raises(BadData, match=r"never settles: .* motor_speed still changes by 4\.\d+ %"):
         settled(tmp_path, robot, inertia=slow)
 

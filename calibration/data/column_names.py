@@ -14,7 +14,6 @@ from calibration.data.columns import DRIVEN, DUTY, HEADING, SIDES, SPEED, SUPPLY
 from calibration.data.input_errors import BadData, allowed_words, parse_number
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import channels, quantities
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 #: Ratio to the largest allowed value from which another unit is probable.
@@ -141,10 +140,13 @@ def match_column_names(
         raise BadData(
             f"{name}: column {repeated[0]} is present {matched_names.count(repeated[0])} times; expected once"
         )
-    if inferred:
-        layout = _with_channels(name, matched_names, layout, channels.EVERY)
-    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, matched_names) if m}:
-        layout = _with_channels(name, matched_names, layout, channels.OF_TURNS)
+    if inferred or of_turns:
+        every = dataclasses.replace(layout, channels=channels.EVERY)
+        present = {m.column for m in every.meanings(name, matched_names) if m is not None}
+        turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present
+        more = channels.EVERY if inferred else channels.OF_TURNS if turns else ()
+        read = (c for c in channels.EVERY if c in layout.channels or (c in more and c.column in present))
+        layout = dataclasses.replace(layout, channels=tuple(read))
     return matched_names, layout, tuple(notes)
 
 
@@ -163,16 +165,6 @@ def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool
             column = right
         columns_found.append(column)
     return columns_found, tuple(notes)
-
-
-def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
-    """Layout extended by each channel of `more` for which the file has a column."""
-    meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
-    mapped_columns = {m.column for m in meanings if m is not None}
-    with_channels = tuple(
-        c for c in channels.EVERY if c in layout.channels or (c in more and c.column in mapped_columns)
-    )
-    return dataclasses.replace(layout, channels=with_channels)
 
 
 def check_header(

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from calibration.data import Json
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
 from mmrjax import effects
 from mmrjax.effects.base import THE_SIDE, Effect
 from mmrjax.model import balances, channels, paper_robots, params
@@ -114,11 +114,8 @@ def effect_library(paths: Sequence[Path | str]) -> Library:
         library[effect.name] = effect
     for path, effect in own_effects:
         other_names = [name for name in library if name != effect.name]
-        if effect.settles_to and effect.settles_to not in other_names:
-            raise BadConfiguration(
-                f"{_where(path, effect)}, settles_to: got {effect.settles_to}; "
-                f"{allowed_words(effect.settles_to, other_names)}"
-            )
+        if effect.settles_to:
+            stated_word(effect.settles_to, other_names, f"{_where(path, effect)}, settles_to")
     return library
 
 

@@ -27,7 +27,7 @@ from sweeps.points import axes, grid, run, scale, uncertainty
 from sweeps.points.job import prepare_job, showing_turns, store_layout
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of_configuration
-from sweeps.points.zarr_store import STORE, Done, Identity, Layout, SweepStore, job_identity
+from sweeps.points.zarr_store import STORE, Done, Identity, StoreLayout, SweepStore, job_identity
 from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
 from sweeps.report.run_tables import endings_table
@@ -129,7 +129,7 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
 # --- before ---------------------------------------------------------------------------------------------------------
 
 
-def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
+def dry_run(job: scale.Job, layout: StoreLayout, path: Path) -> None:
     """Reports points, chunks, bytes and expected time of a sweep. Nothing is written."""
     compiled = scale.Compiled(job)
     blocks, slow = job.blocks, job.task.slow
@@ -291,10 +291,10 @@ def finish_sweep(
     return DONE if words.every_run_solved(counts) else SOLVER_FAILED
 
 
-def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
+def sweep_summary(layout: StoreLayout, job: scale.Job, done: Iterable[Done]) -> Json:
     """`result.json`."""
     done = list(done)
-    units = {v.name: v.attributes["units"] for v in layout.variables if "units" in v.attributes}
+    units = {name: a["units"] for name, (_, a) in layout.variables.items() if "units" in a}
     names = [name for name in job.outputs if name in units]
     ranges = {name: [d.ranges[name] for d in done if name in d.ranges] for name in names}
     return {

@@ -15,7 +15,14 @@ from calibration.data import Json, Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import reason_without_levers
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number, stated_word
+from calibration.data.input_errors import (
+    SEEDS,
+    BadConfiguration,
+    allowed_words,
+    stated_count,
+    stated_number,
+    stated_word,
+)
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
@@ -178,12 +185,8 @@ def _check_within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> No
 
 
 def _configuration(name: Any, robot: Robot, where: str) -> float:
-    if name not in robot.configurations.names:
-        raise BadConfiguration(
-            f"{where}: got {name!r}; the robot has no such configuration; "
-            f"{allowed_words(str(name), robot.configurations)}"
-        )
-    return float(robot.configurations.index(name))
+    wrong = f"got {name!r}; the robot has no such configuration"
+    return float(robot.configurations.index(stated_word(name, robot.configurations, where, wrong)))
 
 
 # --- grids ------------------------------------------------------------------------------------------------------
@@ -201,8 +204,7 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
         start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
         number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
         scale = stated.get("scale", "linear")
-        if scale not in ("linear", "log"):
-            raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
+        stated_word(scale, ("linear", "log"), f"{where}.scale", f"got {scale!r}")
         if start > stop or (start == stop) != (number == 1):
             raise BadConfiguration(
                 f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and 2 "
@@ -267,13 +269,9 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     if not stated:
         return None
     _check_keys(stated, _SAMPLES, ("design", "number"), where)
-    design = stated["design"]
-    if not isinstance(design, str) or design not in DESIGNS:
-        raise BadConfiguration(f"{where}.design: got {design!r}; {allowed_words(str(design), DESIGNS)}")
+    design = stated_word(stated["design"], DESIGNS, f"{where}.design", f"got {stated['design']!r}")
     number = stated_count(stated["number"], f"{where}.number", 1, 2**52)
-    seed = stated.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")
+    seed = stated_count(stated.get("seed", 0), f"{where}.seed", 0, SEEDS)
     overrides = stated.get("over", {})
     if not isinstance(overrides, dict):
         raise BadConfiguration(f"{where}.over: got {overrides!r}; expected a table of names and distributions")
@@ -315,8 +313,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         raise BadConfiguration(f"{where}: cannot be sampled; put it under axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
     kind = table.get("distribution") if isinstance(table, dict) else None
-    if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
-        raise BadConfiguration(f"{where}.distribution: got {kind!r}; {allowed_words(str(kind), DISTRIBUTIONS)}")
+    kind = stated_word(kind, DISTRIBUTIONS, f"{where}.distribution", f"got {kind!r}")
     needed = DISTRIBUTIONS[kind]
     _check_keys(table, ("distribution", *needed), needed, where)
     numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}

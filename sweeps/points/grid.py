@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.columns import LOAD, Layout
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.runs import Runs
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
 from mmrjax.model.robot import Robot
@@ -56,8 +56,8 @@ def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None
     )
     imposed.check_acting(robot, ground, shaft)
     surface = config.surface
-    if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
-        raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {allowed_words(surface, SURFACES)}")
+    if surface is not None and robot.rig.scales_adhesion:
+        stated_word(surface, SURFACES, OPTIONS["surface"], f"got {surface!r}")
     update: dict[str, object] = {"configurations": grid_configurations(config, robot)}
     if battery:
         imposed.check_battery(robot)

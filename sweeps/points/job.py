@@ -26,7 +26,7 @@ from sweeps.console import print_message
 from sweeps.points import axes, scale
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import Task, task_of_configuration
-from sweeps.points.zarr_store import ABSENT, Layout, Variable
+from sweeps.points.zarr_store import ABSENT, StoreLayout
 
 #: Number of points that the fidelity checks before the first one is simulated.
 ASKED = 48
@@ -115,14 +115,14 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
             raise BadConfiguration(f"--model {task.model}: at {point_text}: {error}") from error
 
 
-def store_layout(config: Campaign, job: scale.Job) -> Layout:
+def store_layout(config: Campaign, job: scale.Job) -> StoreLayout:
     """Arrays in the store of a job, with units and long names."""
-    variables = [
-        Variable(name, scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
+    variables = {
+        name: (scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
         for name in job.outputs
-    ]
+    }
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
-    variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}))
+    variables[STATUS] = scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}
     planned = job.plan.axes
     coordinates = {
         n: _store_attributes({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()
@@ -131,8 +131,8 @@ def store_layout(config: Campaign, job: scale.Job) -> Layout:
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
     group_attributes = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
-    return Layout(
-        job.plan.design, job.blocks, tuple(variables), coordinates, labels, group_attributes, config.compression
+    return StoreLayout(
+        job.plan.design, job.blocks, variables, coordinates, labels, group_attributes, config.compression
     )
 
 
