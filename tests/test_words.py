@@ -470,7 +470,9 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
 
 
 def test_every_doubt_about_a_mechanism_has_words():
-    none = Mechanism(tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0)
+    none = Mechanism(
+        tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0, run=2, changed="track"
+    )
     assert set(none.fails) == set(loop_words.NO_MECHANISM) and all(loop_words.no_mechanism(none).split())
 
 

@@ -908,8 +908,8 @@ def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages
     run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
     if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
         return traced
-    if traced.verdict == "mechanism":
-        return dataclasses.replace(traced, verdict="place")
+    if traced.verdict == "mechanism" and traced.mechanism is not None:  # a curve is not simulated
+        return dataclasses.replace(traced, verdict="place") if traced.mechanism.effects else traced
     mechanism = find_mechanism(
         screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
         traced.predicted, windows.settings,

@@ -179,19 +179,28 @@ def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
     )
 
 
+def _changed_constant(constant: str, run: int | None) -> str:
+    """`a different motor.inertia in run 3`."""
+    if "." in constant:
+        return f"a different {constant} in run {run}"
+    return f"a constant error in the {bases.place_in_words(constant)} of run {run}"
+
+
 #: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the misfit beyond noise",
     "gain": "it changes the log likelihood of held-out runs by {0.gain:+.2g} ± {0.se:.2g} per reading",
     "again": "it is found again in only {again:.0f} % of the fits without one block",
     "many": "any of {many} variables or equations may be its cause",
+    "run": "{changed} explains as much",
 }
 
 
 def no_mechanism(found: loop_notes.Mechanism) -> str:
     """Reasons against the best mechanism."""
     numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": found.candidates}
-    why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
+    changed = _changed_constant(found.changed, found.run)
+    why = [NO_MECHANISM[name].format(found, **numbers, changed=changed) for name in found.fails]
     return f"the best candidate is a {found.families[0]}, but {' and '.join(why)}"
 
 
@@ -547,17 +556,10 @@ def _score_words(test: loop_notes.NameTest) -> str:
     """Score of an effect, with the threshold of chance and the score without its strongest row."""
     less = ""
     if test.changed:
-        less = f", {_changed_constant(test)} explains {test.root_changed:.1f} σ"
+        less = f", {_changed_constant(test.changed, test.row)} explains {test.root_changed:.1f} σ"
     elif test.row is not None:
         less = f", and {test.root_without:.1f} σ remain without row {test.row}"
     return f"{test.effect} scores {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ{less})"
-
-
-def _changed_constant(test: loop_notes.NameTest) -> str:
-    """`a different motor.inertia in run 3`."""
-    if "." in test.changed:
-        return f"a different {test.changed} in run {test.row}"
-    return f"a constant error in the {bases.place_in_words(test.changed)} of run {test.row}"
 
 
 #: Evidence against a single effect: short, and in words.
@@ -585,7 +587,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     doubts = {
         "beside": curve_words and f" next to smooth curves ({curve_words})",
         "larger": " and ".join(test.larger),
-        "changed": _changed_constant(test),
+        "changed": _changed_constant(test.changed, test.row),
     }
     doubts |= {"over_variable": bases.variable_in_words(test.over)}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
@@ -821,10 +823,9 @@ def sentence_on_single_run(
 ) -> str:
     """Sentence on an effect that depends on one row, or that one different run explains as well."""
     if test.changed:
-        return (
-            f"{_changed_constant(test)} explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ. Check "
-            "what was different in that run, or repeat it"
-        )
+        explained = f"explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ"
+        different = _changed_constant(test.changed, test.row)
+        return f"{different} {explained}. Check what was different in that run, or repeat it"
     place_words = _conditions(conditions)
     row = f"row {test.row}{f' ({place_words})' * bool(place_words)}"
     others = (
