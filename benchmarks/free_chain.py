@@ -290,7 +290,7 @@ def measure(
     normal = np.asarray(sums.normal)[tail]
     clock, whole = sample * np.arange(len(normal)), max(round(1e-3 / sample), 1)
     coarse = normal[len(normal) % whole :].reshape(-1, whole).mean(1)
-    found = measure_ripple(clock, normal)
+    _, amplitude, repetition = measure_ripple(clock, normal)
     weight = float(c.half.chassis + 2 * c.half.pulley + gear.belt_mass) * GRAVITY
     return {
         "guide_share": mean["guide"] / mean["normal"],
@@ -298,8 +298,8 @@ def measure(
         "carried_over_weight": mean["normal"] / weight,
         "normal_std_over_mean": float(normal.std() / normal.mean()),
         "normal_std_over_mean_1_ms": float(coarse.std() / coarse.mean()),  # sampled as in the track model
-        "ripple_amplitude": found.amplitude,
-        "ripple_period_s": found.period,
+        "ripple_amplitude": amplitude,
+        "ripple_period_s": repetition,
         "period_34_s": period,
         "line_of_34": harmonics(normal, periods),
         "speed_m_s": float(np.mean(np.asarray(rate)[tail, 0])),
@@ -333,8 +333,8 @@ def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
             {
                 "guide_share": float(answer.steady.guide_share[0]),
                 "normal_std_over_mean": float(normal.std() / normal.mean()),
-                "ripple_amplitude": measure_ripple(np.asarray(answer.time[0, -300:]), normal).amplitude,
-                "ripple_period_s": measure_ripple(np.asarray(answer.time[0, -300:]), normal).period,
+                "ripple_amplitude": measure_ripple(np.asarray(answer.time[0, -300:]), normal)[1],
+                "ripple_period_s": measure_ripple(np.asarray(answer.time[0, -300:]), normal)[2],
                 "period_34_s": period,
                 "line_of_34": harmonics(normal[-round(periods * period / 1e-3) :], periods),
                 "speed_wheel": fast,

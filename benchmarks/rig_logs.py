@@ -32,10 +32,12 @@ import loop_scores as scores
 from campaign import Task, campaign, looped, refused
 from worlds import laws, logs
 
-KINDS = ("clean", "library", "outside")
-#: Least and greatest sigmas of each effect.
-SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}
-VARIED = {"library": (5.0, 5.5), "outside": (8.0, 15.0)}
+KINDS = ("clean", "library", "outside", "fault")
+#: Least and greatest sigmas of each effect, or of a constant that differs in one run.
+SIGMAS = {"library": (5.0, 15.0), "outside": (8.0, 15.0), "fault": (8.0, 15.0)}
+VARIED = {**SIGMAS, "library": (5.0, 5.5)}
+#: Constants that differ in one run, in turn.
+DIFFERING = ("dry", "damping", "resistance", "inertia", "torque_constant", "efficiency")
 #: Rigs drawn until one can have an effect of the wanted strength.
 TRIES = 6
 #: Allowed excess of the loop's error over that of independent least squares.
@@ -61,6 +63,11 @@ def attempt(kind: str, seed: int, stratum: str = "") -> logs.Case | str:
     stated, sigmas = not varied or seed % 2 == 0, (VARIED if varied else SIGMAS)
     if kind == "clean":
         return logs.case(made(), "", 0.0, seed, stated=stated)
+    if kind == "fault":
+        made = made()
+        names = [n for n in DIFFERING if n in made.names]
+        name, run = names[(seed // len(logs.IMPOSED)) % len(names)], int(rng.integers(len(made.inputs)))
+        return logs.case(made, name, float(rng.uniform(*sigmas[kind])), seed, stated=stated, run=run)
     pool = [n for n, x in (laws.LOGS if kind == "library" else laws.OUTSIDE_LOGS).items() if x.needs(imposed)]
     name, why = pool[(seed // len(logs.IMPOSED)) % len(pool)], ""
     for _ in range(TRIES):
@@ -149,7 +156,8 @@ def summary(lines: list[dict]) -> list[str]:
     f.say("outside: a wrong established name (goal <= 3 %)", outside, lambda x: x["classes"])
     f.say("  unnamed in the right equation", outside, scores.placed)
     f.say("  nothing found", outside, lambda x: x["verdict"] == "none")
-    every = f.of(*KINDS)
+    f.say("a constant differs in one run: an established name (goal <= 3 %)", f.of("fault"), lambda x: x["classes"])
+    every = f.of(*KINDS[:3])
     for imposed in (*logs.IMPOSED, logs.GOAL):
         some = [x for x in every if x["made"]["imposed"] == imposed]
         f.say(f"  {imposed}: clean without a finding, library right, outside without a name", some, right)

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from calibration.data import Json, Names, effect_file, posterior_file, robot_file, stated, surface_labels
+from calibration.data import Json, Names, effect_file, posterior_file, robot_file, stated, table
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced_levers
@@ -132,7 +132,7 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None) -> 
     """
     is_allowed = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
     if not is_allowed and not all(
-        surface_labels.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
+        table.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
     ):
         raise BadConfiguration(
             f"--surface: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"

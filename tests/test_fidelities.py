@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mmrjax import fidelities
-from mmrjax.fidelities import Effort, FidelityFacts, Option
+from mmrjax.fidelities import FidelityFacts, Option
 from mmrjax.fidelities.base import Fidelity, History, RunBatch
 from mmrjax.fidelities.steady import operating_point, steady_batch
 from mmrjax.model import channels, params
@@ -33,12 +33,7 @@ def short(fidelity):
 
 def knows_itself(fidelity, robot):
     facts = fidelity.facts
-    assert (
-        fidelity.name in fidelities.TABLE
-        and facts.description
-        and facts.at_once(False) >= 1
-        and facts.effort.starts >= 1
-    )
+    assert fidelity.name in fidelities.TABLE and facts.description and facts.at_once(False) >= 1 and facts.starts >= 1
     assert all(0 < option.default <= option.most and option.meaning and option.unit for option in facts.options)
     assert fidelity.facts.resolved() == {option.name: option.default for option in facts.options}
     assert (fidelity.histories is not None) == facts.histories
@@ -164,7 +159,7 @@ def toy(monkeypatch):
     module.FIDELITY = Fidelity("toy", settled=settled, run=run)
     monkeypatch.setitem(sys.modules, "toy_fidelity", module)
     line = FidelityFacts(
-        "toy_fidelity", "steady, and patient", chunk=8, effort=Effort(2, True, False),
+        "toy_fidelity", "steady, and patient", chunk=8, starts=2, profiles=True,
         options=(Option("patience", "s", 3.0, 10.0, "time that it takes"),),
     )  # fmt: skip
     monkeypatch.setitem(fidelities.TABLE, "toy", line)

@@ -51,9 +51,9 @@ def test_sysid_log_of_wpilib_becomes_one_run_for_each_test(tmp_path):
     signals = signals_of(file)
     assert signals["tags"].refused and len({id(s.clock) for s in signals.values() if s.clock}) == 1
     assert presets_file.recognise_preset([*signals]) == "sysid"
-    table = reading.read_columns(file, runs.Layout.of(None), presets_file.find_preset("sysid,rotations=1"))
-    columns = dict(zip(table.arrays.header, table.arrays.values, strict=True))
-    names = {mine: columns[theirs] for mine, theirs, _ in table.mapped}
+    table, mapped = reading.read_columns(file, runs.Layout.of(None), presets_file.find_preset("sysid,rotations=1"))
+    columns = dict(zip(table.header, table.values, strict=True))
+    names = {mine: columns[theirs] for mine, theirs, _ in mapped}
     assert list(dict.fromkeys(names["run_id"])) == ["quasistatic-forward", "dynamic-reverse"]
     assert_array_equal(names["supply_voltage_V"], [*range(20, 30)] * 2)
     assert_array_equal(names["output_speed_turns_s"], [*range(40, 50)] * 2)
@@ -68,9 +68,9 @@ def test_advantagekit_names_a_module(tmp_path):
     (tmp_path / "akit.wpilog").write_bytes(wpilog(*records))
     assert presets_file.recognise_preset(entries) == "advantagekit"
     preset = presets_file.find_preset("advantagekit,module=1")
-    table = reading.read_columns(tmp_path / "akit.wpilog", runs.Layout.of(None), preset)
-    columns = dict(zip(table.arrays.header, table.arrays.values, strict=True))
-    found = {mine: columns[theirs] for mine, theirs, _ in table.mapped}
+    table, mapped = reading.read_columns(tmp_path / "akit.wpilog", runs.Layout.of(None), preset)
+    columns = dict(zip(table.header, table.values, strict=True))
+    found = {mine: columns[theirs] for mine, theirs, _ in mapped}
     expected = ("supply_voltage_V", "output_angle_rad", "output_speed_rad_s", "motor_current_A")
     for k, mine in enumerate(expected, 5):
         assert_array_equal(found[mine], 10 * k + np.arange(5))
@@ -200,12 +200,12 @@ TABLE = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total
 def test_files_of_a_pattern_are_runs_of_their_own(tmp_path):
     for k, voltage in enumerate((15, 24)):
         (tmp_path / f"run{k}.csv").write_text(TABLE.format(voltage))
-    table = reading.read_columns(str(tmp_path / "run*.csv"), runs.Layout.of(None)).arrays
+    table, _ = reading.read_columns(str(tmp_path / "run*.csv"), runs.Layout.of(None))
     columns = dict(zip(table.header, table.values, strict=True))
     assert columns["run_id"] == ["run0", "run1"] and columns["supply_voltage_V"] == ["15", "24"]
     first = table.digest
     (tmp_path / "run1.csv").write_text(TABLE.format(25))
-    assert reading.read_columns(str(tmp_path / "run*.csv"), runs.Layout.of(None)).arrays.digest != first
+    assert reading.read_columns(str(tmp_path / "run*.csv"), runs.Layout.of(None))[0].digest != first
     assert len(runs.read_runs(tmp_path / "run*.csv")) == 2
     shown = contents.inspect_source(str(tmp_path / "run*.csv"))  # it was "no such file"
     assert len(shown.signals) == 6 and "2 files, each a run; these are the signals of run0.csv" in shown.notes[0]

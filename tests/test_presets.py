@@ -220,14 +220,14 @@ def test_ros_2_effort_is_what_the_preset_assumes(tmp_path, topic, preset, column
                 [*np.array(joints).T.copy()] if kind != state else [[store.types[value](["position", "velocity", "effort"], x) for x in joints]]
             )  # fmt: skip
             writer.write(link, at, store.serialize_cdr(store.types[kind](header, ["a", "b"], *fields), kind))
-    read = reading.read_columns(
+    table, mapped = reading.read_columns(
         tmp_path / "bag", records.Layout.of(None), presets_file.find_preset(f"{preset},joint=1")
     )
-    values = dict(zip(read.arrays.header, read.arrays.values, strict=True))
-    found = {mine: factor * values[theirs] for mine, theirs, factor in read.mapped}
+    values = dict(zip(table.header, table.values, strict=True))
+    found = {mine: factor * values[theirs] for mine, theirs, factor in mapped}
     assert_allclose(found["output_speed_rad_s"], 2.0 * np.arange(4))
     assert_allclose(found[column], 1.5 * np.arange(4) * (1000 if "mA" in column else 1))
-    assert any(f"read as {column}, is assumed to be" in note for note in read.arrays.notes)
+    assert any(f"read as {column}, is assumed to be" in note for note in table.notes)
 
 
 WRONG = {

@@ -1,11 +1,13 @@
 """Answers of the regression alone, on generated logs of one motor with six faults. Plain NumPy laws, no simulation."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import active_set, candidates, discover, findings, score_tests, screening
+from calibration.discovery import active_set, candidates, discover, findings, score_tests, screening, standing
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
 from calibration.inference.observers import Histories, windows
@@ -23,12 +25,15 @@ SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
 SETTINGS = settings_for(Histories, 333)
 
 
-def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, swings=False, slow=0.0):
+def log(
+    seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0
+):
     """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
 
     Args:
         late: rows by which the voltage acts later than its column says.
         forward: friction is larger by this share forward, smaller backward. sticks: larger by it at rest, and falls over 60 rad/s.
+        rough: friction of the third run alone is larger by this share.
         swings: the voltage swings, and is held from row to row.
         slow: sd of a torque that nobody knows and that changes every 0.4 s [N·m].
     """
@@ -45,7 +50,11 @@ def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0
         for _ in range(round(EVERY / STEP)):
             settled = (acts[:, n] - 0.042 * speed) / (0.9 + sag)  # exact for the winding, of time constant 2 steps
             current = settled + (current - settled) * np.exp(-STEP * (0.9 + sag) / 4e-4)
-            dry = 0.02 * (1 + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60)) * np.tanh(speed / 0.05)
+            dry = (
+                0.02
+                * (1 + rough * (np.arange(4) == 2) + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60))
+                * np.tanh(speed / 0.05)
+            )
             torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed + unknown[:, n]
             speed = speed + STEP * torque / 2.4e-4
     current, speed = (np.array(x).T for x in zip(*shown, strict=True))
@@ -145,6 +154,24 @@ def test_windows_fit_effects_as_least_squares_do(answered):
     expected = np.concatenate([fit.origin + move[:size], move[size:]])
     assert np.max(np.abs(found.z[: size + 2] - expected) / found.sd[: size + 2]) < 0.05  # the end of a search
     assert move[size] > 5 * found.sd[size] and len(rows) == len(posed.data.weight)
+
+
+@pytest.mark.parametrize("fault", [{"rough": 0.3}, {"forward": 0.3}])
+def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_imitates_it(answered, fault):
+    space = answered.space_of(**fault)
+    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
+    posed, _ = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    linear = posed.observe.linear
+    space = dataclasses.replace(
+        space, bare=posed, equipped=dataclasses.replace(space.equipped, observe=posed.observe)
+    )
+    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    run, changed, root = standing._changed_run(space, linear, (), jacobian, residual)
+    effects = standing._largest_root(jacobian, residual, np.asarray(linear.signatures))
+    if "rough" in fault:
+        assert (run, changed) == (3, "motor.friction_coulomb") and root > 1.2 * effects
+    else:
+        assert root < 0.8 * effects
 
 
 def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered):

@@ -111,7 +111,7 @@ def test_a_log_of_two_rates_is_read_equal_to_its_arrays(tmp_path, robot, file):
     ):
         signal = find_signal(signals, path, file)
         assert_allclose(signal.load(), values, rtol=0, atol=off)
-        elapsed = one_clock.clock_seconds(signal.clock).time
+        elapsed = one_clock.clock_seconds(signal.clock)[0]
         assert_allclose(elapsed, time - time[0], rtol=0, atol=1e-9)
     speed = "motor_speed_rad_s" if "velocity" in rpm else "motor_speed_rpm"
     one_rpm = 30 / np.pi if "velocity" in rpm else 1.0

@@ -23,11 +23,12 @@ from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, fit_smooth_curve, fit_smooth_surface
 from calibration.discovery.standing import (
+    _changed_run,
     _curve_evidence,
     _deficient_equations,
     _largest_root,
     _largest_variation,
-    _most_influential_run,
+    _most_influential_row,
     _recurrence,
     cost_of_names,
     equation_of_place,
@@ -327,20 +328,40 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
 
     assert _largest_root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
     space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
-    row, least = _most_influential_run(space, toy.linear.runs(), jacobian, residual, signature)
+    space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
+    row, least = _most_influential_row(space, jacobian, residual, signature)
     falls = [fall(np.repeat(rows != k, 3)) for k in rows]
     assert row == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
-    runs = np.split(rows, 4)  # as of histories
-    run, least = _most_influential_run(space, runs, jacobian, residual, signature)
-    falls = [fall(np.repeat(~np.isin(rows, run), 3)) for run in runs]
-    assert run == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
-    assert _most_influential_run(space, runs[:2], jacobian, residual, signature) == (None, math.inf)
-    of_one = np.where(
-        np.repeat(np.isin(rows, runs[1]), 3)[:, None], signature, 0.1 * signature
-    )  # the others tell little
-    same = -np.append(10.0 * of_one[:, 0], np.zeros(len(residual) - readings))
-    alike = [_most_influential_run(space, runs, jacobian, same, of_one, differ)[1] for differ in (False, True)]
-    assert alike[0] < 0.3 * _largest_root(jacobian, same, of_one) < 0.9 * alike[1]
+
+
+def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find(toy, monkeypatch):
+    """Against the fall of χ² by a parameter's column, or a constant error of a place, within each run."""
+    rng = np.random.default_rng(5)
+    readings, runs = len(toy.readings), np.split(np.arange(toy.rows), 4)
+    linear = toy.linear
+    monkeypatch.setattr(type(linear), "runs", lambda self: runs)
+    monkeypatch.setattr("calibration.discovery.standing.bases_room.family_names", lambda _: [("slip", "speed")])
+    error = rng.standard_normal((readings, 1))
+    monkeypatch.setattr("calibration.discovery.standing.family_columns", lambda *_: np.c_[error, 2 * error])
+    jacobian, residual = augment_with_columns(toy.linear, rng.standard_normal((readings, 2)))
+    parameters = np.asarray(toy.linear.jacobian)[:readings]
+    names = [f"p{k}" for k in range(parameters.shape[1])]
+    coordinates = SimpleNamespace(base=SimpleNamespace(names=names))
+    space = SimpleNamespace(included=toy.counts, coordinates=coordinates, free=len(names))
+
+    def left(columns):
+        return np.sum((residual + columns @ np.linalg.lstsq(columns, -residual, rcond=None)[0]) ** 2)
+
+    best = (0.0, 0, "")
+    for k, rows in enumerate(runs):
+        inside = np.repeat(np.isin(np.arange(toy.rows), rows), 3)
+        for name, column in zip([*names, "slip"], [*parameters.T, error[:, 0]], strict=True):
+            extra = np.append(column * inside, np.zeros(len(residual) - readings))[:, None]
+            best = max(best, (left(jacobian) - left(np.c_[jacobian, extra]), k + 1, name))
+    run, changed, root = _changed_run(space, linear, (), jacobian, residual)
+    assert (run, changed) == best[1:] and root**2 == pytest.approx(best[0], rel=1e-6)
+    runs[:] = [np.arange(toy.rows)]
+    assert _changed_run(space, linear, (), jacobian, residual) == (None, "", 0.0)
 
 
 @pytest.mark.parametrize(
@@ -366,8 +387,9 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     assert dataclasses.replace(test, varies=9.0, spread=0.31).established is False
     # of a library of three effects chance reaches less than in a dozen looks at the amplitude
     assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
-    of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
-    assert of_runs.rests_on == (10 if without < 3.3 <= root else None)
+    of_log = dataclasses.replace(test, root_without=math.inf, changed="motor.inertia", root_changed=6.9)
+    assert of_log.rests_on == (10 if root <= 6.9 else None)
+    assert dataclasses.replace(of_log, root_changed=3.2).rests_on is None
     renumbered = NameSupport(True, tests=(test,)).with_row_numbers(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 

@@ -215,7 +215,8 @@ SAMPLES = [
     *(Remark("unshown", source="log.csv", why=why.value) for why in MissingStates),
     Remark("outstanding", factors=(0.5, 2.0), word="assumed"),
     Remark("lost_replicates", settled=400, asked=500),
-    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, 2.4, what="run")),
+    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="motor.inertia", root_changed=11.2)),
+    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="track", root_changed=11.2)),
     Remark(
         "rests_on",
         test=NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),
@@ -326,7 +327,10 @@ def test_every_reason_and_every_doubt_has_its_words():
     schema = (ROOT / "docs/schemas/loop.schema.json").read_text(encoding="utf-8")
     assert all(f'"{doubt}"' in schema for doubt in loop_words.DOUBTS)
     rests = dataclasses.replace(worst, root=4.0)  # below chance with all its rows it rests on none
-    assert {*worst.fails, *rests.fails} == set(loop_words.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
+    differs = dataclasses.replace(rests, changed="motor.inertia", root_changed=9.0)
+    assert {*worst.fails, *rests.fails, *differs.fails} == set(loop_words.DOUBTS) and not NameTest(
+        "a", 4.0, 3.0, (), 0.0
+    ).fails
 
 
 @pytest.mark.parametrize(("unit", "said"), [("-", "-0.0154 ± 0.00014"), ("ohm", "-0.0154 ± 0.00014 ohm")])

@@ -9,7 +9,7 @@ from typing import Any
 
 import equinox as eqx
 
-from calibration.data import Json, Names, rig_file
+from calibration.data import Json, rig_file
 from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
@@ -42,24 +42,9 @@ _KINDS = ("load", "like", "movers")
 _EXAMPLE = 'configurations = ["rover"]'
 
 
-@dataclasses.dataclass(frozen=True)
-class ConfigurationLoads:
-    """Loads of a robot file, before the parameters that the file states are applied.
-
-    Attributes:
-        by_name: loads by name, in order.
-        travels: True if the loads travel, as vehicles and linear units do.
-        linear: names of linear units.
-        missing: required parameters that the file does not state.
-    """
-
-    by_name: dict[str, Load]
-    travels: bool
-    linear: frozenset[str]
-    missing: Names
-
-
-def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], where: str) -> ConfigurationLoads:
+def loads_from_tables(
+    base: Robot | None, content: Json, sds: dict[str, float], where: str
+) -> tuple[dict[str, Load], bool, frozenset[str], list[str]]:
     """Loads that a robot file states, in its order.
 
     It removes `configurations`, and each configuration's `load`, `like` and `movers`, from `content`, and replaces
@@ -71,6 +56,10 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
         content: content of the file.
         sds: stated standard deviations, by dotted name.
         where: beginning of the error message.
+
+    Returns:
+        Loads by name, in order, before the parameters that the file states are applied. True if the loads travel, as
+        vehicles and linear units do. Names of linear units. Required parameters that the file does not state.
 
     Raises:
         BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name. A table belongs to
@@ -121,7 +110,7 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
             f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; a file can describe only one kind; use "
             "two files"
         )
-    return ConfigurationLoads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
+    return by_name, not shafts or bool(linear), frozenset(linear), missing
 
 
 def resolve_likes(content: Json, where: str) -> None:

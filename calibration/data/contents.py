@@ -190,13 +190,13 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
 
 def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
     try:
-        seconds_found = one_clock.clock_seconds(clock)
+        time, _, unit, _ = one_clock.clock_seconds(clock)
     except BadData as error:
         return str(error)
-    rows_of_falls = np.flatnonzero(np.diff(seconds_found.time) < 0)
+    rows_of_falls = np.flatnonzero(np.diff(time) < 0)
     if rows_of_falls.size:
         return f"{clock.name} goes back at sample {rows_of_falls[0] + 2}"
-    return seconds_found.time, seconds_found.unit
+    return time, unit
 
 
 def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:

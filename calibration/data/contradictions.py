@@ -8,6 +8,7 @@ import numpy as np
 from calibration.data import sides
 from calibration.data.columns import HEADING, LEVERS, SPEED, SUPPLY
 from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import check_rows
 from calibration.data.table import Runs
 from mmrjax.model import params
 from mmrjax.model.quantities import CURRENT, RPM, VOLTAGE
@@ -136,16 +137,15 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
             robot.motor.resistance
         ) * np.sign(back_emf)
     tells = np.abs(back_emf) > LEAST
-    wrong = np.flatnonzero(tells & (voltage_forward < TOO_SMALL * np.abs(back_emf)))
-    if wrong.size > (0 if current else MOST_BRAKING * np.sum(tells)):
-        row = int(wrong[0])
-        why = "with the wrong sign" if voltage_forward[row] < 0 else "too small"
-        raise BadData(
-            f"{runs.source} row {row + 1}, {column}: got {voltage[row]:g} at an imposed {SPEED} of "
-            f"{runs[SPEED][row]:g}, {why} for the motors' back-EMF of "
-            f"{float(f'{back_emf[row]:.3g}'):g} V; "
-            "check both columns and motor.torque_constant in the robot's file"
+    wrong = tells & (voltage_forward < TOO_SMALL * np.abs(back_emf))
+    if wrong.sum() > (0 if current else MOST_BRAKING * np.sum(tells)):
+        row = int(np.argmax(wrong))
+        why = (
+            f" at an imposed {SPEED} of {runs[SPEED][row]:g}, "
+            f"{'with the wrong sign' if voltage_forward[row] < 0 else 'too small'} for the motors' back-EMF of "
+            f"{float(f'{back_emf[row]:.3g}'):g} V; check both columns and motor.torque_constant in the robot's file"
         )
+        check_rows(runs.source, runs.columns, [(column, wrong, why)])
 
 
 def _check_time_order(runs: Runs) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import hashlib
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -216,30 +217,24 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
     if mark == ",":
         return rows, ()
     note = f"{name}: columns are separated by {SEPARATORS[mark]}"
-    comma: dict[int, list[str]] = {}
-    point: dict[int, list[str]] = {}
-    integer_columns: set[int] = set()
-    for row in rows[1:]:
-        for j, cell in enumerate(row):
-            if _COMMA.fullmatch(cell):
-                comma.setdefault(j, []).append(cell)
-                row[j] = cell.replace(",", ".")
-            elif _POINT.fullmatch(cell):
-                point.setdefault(j, []).append(cell)
-            elif _BELOW.fullmatch(cell):
-                integer_columns.add(j)
+    columns = list(itertools.zip_longest(*rows[1:], fillvalue=""))
+    commas, points, below = ([[*filter(x.fullmatch, column)] for column in columns] for x in (_COMMA, _POINT, _BELOW))
     expectation = "expected either decimal commas or decimal points in a column, and no thousands separators"
-    for j in comma.keys() & point.keys():
-        raise BadData(f"{name}, {_column(rows, j)}: got {comma[j][0]} and {point[j][0]}; {expectation}")
-    for marked, other in ((point, comma), (comma, point)):
-        for j, written in marked.items():
-            if (other or j in integer_columns) and all(map(_THOUSANDS.fullmatch, written)):
-                other_cell = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
+    for j, (comma, point) in enumerate(zip(commas, points, strict=True)):
+        if comma and point:
+            raise BadData(f"{name}, {_column(rows, j)}: got {comma[0]} and {point[0]}; {expectation}")
+    for marked, other in ((points, commas), (commas, points)):
+        elsewhere = next((f"{cells[0]} in {_column(rows, k)}" for k, cells in enumerate(other) if cells), "")
+        for j, written in enumerate(marked):
+            if written and (elsewhere or below[j]) and all(map(_THOUSANDS.fullmatch, written)):
                 raise BadData(
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
-                    f"{other_cell or 'whole numbers below a thousand'}; {expectation}"
+                    f"{elsewhere or 'whole numbers below a thousand'}; {expectation}"
                 )
-    return rows, (f"{note}, and numbers have decimal commas" if comma else f"{note}; read so",)
+    if not any(commas):
+        return rows, (f"{note}; read so",)
+    body = ([cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell for cell in row] for row in rows[1:])
+    return [rows[0], *body], (f"{note}, and numbers have decimal commas",)
 
 
 def _column(rows: list[list[str]], j: int) -> str:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
 from calibration.data import Names
-from calibration.data.input_errors import parse_number
+from calibration.data.input_errors import BadData, parse_number
 
 #: Raw values of a column: a list of texts as written, or an array of numbers with NaN for a missing reading.
 Raw = list[str] | np.ndarray
 #: Entries that programs write for a missing reading.
 MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
+#: A check of rows: column, True for each wrong row, and the end of the message, or a function that returns it by row.
+Check = tuple[str, np.ndarray, str | Callable[[int], str]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,3 +104,21 @@ def missing_readings(raw: Raw, rows: np.ndarray) -> np.ndarray:
     if isinstance(raw, np.ndarray):
         return np.isnan(raw[rows].astype(float))
     return np.array([raw[row].lower() in MISSING for row in rows.tolist()], bool)
+
+
+def check_rows(name: str, columns: Mapping[str, np.ndarray], checks: Iterable[Check], first: int = 1) -> None:
+    """Runs checks in their order, and rejects a table at the first wrong row of the first check that finds one.
+
+    Args:
+        name: name of the source, with which the message begins.
+        columns: values of the columns, shape (rows,).
+        first: number of the first row.
+    """
+    for column, wrong, why in checks:
+        for row in np.flatnonzero(wrong)[:1].tolist():
+            value = columns[column][row]
+            cell, end = (
+                "an empty cell" if np.isnan(value) else f"{value:g}",
+                why if isinstance(why, str) else why(row),
+            )
+            raise BadData(f"{name} row {row + first}, {column}: got {cell}{end}")

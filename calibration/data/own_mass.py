@@ -7,15 +7,14 @@ to a file with another.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.runs import Runs
-from calibration.data.surface_labels import rows_of_scaled_adhesion
+from calibration.data.input_errors import BadConfiguration
+from calibration.data.named_arrays import check_rows
+from calibration.data.table import Runs, rows_of_scaled_adhesion
 from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH
 from mmrjax.model.robot import Robot
@@ -24,28 +23,12 @@ from mmrjax.model.robot import Robot
 ROUNDING = 1e-6
 
 
-@dataclasses.dataclass(frozen=True)
-class StatedMass:
-    """Mass of one configuration without payload, according to a table: `total_mass_kg` minus `payload_kg`.
+def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, float, bool]]:
+    """Masses without payload that a table states for its configurations: `total_mass_kg` minus `payload_kg`.
 
-    Attributes:
-        median, low, high: median, smallest and largest value over the rows of the configuration [kg].
-        unladen: true if it varies while `total_mass_kg` is constant, as if that column excluded the payload.
-    """
-
-    median: float
-    low: float
-    high: float
-    unladen: bool
-
-    @property
-    def varies(self) -> bool:
-        """True if no single mass is right for every row."""
-        return self.high - self.low > ROUNDING
-
-
-def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
-    """Masses that a table states for its configurations. Empty without `total_mass_kg`.
+    Returns:
+        For each configuration the median, smallest and largest value over its rows [kg], and True if
+        `total_mass_kg` is constant. Empty without that column.
 
     Raises:
         BadData: a mass is out of bounds, or the robot lacks a configuration.
@@ -57,21 +40,17 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     low, high = next(
         p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
     ).spec.bounds
-    wrong = np.flatnonzero((own_masses < low) | (own_masses > high))
-    if wrong.size:
-        row = int(wrong[0])
-        raise BadData(
-            f"{runs.source} row {row + 1}, total_mass_kg: got {runs['total_mass_kg'][row]:g} "
-            "with a payload of "
-            f"{runs['payload_kg'][row]:g} kg; expected {low:g} to {high:g} kg without the payload"
-        )
+    wrong, payload = (own_masses < low) | (own_masses > high), runs["payload_kg"]
+    end = f"expected {low:g} to {high:g} kg without the payload"
+    why = lambda row: f" with a payload of {payload[row]:g} kg; {end}"  # noqa: E731
+    check_rows(runs.source, runs.columns, [("total_mass_kg", wrong, why)])
     masses = {}
     for index in np.unique(configuration_index):
         is_own_row = configuration_index == index
         m = own_masses[is_own_row]
         constant = bool(np.ptp(runs["total_mass_kg"][is_own_row]) <= ROUNDING)
         median = round(float(np.median(m)), 6)
-        masses[robot.configurations.names[index]] = StatedMass(median, float(m.min()), float(m.max()), constant)
+        masses[robot.configurations.names[index]] = (median, float(m.min()), float(m.max()), constant)
     return masses
 
 
@@ -82,7 +61,7 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
         BadData: for the same reasons as `stated_masses`.
     """
     own_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
-    masses = {n: s.median for n, s in stated_masses(robot, runs).items() if abs(s.median - own_masses[n]) > ROUNDING}
+    masses = {n: m for n, (m, *_) in stated_masses(robot, runs).items() if abs(m - own_masses[n]) > ROUNDING}
     return params.replace(robot, {f"{name}.mass": jnp.asarray(mass, float) for name, mass in masses.items()})
 
 
@@ -93,19 +72,19 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
         robot: robot as given, before `with_table_mass`.
     """
     notes = []
-    for name, file_mass in stated_masses(robot, runs).items():
+    for name, (median, low, high, constant) in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
-        if file_mass.varies:
-            why = "; does total_mass_kg exclude the payload?" if file_mass.unladen else ""
+        if high - low > ROUNDING:
+            why = "; does total_mass_kg exclude the payload?" if constant else ""
             notes.append(
-                f"{name}: total_mass_kg minus payload_kg varies from {file_mass.low:.4g} to {file_mass.high:.4g} kg. "
-                f"The fit used the mass of each row. robot.toml contains the median, {file_mass.median:.4g} kg, and "
+                f"{name}: total_mass_kg minus payload_kg varies from {low:.4g} to {high:.4g} kg. "
+                f"The fit used the mass of each row. robot.toml contains the median, {median:.4g} kg, and "
                 f"does not reproduce the fit in rows with another mass{why}"
             )
-        elif abs(file_mass.median - mass) > ROUNDING:
+        elif abs(median - mass) > ROUNDING:
             notes.append(
-                f"{name}: the table states {file_mass.median:.6g} kg without payload, the robot's file {mass:.6g} "
-                f"kg. {file_mass.median:.6g} kg is used, and written to robot.toml"
+                f"{name}: the table states {median:.6g} kg without payload, the robot's file {mass:.6g} "
+                f"kg. {median:.6g} kg is used, and written to robot.toml"
             )
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):

@@ -208,9 +208,9 @@ def read_profile(source: str | Path) -> ProfileTable:
     path, signal_path = opening.split_source(str(source))
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged profile; {allowed_words(str(source), PACKAGED)}")
-    table = reading.read_whole_table(path, signal_path)
-    if table is None:
+    if opening.format_of(path, path.name) is None:
         return _profile_of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
+    table = reading.read_whole_table(path, signal_path)
     rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
     return _parsed(table.name, _header_settings(table.name, []), rows, table.digest, table.notes)
 

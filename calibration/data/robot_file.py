@@ -238,8 +238,8 @@ def _robot_before_parameters(
     sds = stated.split_values_and_sds(tables, where)
     values = dict(_flatten(tables))
     sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
-    loads = loads_from_tables(base, content, sds, where)
-    rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
+    loads, travels, linear, lacking = loads_from_tables(base, content, sds, where)
+    rig = rig_file.parse_rig(content, where, list(loads), travels=travels, inherits=base is not None)
     if "controller" in content and not rig.follows_goal:
         raise BadConfiguration(
             f"{where}, controller: cannot be combined with imposed = {toml_value(rig.imposed)}; a controller needs "
@@ -247,11 +247,9 @@ def _robot_before_parameters(
         )
     controller = Controller() if rig.follows_goal else None
     if base is not None:
-        robot = dataclasses.replace(
-            base, configurations=Configurations(loads.by_name), rig=rig, controller=controller
-        )
-        return robot, sds, loads.linear
-    robot = paper_robots.blank_robot(Configurations(loads.by_name), rig=rig)
+        robot = dataclasses.replace(base, configurations=Configurations(loads), rig=rig, controller=controller)
+        return robot, sds, linear
+    robot = paper_robots.blank_robot(Configurations(loads), rig=rig)
     robot = dataclasses.replace(robot, controller=controller)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     file_values = dict(_flatten(content))
@@ -263,10 +261,10 @@ def _robot_before_parameters(
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
     missing = [name for name in rig_file.required_parameters(rig, file_values.items()) if name not in file_values]
-    if not loads.travels and "speed" in rig.channels:
-        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in file_values]
-    rig_file.reject_missing([*missing, *loads.missing], parameters, where, file_values)
-    return robot, sds, loads.linear
+    if not travels and "speed" in rig.channels:
+        missing += [f"{name}.radius" for name in loads if f"{name}.radius" not in file_values]
+    rig_file.reject_missing([*missing, *lacking], parameters, where, file_values)
+    return robot, sds, linear
 
 
 def _scaled_effect(library: Library, name: str, factors: Any, where: str) -> type[effects.Effect]:
@@ -548,21 +546,20 @@ def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tu
         part, _, key = name.partition(".")
         return getattr(getattr(owner, part), key, None)
 
-    for name, (_, _, unit, meaning) in RATINGS.items():
+    for name in (*RATINGS, *SWITCHES, *CHOICES):
         part, _, key = name.partition(".")
-        rating = value(robot, name)
+        setting, meaning = value(robot, name), SWITCHES.get(name, "")
+        differs = setting != value(nothing, name)
         must_state = key == "capacity_curve" and part in stated  # otherwise it would follow from the capacity
-        if rating is not None and (inherits or must_state or rating != value(nothing, name)):
-            stated = stated | {part}
-            yield part, f"{key} = {rating!r}  # [{unit}] {meaning if inherits else meaning.partition(';')[0]}"
-    for name, meaning in SWITCHES.items():
-        part, _, key = name.partition(".")
-        if inherits or value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {str(value(robot, name)).lower()}  # {meaning}"
-    for name, (_, meaning) in CHOICES.items():
-        part, _, key = name.partition(".")
-        if value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {toml_value(value(robot, name))}  # {meaning}"
+        if setting is None or not (differs or must_state or (inherits and name not in CHOICES)):
+            continue
+        stated = stated | {part}
+        if name in RATINGS:
+            _, _, unit, words = RATINGS[name]
+            meaning = f"[{unit}] {words if inherits else words.partition(';')[0]}"
+        elif name in CHOICES:
+            meaning = CHOICES[name][1]
+        yield part, f"{key} = {toml_value(setting)}  # {meaning}"
 
 
 def _flatten(content: Json, prefix: str = "") -> list[tuple[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from calibration.data.columns import (
     Layout,
 )
 from calibration.data.input_errors import BadData, three_digits
+from calibration.data.named_arrays import Check, check_rows
 from calibration.data.table import driven_on
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
@@ -120,30 +121,42 @@ STILL = 0.02
 def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table may omit, and rejects values that contradict each other."""
     _add_default_columns(name, columns, rows, layout)
-    _check_driving(name, columns)
+    check_rows(name, columns, _contradictions_in_rows(name, columns, layout))
+    if "duty" in columns:
+        columns["duty"] = np.nan_to_num(columns["duty"])
+
+
+def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iterator[Check]:
+    """Checks of values that contradict each other within a row.
+
+    Raises:
+        BadData: columns contradict each other.
+    """
+    if "mode" in columns and not set(TIME) <= set(columns):  # motors of settled runs are driven
+        raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
+    if "duty" in columns:
+        duty, modes = columns["duty"], columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))
+        driven = modes == DRIVEN[0]
+        yield "duty", driven & np.isnan(duty), "; expected a number from -1 to 1"
+        undriven = ~driven & (np.nan_to_num(duty) != 0)
+        yield "duty", undriven, lambda row: f" in mode {modes[row]}; expected 0 or an empty cell"
     held = columns.get("held", np.zeros(1))
-    for row in np.flatnonzero((held != 0) & (held != 1))[:1]:
-        raise BadData(
-            f"{name} row {row + 1}, held: got {held[row]:g}; expected 1 if a clamp holds the output, otherwise 0"
-        )
-    for row in np.flatnonzero((held == 1) & (columns.get(LOAD, 0.0) != 0))[:1]:
-        raise BadData(
-            f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} although held is 1; expected 0, since the "
-            "torque at a clamp is a reading: rename its column to output_torque"
-        )
+    yield "held", (held != 0) & (held != 1), "; expected 1 if a clamp holds the output, otherwise 0"
+    yield (
+        LOAD,
+        (held == 1) & (columns.get(LOAD, 0.0) != 0),
+        (
+            " although held is 1; expected 0, since the torque at a clamp is a reading: rename its column to "
+            "output_torque"
+        ),
+    )
     _check_sides(name, columns, layout)
     if "total_mass_kg" in columns:
-        total, payload = columns["total_mass_kg"], columns["payload_kg"]
-        for row in np.flatnonzero(total <= payload)[:1]:
-            raise BadData(too_light_message(f"{name} row {row + 1}", total[row], payload[row]))
-    for channel in layout.channels:
-        if channel.column in columns and channel.sd_column in columns:
-            lacks_sd = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
-            if lacks_sd.any():
-                raise BadData(
-                    f"{name} row {int(np.flatnonzero(lacks_sd)[0]) + 1}, {channel.sd_column}: got an empty cell next "
-                    f"to a reading; expected its sd, more than 0 {channel.unit}"
-                )
+        payload = columns["payload_kg"]
+        yield "total_mass_kg", columns["total_mass_kg"] <= payload, lambda row: too_light(payload[row])
+    for channel in (c for c in layout.channels if c.column in columns and c.sd_column in columns):
+        lacks_sd = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
+        yield channel.sd_column, lacks_sd, f" next to a reading; expected its sd, more than 0 {channel.unit}"
 
 
 def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
@@ -227,24 +240,6 @@ def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout)
         columns.setdefault(column, np.full(rows, value))
 
 
-def _check_driving(name: str, columns: Columns) -> None:
-    if "mode" in columns and not set(TIME) <= set(columns):  # motors of settled runs are driven
-        raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
-    if "duty" not in columns:
-        return
-    duty, modes = columns["duty"], columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))
-    driven = modes == DRIVEN[0]
-    wrong = np.where(driven, np.isnan(duty), ~np.isnan(duty) & (duty != 0))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        if driven[row]:
-            raise BadData(f"{name} row {row + 1}, duty: got an empty cell; expected a number from -1 to 1")
-        raise BadData(
-            f"{name} row {row + 1}, duty: got {duty[row]:g} in mode {modes[row]}; expected 0 or an empty cell"
-        )
-    columns["duty"] = np.nan_to_num(duty)
-
-
 def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
     side_columns = [c for c in layout.sides if c in columns]
     if len(side_columns) == 1:
@@ -260,9 +255,9 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
         )
 
 
-def too_light_message(where: str, total: float, payload: float) -> str:
-    included = f"more than the payload of {payload:g} kg, which it includes"
-    return f"{where}, total_mass_kg: got {total:g}; expected {included}"
+def too_light(payload: float) -> str:
+    """End of the message on a total mass that is not more than the payload [kg]."""
+    return f"; expected more than the payload of {payload:g} kg, which it includes"
 
 
 def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
@@ -357,18 +352,16 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
         columns = {column: values[driven] for column, values in columns.items()}
     if {*layout.sides, *HEADING} & set(columns):
         slope = columns["slope_deg"]
-        if slope.any():
-            row = int(np.flatnonzero(slope)[0])
-            rows_text = (
-                f", as in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
-            )
-            raise BadData(
-                f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{rows_text}; "
-                "expected 0, since on a slope the heading keeps changing and a turn never settles. Remove these rows."
-                " To simulate such a turn over time: simulate --model drive --left --right --slope"
-            )
+        sloped = int(np.count_nonzero(slope))
+        rows_text = f", as in {sloped} of {len(slope)} rows" if sloped > 1 else ""
+        why = (
+            f" in a table of settled turns{rows_text}; expected 0, since on a slope the heading keeps changing and a "
+            "turn never settles. Remove these rows. To simulate such a turn over time: simulate --model drive --left "
+            "--right --slope"
+        )
+        check_rows(name, columns, [("slope_deg", slope, why)])
     if not set(layout.sides) & set(columns):
-        _check_signs(name, columns, layout)
+        check_rows(name, columns, _missing_signs(columns, layout))
     return columns, driven, (note,) if note else ()
 
 
@@ -391,13 +384,10 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
     drive_columns = (column, *sides, *(["duty"] if "duty" in columns else []))
     zero = " and ".join(c for c in drive_columns if not columns[c][idle].any())
     for channel in (c for c in layout.channels if c.zero_at_rest and c.column in columns):
-        readings = np.nan_to_num(columns[channel.column])
-        moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
-        if moving.size and moving.size < len(readings):
-            raise BadData(
-                f"{name} row {moving[0] + 1}, {channel.column}: got {readings[moving[0]]:g} although {zero} is 0; "
-                "give the command that drives it, or remove the row"
-            )
+        readings = np.abs(np.nan_to_num(columns[channel.column]))
+        moving = (size == 0) & (readings > STILL * np.max(readings))
+        why = f" although {zero} is 0; give the command that drives it, or remove the row"
+        check_rows(name, columns, [(channel.column, moving & ~moving.all(), why)])
     if idle.size == len(size):
         clamp = (
             '; if the shaft is locked, set imposed = "motor_current" or "voltage", and give the columns held '
@@ -414,52 +404,51 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
     )
 
 
-def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
-    """Rejects unsigned readings in rows that drive the robot backward."""
+def _missing_signs(columns: Columns, layout: Layout) -> Iterator[Check]:
+    """Checks for unsigned readings in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
     if layout.imposed == "voltage":
         imposed = imposed * columns.get("duty", 1.0)
+
+    def place(end: str) -> Callable[[int], str]:
+        return lambda row: f" at {imposed[row]:g} {unit}; {end}"
+
     for channel in layout.channels:
         if channel.column not in columns or not channel.directed:
             continue
         readings = columns[channel.column]
         if layout.magnitude(channel.name):
-            wrong = np.flatnonzero(readings < 0)
-            if wrong.size:
-                raise BadData(
-                    f"{name} row {wrong[0] + 1}, {channel.column}: got {readings[wrong[0]]:g}; expected no "
-                    "negative reading, since by the robot's file the instrument shows only the magnitude"
-                )
+            yield (
+                channel.column,
+                readings < 0,
+                ("; expected no negative reading, since by the robot's file the instrument shows only the magnitude"),
+            )
             continue
         # Downhill, gravity may drive a motor. Only uphill or on the flat do current and voltage have the same sign.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
         if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
             continue  # the load may drive a motor; a reversing bridge also reverses the supply current
         doubt = _sign_tolerance(columns, channel)
-        wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
-        if _rises_through_zero(imposed, readings, backward):
-            wrong = wrong[:0]
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
         forward &= channel.name != "motor_voltage"  # compared with the back-EMF instead
-        against = np.flatnonzero(forward & (readings < -doubt))
-        if against.size:
-            row = int(against[0])
-            alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
-            raise BadData(
-                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at {imposed[row]:g} {unit}; nothing "
-                "else drives the motors, so the reading should have its sign; use one sign convention in all "
+        alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
+        yield (
+            channel.column,
+            forward & (readings < -doubt),
+            place(
+                "nothing else drives the motors, so the reading should have its sign; use one sign convention in all "
                 f"rows{alike}"
-            )
-        if wrong.size:
-            row = int(wrong[0])
-            unsigned_advice = (
-                f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
-            )
-            hint = unsigned_advice if layout.crosses_zero else ""
-            raise BadData(
-                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
-                f"{imposed[row]:g} {unit}; expected readings with their signs, negative in reverse{hint}"
+            ),
+        )
+        if not _rises_through_zero(imposed, readings, backward):
+            advice = f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
+            yield (
+                channel.column,
+                backward & (readings > (doubt if layout.crosses_zero else 0.0)),
+                place(
+                    f"expected readings with their signs, negative in reverse{advice if layout.crosses_zero else ''}"
+                ),
             )
 
 

@@ -29,14 +29,13 @@ from calibration.data import (
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
-from calibration.data.computed_columns import drop_computed_torques
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.invalid_readings import drop_computed_torques, without_unread
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
-from calibration.data.sources.in_memory import EXPECTED
+from calibration.data.sources.columnar import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
-from calibration.data.unread_rows import without_unread
 from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import STARTS
@@ -94,8 +93,7 @@ def read_runs(
         is_plain_file = isinstance(source, str | Path) and not opening.files_of_group(str(source))
         if is_plain_file and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        reading_found = reading.read_columns(source, layout, preset, between)
-        arrays, mapped = reading_found.arrays, reading_found.mapped
+        arrays, mapped = reading.read_columns(source, layout, preset, between)
     has_known_columns = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
     if not has_known_columns and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
@@ -213,10 +211,9 @@ def _column_values(
             runs = column_texts(by_name["run_id"]) if "run_id" in by_name else None
             raw, more_notes = clock.time_since_start(arrays.name, meaning, raw, runs)
             notes += more_notes
-        if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
-            _reject_supply_voltages(arrays, raw)
-        elif meaning.column in layout.idle:
-            _reject_condition_without_effect(arrays, meaning, raw, layout)
+        on_battery = battery and meaning.column == SUPPLY and layout.imposed == "voltage"
+        if on_battery or meaning.column in layout.idle:
+            _reject_readings(arrays, meaning, raw, layout)
         else:
             columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
             wrong = np.flatnonzero(refused).tolist()
@@ -285,33 +282,21 @@ def _values_without_role(raw: Raw) -> np.ndarray:
     return numbers if missing_readings(raw, missing_rows).all() else np.array(raw)
 
 
-def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
-    """Rejects a condition that does not act on the robot's load, unless it is 0 or missing."""
-    why = (
-        f"{NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
-        if layout.has_ground
-        else "the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or "
-        "describe the load as a vehicle"
-    )
-    if isinstance(raw, np.ndarray):
-        nonzero_rows = np.flatnonzero(np.nan_to_num(raw.astype(float)) != 0)[:1].tolist()
+def _reject_readings(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
+    """Rejects a supply voltage on a battery, and a condition other than 0 that does not act on the robot's load."""
+    given = ~missing_readings(raw, np.arange(len(raw)))
+    if meaning.column == SUPPLY:
+        why = " together with --battery, whose charge sets the voltage; leave the cell empty or remove the column"
     else:
-        nonzero_rows = [row for row, cell in enumerate(raw) if cell.strip("0.-") != ""][:1]
-    for row in nonzero_rows:
-        raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {column_texts(raw[row : row + 1])[0]}; {why}")
-
-
-def _reject_supply_voltages(arrays: NamedArrays, voltages: Raw) -> None:
-    """Rejects supply voltages of runs that are on a battery."""
-    if isinstance(voltages, np.ndarray):
-        filled_rows = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
-    else:
-        filled_rows = [row for row, cell in enumerate(voltages) if cell][:1]
-    for row in filled_rows:
-        raise BadData(
-            f"{arrays.row(row)}, supply_voltage_V: got {column_texts(voltages[row : row + 1])[0]} together with "
-            "--battery, whose charge sets the voltage; leave the cell empty or remove the column"
+        given &= column_numbers(raw) != 0
+        why = (
+            f"; {NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
+            if layout.has_ground
+            else "; the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or "
+            "describe the load as a vehicle"
         )
+    for row in np.flatnonzero(given)[:1].tolist():
+        raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {column_texts(raw[row : row + 1])[0]}{why}")
 
 
 def single_run(cells: Json, layout: Layout | None) -> Runs:
@@ -337,6 +322,7 @@ def single_run(cells: Json, layout: Layout | None) -> Runs:
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
-        raise BadConfiguration(row_checks.too_light_message("option", cells["total_mass_kg"], cells["payload_kg"]))
+        total = f"option, total_mass_kg: got {cells['total_mass_kg']:g}"
+        raise BadConfiguration(total + row_checks.too_light(cells["payload_kg"]))
     columns = {c: np.array([cells[c]]) if isinstance(cells.get(c), float) else v for c, v in columns.items()}
     return Runs("the options", columns, layout=layout)

@@ -506,23 +506,10 @@ def _levels_of(
     yield rows[begin:]
 
 
-@dataclasses.dataclass(frozen=True)
-class _End:
-    """End of a level, before the test whether it is settled.
-
-    Attributes:
-        rows: its rows.
-        seen: mean, sd and change of each channel, by name [unit of the column].
-        left_over: largest significant change of a channel, as a share.
-        glitches: number of readings that the mean of each channel omits.
-    """
-
-    rows: np.ndarray
-    seen: dict[str, tuple[float, float, float]]
-    left_over: float
-    glitches: dict[str, int]
-
-
+#: End of a level, before the test whether it is settled: its rows, the mean, sd and change of each channel by name
+#: [unit of the column], the largest significant change of a channel as a share, and the number of readings that the
+#: mean of each channel omits.
+_End = tuple[np.ndarray, dict[str, tuple[float, float, float]], float, dict[str, int]]
 #: Reason why a level has no settled end: one of `REASONS`, the channel responsible, and the size as a share.
 _Why = tuple[str, str, float]
 
@@ -555,11 +542,12 @@ def _settled_end(
     for signal in signals:
         if stuck[signal.channel.name][rows].mean() > 0.5:
             return out("stuck", signal.channel.name)
-    stretch = _best_end(signals, time, rows, shortest, drift)
-    unsettled, left_over = _unsettled(signals, rows, stretch, drift)
+    best_end = _best_end(signals, time, rows, shortest, drift)
+    unsettled, left_over = _unsettled(signals, rows, best_end, drift)
+    end_rows, end_means, _, end_glitches = best_end
     if unsettled is not None:
         return out(*unsettled)
-    finite_means = {name: x for name, x in stretch.seen.items() if math.isfinite(x[0])}
+    finite_means = {name: x for name, x in end_means.items() if math.isfinite(x[0])}
     if not finite_means:
         return out("unread")
     moving = [
@@ -571,7 +559,7 @@ def _settled_end(
     if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
     inertia_of_configuration = inertia.get(str(runs["configuration"][rows[0]]))
-    lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
+    lasts = float(time[end_rows[-1]] - time[end_rows[0]])
     if (
         inertia_of_configuration is not None
         and (accelerates := _acceleration_reason(inertia_of_configuration, finite_means, lasts, imposed, drift))
@@ -583,12 +571,12 @@ def _settled_end(
     further = {s.channel.name: left_over * _scale_of(s, values_by_channel[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
         unsettled_stretch,
-        rows=stretch.rows,
-        begin=float(time[stretch.rows[0]]),
+        rows=end_rows,
+        begin=float(time[end_rows[0]]),
         mean={name: mean for name, (mean, _, _) in values_by_channel.items()},
         sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in values_by_channel.items()},
         drift={name: change for name, (_, _, change) in values_by_channel.items()},
-        glitches={name: count for name, count in stretch.glitches.items() if count},
+        glitches={name: count for name, count in end_glitches.items() if count},
     )
 
 
@@ -611,7 +599,7 @@ def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, s
             if math.isfinite(mean)
         ]
         glitches = {s.channel.name: int(s.glitches[end_rows].sum()) for s in signals}
-        ends.append((math.hypot(max(sds, default=0.0), left_over), _End(end_rows, end_means, left_over, glitches)))
+        ends.append((math.hypot(max(sds, default=0.0), left_over), (end_rows, end_means, left_over, glitches)))
         if left_over <= SLIGHT * drift:
             break
     return min(ends, key=lambda end: end[0])[1]
@@ -622,13 +610,13 @@ def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: 
 
     The change is a share, within the end or expected after it.
     """
-    left_over = end.left_over
+    end_rows, end_means, left_over, glitches = end
     for signal in signals:
         name = signal.channel.name
-        share = end.glitches[name] / len(end.rows)
-        if end.glitches[name] > MOST_GLITCHES * len(end.rows):
+        share = glitches[name] / len(end_rows)
+        if share > MOST_GLITCHES:
             return ("glitches", name, share), left_over
-        mean, sd, change = end.seen[name]
+        mean, sd, change = end_means[name]
         if not math.isfinite(mean):
             continue
         tolerance = max(drift * abs(mean), FINE * signal.largest)

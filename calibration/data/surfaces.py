@@ -13,8 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeVar
 
 from calibration.data.columns import Layout
-from calibration.data.surface_labels import configuration_on_surface
-from calibration.data.table import Runs
+from calibration.data.table import Runs, configuration_on_surface
 from mmrjax.errors import allowed_words
 from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.robot import Configurations, Robot

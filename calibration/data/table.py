@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 
 import numpy as np
 
-from calibration.data import Columns, Names, surface_labels
+from calibration.data import Columns, Names
 from calibration.data.columns import (
     CIRCUITS,
     CONDITIONS,
@@ -26,8 +27,24 @@ from calibration.data.input_errors import BadData, allowed_words, rows_text
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
+from mmrjax.model.paper_tables import SURFACES, adhesion_ratio, lateral_ratio
 from mmrjax.model.robot import Robot
+
+
+def configuration_on_surface(configuration: str, surface: str) -> str:
+    """Name of a configuration on a surface."""
+    return f"{configuration}-{re.sub(r'[^0-9A-Za-z_]+', '_', surface)}"
+
+
+def rows_of_scaled_adhesion(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """True for rows whose adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
+    pairs = list(zip(configurations.tolist(), labels.tolist(), strict=True))
+    labelled = SURFACES if robot.rig.scales_adhesion else ()
+    of_table5 = {
+        (name, label): label in labelled and configuration_on_surface(name, label) not in robot.configurations
+        for name, label in set(pairs)
+    }
+    return np.array([of_table5[pair] for pair in pairs], bool)
 
 
 def driven_on(columns: Columns, layout: Layout) -> np.ndarray:
@@ -218,7 +235,7 @@ class Runs:
     def configurations(self, robot: Robot) -> np.ndarray:
         """Index of each row's configuration in `robot`, shape (rows,).
 
-        It is the configuration for the row's surface (`surface_labels.configuration_on_surface`) if the robot has
+        It is the configuration for the row's surface (`configuration_on_surface`) if the robot has
         one, otherwise the stated configuration.
 
         Raises:
@@ -243,7 +260,7 @@ class Runs:
         if not self.has("surface"):
             return configurations
         pairs = list(zip(configurations.tolist(), self["surface"].tolist(), strict=True))
-        on = {pair: surface_labels.configuration_on_surface(*pair) for pair in set(pairs)}
+        on = {pair: configuration_on_surface(*pair) for pair in set(pairs)}
         return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
@@ -266,7 +283,7 @@ class Runs:
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
             on_tracks = robot.configurations.tracked[configuration_index]
-            scaled = surface_labels.rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
+            scaled = rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
             ]

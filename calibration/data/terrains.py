@@ -8,9 +8,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns, delimited, input_files, named_arrays
+from calibration.data import Columns, named_arrays
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.named_arrays import column_texts
+from calibration.data.named_arrays import Check, check_rows
 from calibration.data.sources import reading
 from mmrjax.climbing import terrain
 from mmrjax.climbing.climb_simulation import ON_GROUND, LeverSequence, roller_clearance
@@ -49,13 +49,7 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")
     table = reading.read_whole_table(path)
-    if table is None:
-        text, _ = delimited.decode_text(path.name, input_files.csv_bytes(path, path.name or str(path)))
-        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        rows, _ = delimited.split_cells(path.name, lines)
-    else:
-        rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    header = table.header
     names = next((names for names in wanted if set(names) <= set(header)), None)
     if names is None:
         either = ", or ".join(" and ".join(names) for names in wanted)
@@ -66,17 +60,18 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
             raise BadData(
                 f"{path.name}: got columns {', '.join(conflicting)} and {ours}; expected one kind, remove the other"
             )
-    columns: dict[str, list[float]] = {name: [] for name in names}
-    for k, row in enumerate(rows[1:], 2):
-        for name in names:
-            j = header.index(name)
-            cell = row[j] if j < len(row) else ""
-            if not np.isfinite(value := named_arrays.cell_number(cell)):
-                raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
-            columns[name].append(value)
-    if len(rows) < 2:
+    for name, unit in zip(header, table.units, strict=False):
+        if name in names and unit and not name.endswith(f"_{unit}"):
+            raise BadData(f"{path.name}: column {name} states {unit} in {table.units_from}; correct one of them")
+    cells = {name: table.values[header.index(name)] for name in names}
+    columns = {name: named_arrays.column_numbers(raw) for name, raw in cells.items()}
+    for name, numbers in columns.items():
+        for row in np.flatnonzero(~np.isfinite(numbers))[:1].tolist():
+            cell = named_arrays.column_texts(cells[name])[row]
+            raise BadData(f"{path.name} row {row + 2}, {name}: got {cell!r}; expected a number")
+    if not len(table):
         raise BadData(f"{path.name}: has no rows; expected at least one")
-    return {name: np.array(values) for name, values in columns.items()}, names
+    return columns, names
 
 
 def read_terrain(path: Path) -> Terrain:
@@ -127,19 +122,15 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Leve
     column_sets = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
     columns, names = _read_columns(path, "--sequence", column_sets)
     abscissa = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
-    if (falls := np.flatnonzero(np.diff(abscissa) <= 0)).size:
-        raise BadData(
-            f"{path.name} row {falls[0] + 3}, {names[0]}: got {columns[names[0]][falls[0] + 1]:g} after "
-            f"{columns[names[0]][falls[0]]:g}; expected increasing values"
-        )
+    falls = np.diff(columns[names[0]], prepend=-np.inf) <= 0
+    before = np.roll(columns[names[0]], 1)
+    checks: list[Check] = [(names[0], falls, lambda row: f" after {before[row]:g}; expected increasing values")]
     over_time = names[0] == "time_s"
     if names[1:] == volts:
-        for name in volts:
-            for k, value in enumerate(columns[name]):
-                if abs(value) > HIGHEST:
-                    raise BadData(
-                        f"{path.name} row {k + 2}, {name}: got {value:g} V; expected -{HIGHEST:g} to {HIGHEST:g} V"
-                    )
+        allowed = f" V; expected -{HIGHEST:g} to {HIGHEST:g} V"
+        checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in volts]
+    check_rows(path.name, columns, checks, 2)
+    if names[1:] == volts:
         front, rear = (jnp.asarray(columns[name]) for name in volts)
         return LeverSequence(jnp.asarray(abscissa), front, rear, jnp.asarray(begins), over_time)
     for name in angles:

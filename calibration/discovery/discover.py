@@ -1399,9 +1399,11 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if found.remains is not None:
         remarks.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
     names = [e.name for e in found.effects]
-    for t in () if found.support is None else found.support.tests:
-        if t.rests_on is not None and t.effect in names:
-            remarks.append(_repeat_run_remark(found, t))
+    doubtful = [t for t in (found.support.tests if found.support else ()) if t.rests_on is not None]
+    remarks += [_repeat_row_remark(found, t) for t in doubtful if t.effect in names and not t.changed]
+    different = [t for t in doubtful if t.changed]
+    if different:
+        remarks.append(Remark("rests_on", test=max(different, key=lambda t: t.root_changed)))
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
     settled, replicates_asked = found.replicates, found.settings.replicates
@@ -1421,13 +1423,11 @@ def delay_remarks(runs: Runs, delay: ParameterShift, stated: bool) -> list[Remar
     return [Remark("late", delay=delay.after, sd=delay.sd_after, ends=ends)]
 
 
-def _repeat_run_remark(found: DiscoveryResult, test: NameTest) -> Remark:
-    """Remark that proposes an experiment if an effect depends on a single run: repeat the run, and add runs half a
+def _repeat_row_remark(found: DiscoveryResult, test: NameTest) -> Remark:
+    """Remark that proposes an experiment if an effect depends on a single row: repeat the row, and add rows half a
     step away from it.
     """
     runs = found.runs
-    if test.what == "run":
-        return Remark("rests_on", test=test)
     row = int(np.flatnonzero(found.numbers == test.row)[0])
     columns = [c for c in ("configuration", *runs.axes) if runs.has(c)]
     conditions_there = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}

@@ -27,9 +27,8 @@ class PlacedCurve(NamedTuple):
 #: Advantage in evidence of a smooth curve of an effect's own equation that refutes its name [σ²]
 #: (docs/lab/findings.md, "Why the constants are what they are").
 BETTER = 5.0
-#: Least share of its root that an effect keeps without any one run. A row of a table may have a wrong reading; a run
-#: of a history has hundreds of samples, so that only significance is tested.
-KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
+#: Least share of its root that an effect keeps without any one row of a table, which may have a wrong reading.
+KEPT = 1 / math.sqrt(3)
 #: Zero error of an instrument over the rms of its readings, below which it is not established without a stated noise:
 #: sds that grow with the readings, or that are too small, leave such an offset.
 SMALL_OFFSET = 0.05
@@ -50,14 +49,13 @@ class NameTest:
         needed: critical value of that root for the strongest effect of the library [σ].
         curves: the curves of other equations.
         evidence: twice the log evidence for the effect over the best smooth curve of its own equation [σ²].
-        row: number of the run whose omission reduces the root most. None if no run was left out.
-        root_without: root without that run. A settled run is a row of its table, see `what`. For histories, the root
-            is scaled to the number of remaining runs.
+        row: number of the row whose omission reduces the root most, for a log the number of the run of `changed`.
+            None if there are too few.
+        root_without: root without that row [σ]. Infinite for a log.
         again: share of the informative blocks for which a fit without the block still finds an effect of its family
             strongest.
         larger: effects that explain the data better, but not at a plausible size.
         remains: True if the largest set of the search still leaves a discrepancy in the equation of the effect.
-        what: name of a run, `row` or `run`.
         varies: square root of the score if the amplitude may change with a variable, in addition to the largest set
             [σ].
         over: variable with which the amplitude changes most.
@@ -65,6 +63,9 @@ class NameTest:
         spread: relative change of the amplitude at an end of that variable [-].
         offset: zero error of an instrument without a stated noise, divided by the rms of its readings [-]. Otherwise
             infinite.
+        changed: of a log, the parameter, or the place of a constant error, that explains most if it differs in one
+            run. Empty for a table.
+        root_changed: square root of the score of that difference [σ].
     """
 
     effect: str
@@ -77,12 +78,13 @@ class NameTest:
     again: float = 1.0
     larger: Names = ()
     remains: bool = False
-    what: str = "row"
     varies: float = 0.0
     over: str = ""
     by_chance: float = 0.0
     spread: float = math.inf
     offset: float = math.inf
+    changed: str = ""
+    root_changed: float = 0.0
 
     @property
     def stands(self) -> bool:
@@ -91,12 +93,13 @@ class NameTest:
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the run without which the test would fail. None if no single run decides, or if the test fails
-        anyway.
+        """Number of the row without which the test would fail, or of the run in which a different constant explains
+        as much. None if there is none.
         """
-        if self.root < self.needed:
-            return None
-        return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
+        if self.changed:
+            return self.row if self.root_changed >= max(self.root, self.needed) else None
+        alone = self.root_without < max(self.needed, KEPT * self.root)
+        return self.row if alone and self.root >= self.needed else None
 
     @property
     def fails(self) -> Names:
@@ -104,7 +107,8 @@ class NameTest:
         doubts = {
             "chance": self.root < self.needed,
             "curve": self.evidence < -BETTER,
-            "row": self.rests_on is not None,
+            "row": self.rests_on is not None and not self.changed,
+            "run": self.rests_on is not None and bool(self.changed),
             "blocks": self.again < AGAIN,
             "larger": bool(self.larger),
             "remains": self.remains,
@@ -176,7 +180,7 @@ class NameSupport:
             numbers: number of each row.
         """
         numbered = (
-            t if t.row is None or t.what == "run" else dataclasses.replace(t, row=int(numbers[t.row - 1]))
+            t if t.row is None or t.changed else dataclasses.replace(t, row=int(numbers[t.row - 1]))
             for t in self.tests
         )
         return dataclasses.replace(self, tests=tuple(numbered))

@@ -304,28 +304,33 @@ def judge_each_name(
                 space, best, effect, _augment_with_curves(space, after.linear, bases, chosen_curves, effect)
             )
             signatures = after.linear.signatures
-        run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=over_time)
+        row, root_without, changed, root_changed = None, math.inf, "", 0.0
+        if over_time:
+            row, changed, root_changed = _changed_run(space, linear, bases, *beside[:2])
+        else:
+            row, root_without = _most_influential_row(space, *beside)
         full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
             NameTest(
                 effect,
                 _largest_root(*beside),
-                after.test.threshold("single"),
+                after.test.threshold("single") + over_time * settings.margins["single"],
                 tuple(_curve_of_variable(*names[k]) for k in chosen_curves),
                 evidence_over_curves(
                     space, full_fit, other_fit, (effect,), linearizations[other_fit.active], bases, settings
                 ),
-                run,
+                row,
                 root_without,
                 _recurrence(
                     space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
-                "run" if over_time else "row",
                 *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
                 offset=_relative_zero_error(space, best, effect, settings),
+                changed=changed,
+                root_changed=root_changed,
             )
         )
     return tuple(tests)
@@ -526,33 +531,54 @@ def _recurrence(
     return float(np.mean(chosen_effects)) if chosen_effects else 1.0
 
 
-def _most_influential_run(
-    space: CandidateSpace,
-    runs: Sequence[np.ndarray],
-    jacobian: np.ndarray,
-    residual: np.ndarray,
-    signatures: np.ndarray,
-    differ: bool = False,
+def _most_influential_row(
+    space: CandidateSpace, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[int | None, float]:
-    """Number of the run whose omission reduces the root most, and the root without it. None for fewer than three
-    runs.
-
-    Args:
-        runs: rows of each run.
-        differ: True if runs carry different information, as histories do. The root is then scaled to the information
-            of all runs.
+    """Number of the row whose omission reduces the root most, and the root without it. None for fewer than three
+    rows.
     """
     least: tuple[int | None, float] = None, math.inf
-    full_score = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
-    counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
-    for k, rows in counting if len(counting) > 2 else ():
+    rows = np.flatnonzero(space.included)
+    for row in rows if len(rows) > 2 else ():
+        out = np.arange(len(space.included)) == row
+        root = _largest_root(
+            *_restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
+        )
+        least = (int(row) + 1, root) if root < least[1] else least
+    return least
+
+
+def _changed_run(
+    space: CandidateSpace, linear: Linearization, bases: Bases, jacobian: np.ndarray, residual: np.ndarray
+) -> tuple[int | None, str, float]:
+    """Run, constant and root of the best explanation by one constant that differs in one run. None for one run.
+
+    The constants are the free parameters and a constant error of each place. A run has hundreds of readings, so an
+    effect may be visible in one run only. If a constant of that run explains as much, the run may just be different.
+    """
+    readings, names = linear.readings, list(space.coordinates.base.names)
+    columns = [np.asarray(linear.jacobian)[:readings, : space.free]]
+    for k, (place, _) in enumerate(bases_room.family_names(bases)):
+        if place not in names:
+            names.append(place)
+            columns.append(family_columns(linear, bases, k)[:, :1])
+    constants = np.concatenate(columns, 1)
+    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    projected_residual = residual - half.T @ (half @ residual)
+    best: tuple[int | None, str, float] = None, "", 0.0
+    runs = [(k, rows) for k, rows in enumerate(linear.runs()) if space.included[rows].any()]
+    for k, rows in runs if len(runs) > 1 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
-        remaining = _restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
-        information = math.sqrt(np.max(_projected_columns(*remaining)[0]) / full_score) if differ else 1.0
-        root = _largest_root(*remaining) / max(information, 1e-9)
-        least = (k + 1, root) if root < least[1] else least
-    return least
+        inside = np.flatnonzero(~_kept_readings(space, out, readings))
+        of_run = constants[inside]
+        norm2, scores = np.sum(of_run**2, 0), of_run.T @ projected_residual[inside]
+        left = norm2 - np.sum((half[:, inside] @ of_run) ** 2, 0)
+        visible = left > ABSORBED**2 * norm2
+        roots = np.where(visible, np.abs(scores) / np.sqrt(np.where(visible, left, 1.0)), 0.0)
+        if roots.max() > best[2]:
+            best = k + 1, names[int(np.argmax(roots))], float(roots.max())
+    return best
 
 
 def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:

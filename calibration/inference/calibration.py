@@ -121,10 +121,10 @@ def calibrate(
     runs, progress = used_rows(runs, robot, rows), report_in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
-    effort = observers.facts_of_fidelity(fidelity).effort
-    starts = (observe.searches or effort.starts) if starts is None else starts
-    profiles = effort.profiles and observe.profiled if profiles is None else profiles
-    blocks = effort.blocks if blocks is None else blocks
+    facts = observers.facts_of_fidelity(fidelity)
+    starts = (observe.searches or facts.starts) if starts is None else starts
+    profiles = facts.profiles and observe.profiled if profiles is None else profiles
+    blocks = facts.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
     choose = functools.partial(_free_names, runs, observe, fidelity, free, fix)
     ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose)
@@ -296,7 +296,7 @@ def _search(
         shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell), None
     tell(progress_remark("steady"))
-    draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
+    draws = rng.standard_normal((fidelities.fidelity_facts("steady").starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
         observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws

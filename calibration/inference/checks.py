@@ -12,9 +12,9 @@ from scipy.optimize import nnls
 
 from calibration.data import Names
 from calibration.data.columns import LOAD, SPEED, SUPPLY
-from calibration.data.computed_columns import line_through
 from calibration.data.courses import applied_drive
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.invalid_readings import line_through
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes

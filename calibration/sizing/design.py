@@ -250,9 +250,8 @@ def _demand_margin(
     if r.limit is None:  # ratings of the parts, required of every design
         return jnp.minimum(travels, cell_voltage_ratio)
     if r.name not in states:  # not a quantity of straight travel
-        found_here = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
-        counts = jnp.where(found_here.outcome == CONVERGED, 1.0, -1.0)
-        value, travels = found_here.value / r.quantity.factor, jnp.min(counts)
+        value, outcome = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
+        value, travels = value / r.quantity.factor, jnp.min(jnp.where(outcome == CONVERGED, 1.0, -1.0))
     else:
         value = states[r.name] / r.quantity.factor
     share = jnp.min(value / _positive_limit(r) - 1) if r.least else jnp.min(1 - value / _positive_limit(r))

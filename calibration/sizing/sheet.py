@@ -220,8 +220,7 @@ def _quantity_at_points(
 
     def one(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
         changed, changed_ratings = _with_parameters(robot, rated, names, theta)
-        quantity = evaluate_requirement(changed, point, changed_ratings, name)
-        return quantity.value, quantity.outcome
+        return evaluate_requirement(changed, point, changed_ratings, name)
 
     return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
 
@@ -234,7 +233,7 @@ def _quantity_gradient(
 
     def value(theta: Array) -> Array:
         changed, changed_ratings = _with_parameters(robot, rated, names, theta)
-        return evaluate_requirement(changed, at, changed_ratings, name).value
+        return evaluate_requirement(changed, at, changed_ratings, name)[0]
 
     return jax.grad(value)(theta)
 

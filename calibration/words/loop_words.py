@@ -552,15 +552,27 @@ def naming_reasons(found: DiscoveryResult) -> str:
 
 def _score_words(test: loop_notes.NameTest) -> str:
     """Score of an effect, with the threshold of chance and the score without its strongest row."""
-    less = "" if test.row is None else f", and {test.root_without:.1f} σ remain without {test.what} {test.row}"
+    less = ""
+    if test.changed:
+        less = f", {_changed_constant(test)} explains {test.root_changed:.1f} σ"
+    elif test.row is not None:
+        less = f", and {test.root_without:.1f} σ remain without row {test.row}"
     return f"{test.effect} scores {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ{less})"
+
+
+def _changed_constant(test: loop_notes.NameTest) -> str:
+    """`a different motor.inertia in run 3`."""
+    if "." in test.changed:
+        return f"a different {test.changed} in run {test.row}"
+    return f"a constant error in the {bases.place_in_words(test.changed)} of run {test.row}"
 
 
 #: Evidence against a single effect: short, and in words.
 DOUBTS = {
     "chance": ("chance", "explains {0.root:.1f} σ{beside}, where chance alone reaches {0.needed:.1f} σ"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
-    "row": ("{0.what} {0.rests_on}", "depends on {0.what} {0.rests_on} alone"),
+    "row": ("row {0.row}", "depends on row {0.row} alone"),
+    "run": ("run {0.row}", "explains no more than {changed} ({0.root_changed:.1f} σ)"),
     "blocks": ("blocks", "is chosen again in only {again:.0f} % of the fits with one block left out"),
     "larger": ("size", "explains less than {larger} at an implausible size"),
     "remains": ("equation", "leaves an error in its own equation"),
@@ -580,6 +592,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     doubts = {
         "beside": curve_words and f" next to smooth curves ({curve_words})",
         "larger": " and ".join(test.larger),
+        "changed": _changed_constant(test),
     }
     doubts |= {"over_variable": bases.variable_in_words(test.over)}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
@@ -812,17 +825,22 @@ def sentence_on_single_run(
     axis: str = "",
     beside: tuple[float, ...] = (),
 ) -> str:
-    """Sentence on an effect that depends on one run."""
+    """Sentence on an effect that depends on one row, or that one different run explains as well."""
+    if test.changed:
+        return (
+            f"{_changed_constant(test)} explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ. Check "
+            "what was different in that run, or repeat it"
+        )
     place_words = _conditions(conditions)
-    run = f"{test.what} {test.rests_on}{f' ({place_words})' * bool(place_words)}"
+    row = f"row {test.row}{f' ({place_words})' * bool(place_words)}"
     others = (
         f"add runs at {axis} {' and '.join(f'{x:g}' for x in beside)}"
         if beside
         else "add runs at conditions on either side of it"
     )
     return (
-        f"{test.effect} depends on {test.what} {test.rests_on} alone ({test.root:.1f} σ with it, "
-        f"{test.root_without:.1f} σ without). Repeat {run}, and {others}"
+        f"{test.effect} depends on row {test.row} alone ({test.root:.1f} σ with it, "
+        f"{test.root_without:.1f} σ without). Repeat {row}, and {others}"
     )
 
 

@@ -7,8 +7,6 @@ point is its distance along the path from the middle of the lower run.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -147,31 +145,20 @@ def grouser_tips(loop: BeltLoop, place: Float[Array, " n"]) -> tuple[Array, Arra
     return loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal)
 
 
-class CornerGaps(NamedTuple):
-    """Gaps between a belt and points such as corners of the ground.
+def gaps_to_belt(loop: BeltLoop, at: Float[Array, "n 2"]) -> tuple[Array, Array, Array, Array]:
+    """Gaps between points, such as corners of the ground, and the belt between its grousers.
 
-    Attributes:
-        gap: distance from the belt [m].
-        normal: outward normal of the belt, shape (n, 2).
-        rate: displacement of the belt's material per displacement of the belt, shape (n, 2).
-        place: position on the path [m].
+    Returns:
+        Distance from the belt [m], its outward normal, shape (n, 2), displacement of its material per displacement of
+        the belt, shape (n, 2), and position on the path [m].
     """
-
-    gap: Array
-    normal: Array
-    rate: Array
-    place: Array
-
-
-def gaps_to_belt(loop: BeltLoop, at: Float[Array, "n 2"]) -> CornerGaps:
-    """Gaps between points and the belt between its grousers."""
     height, place = loop.project(at)
     normal = loop.normal(loop.turned(place))
-    return CornerGaps(height, normal, running_direction(normal), place)
+    return height, normal, running_direction(normal), place
 
 
-def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> CornerGaps:
-    """Gaps between points and the nearest grouser, a rigid tooth with flanks perpendicular to its base."""
+def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> tuple[Array, Array, Array, Array]:
+    """As `gaps_to_belt`, to the nearest grouser, a rigid tooth with flanks perpendicular to its base."""
     under = loop.project(at)[1]
     grouser_offset = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
     place = jnp.mod(under - grouser_offset, loop.length)
@@ -184,7 +171,7 @@ def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> 
     outward = jnp.where((flank > top)[:, None], jnp.sign(u)[:, None] * along, normal)
     run = running_direction(loop.normal(loop.turned(place)))
     rate = run + rise[:, None] * (w[:, None] * along - u[:, None] * normal)
-    return CornerGaps(jnp.maximum(flank, top), outward, rate, place)
+    return jnp.maximum(flank, top), outward, rate, place
 
 
 def running_direction(normal: Array) -> Array:

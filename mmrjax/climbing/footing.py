@@ -168,10 +168,12 @@ def _belt_contacts(
     groups = [contact_group(points, gap, normal, frame.along(rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
-    for near in (belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local)):
-        normal = -frame.along(near.normal)
+    for gap, outward, rate, place in (
+        belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local),
+    ):  # fmt: skip
+        normal = -frame.along(outward)
         points = corners + terrain.nose * -normal
-        groups.append(contact_group(points, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
+        groups.append(contact_group(points, gap - terrain.nose, normal, frame.along(rate), place))
     return groups
 
 

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from mmrjax.climbing import static_limits
 from mmrjax.derived import steepest_slope
@@ -84,16 +84,9 @@ class EnvelopePoint(eqx.Module):
     tread: Scalar
 
 
-class QuantityValue(eqx.Module):
-    """Value of a quantity at one point.
-
-    Attributes:
-        value: value [SI], finite for every outcome.
-        outcome: index into `STATUSES`. The value is meaningful only for `converged`.
-    """
-
-    value: Float[Array, "..."]
-    outcome: Int[Array, "..."]
+#: Value of a quantity at one point [SI], finite for every outcome, and the outcome: an index into `STATUSES`. The
+#: value is meaningful only for `converged`.
+Valued = tuple[Array, Array]
 
 
 def with_cells(robot: Robot, cells: Scalar) -> Robot:
@@ -167,23 +160,23 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
 
 
-def _travel_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _travel_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     values, outcome = travel_quantities(robot, point, rated)
-    return QuantityValue(values[name], outcome)
+    return values[name], outcome
 
 
-def _steepest_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _steepest_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     answer = steepest_slope.compute(robot_there, conditions)
     is_reachable = jnp.isfinite(answer["steepest_slope"])
-    return QuantityValue(jnp.where(is_reachable, answer["steepest_slope"], 0.0), answer["status"])
+    return jnp.where(is_reachable, answer["steepest_slope"], 0.0), answer["status"]
 
 
 #: Halvings of a bracket; a Newton step removes the remaining error.
 HALVINGS = 26
 
 
-def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """Largest payload for continuous travel.
 
     The robot travels, its winding settles below its largest temperature, the gearboxes stay within their torque limit
@@ -211,7 +204,7 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
     )
     signals, status, _ = operating_state(unladen_robot, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
-    return QuantityValue(jnp.where(is_positive, found, 0.0), outcome)
+    return jnp.where(is_positive, found, 0.0), outcome
 
 
 def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
@@ -243,7 +236,7 @@ def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Ar
 NODES = 8
 
 
-def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """Endurance on the battery [s]: t = ∫ dC / (s I_Σ(C) + I_p) over the usable charge, Gauss-Legendre.
 
     The robot drives at full voltage for a share s of the time and stands otherwise. It ends when a cell reaches its
@@ -272,19 +265,19 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
     time = (end - charge_at_begin) * jnp.sum(jnp.asarray(weights / 2) / flowing)
     worst = status[jnp.argmax(status != CONVERGED)]
     outcome = jnp.where(begins, worst, CUT_OFF)
-    return QuantityValue(time, outcome)
+    return time, outcome
 
 
-def _mass_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _mass_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     mass = jnp.asarray(robot.chassis(point.configuration).mass)
-    return QuantityValue(mass, jnp.full(mass.shape, CONVERGED))
+    return mass, jnp.full(mass.shape, CONVERGED)
 
 
 #: Duty of the left side, while the right side's is 1.
 DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 
-def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(
@@ -301,10 +294,10 @@ def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str)
         if name == "turn_in_place_rad_s"
         else jnp.sqrt(jnp.maximum(speed_squared, 1e-24)) / jnp.abs(turns)
     )
-    return QuantityValue(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
+    return jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status)
 
 
-def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """Steepest side slope [deg] that a robot travels across without sliding or tipping.
 
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
@@ -319,12 +312,10 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     # A root of 0 has no derivative.
     slope_of_sliding = friction * stance.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
     slope_of_tipping = stance.width / (2 * stance.height)
-    return QuantityValue(
-        jnp.degrees(jnp.arctan(jnp.minimum(slope_of_sliding, slope_of_tipping))), jnp.asarray(CONVERGED)
-    )
+    return jnp.degrees(jnp.arctan(jnp.minimum(slope_of_sliding, slope_of_tipping))), jnp.asarray(CONVERGED)
 
 
-def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """Geometric limits of a robot on level ground, see `static_limits`.
 
     The highest step in any posture of its levers, stairs and gaps with its levers flush, its size with them folded.
@@ -339,7 +330,7 @@ def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: 
         angle = static_limits.flush_lever_angle(robot) if name == "gap_mm" else jnp.pi
         limits = static_limits.posture_limits(robot, static_limits.with_lever_angles(conditions, angle, angle))
         value = {"gap_mm": limits.gap, "length_mm": limits.length, "height_mm": limits.height}[name]
-    return QuantityValue(jnp.asarray(value), jnp.asarray(CONVERGED))
+    return jnp.asarray(value), jnp.asarray(CONVERGED)
 
 
 #: Function of each group of quantities: (robot, point, ratings, name) -> Found.
@@ -348,7 +339,7 @@ GROUPS = {"travel": _travel_quantity, "slope": _steepest_slope, "payload": _larg
           "turn": _settled_turn, "across": _side_slope, "posture": _posture_quantity}  # fmt: skip
 
 
-def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """Value of one quantity at one point.
 
     Args:

@@ -33,24 +33,6 @@ class Option:
     meaning: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Effort:
-    """Default effort of a calibration.
-
-    A profile takes about twenty refits per parameter, and hold-out blocks take about a dozen. This is seconds with
-    `steady`, and many minutes with simulations over time.
-
-    Attributes:
-        starts: searches from different start points.
-        profiles: True to profile every parameter.
-        blocks: True to refit without each block of runs.
-    """
-
-    starts: int
-    profiles: bool
-    blocks: bool
-
-
 #: Number of steady runs up to which all batches share a program.
 FEW = 256
 
@@ -63,7 +45,10 @@ class FidelityFacts:
         module: module that holds its `FIDELITY`.
         description: one line.
         chunk: largest number of runs in one call. A pair if it differs between processors and an accelerator.
-        effort: effort of a calibration with it.
+        starts: default number of searches of a calibration from different start points.
+        profiles: True if a calibration profiles every parameter by default, with about twenty refits for each. This
+            takes seconds with `steady`, and many minutes with simulations over time.
+        blocks: True if a calibration refits without each block of runs by default, about a dozen times.
         options: its options.
         rollout: True if it integrates over time. Searches with it run one at a time and end sooner.
         histories: True if it can return a run over time.
@@ -78,7 +63,9 @@ class FidelityFacts:
     module: str
     description: str
     chunk: int | tuple[int, int]
-    effort: Effort
+    starts: int = 1
+    profiles: bool = False
+    blocks: bool = False
     options: tuple[Option, ...] = ()
     rollout: bool = False
     histories: bool = False
@@ -136,13 +123,14 @@ TABLE: dict[str, FidelityFacts] = {
         "mmrjax.fidelities.steady",
         "the operating point as a root of the balances, with implicit derivatives",
         chunk=(262_144, 4_194_304),
-        effort=Effort(starts=64, profiles=True, blocks=True),
+        starts=64,
+        profiles=True,
+        blocks=True,
     ),
     "drive": FidelityFacts(
         "mmrjax.fidelities.drive",
         "the ODE of drives and chassis, with slip, inductance and battery",
         chunk=(4_096, 65_536),
-        effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration_option(30.0, 86_400.0),),
         rollout=True,
         histories=True,
@@ -152,7 +140,6 @@ TABLE: dict[str, FidelityFacts] = {
         "mmrjax.fidelities.track",
         "half a robot as multibody dynamics in MuJoCo MJX, with individual contacts",
         chunk=(512, 16_384),
-        effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration_option(1.5, 3600.0), _STEP),
         rollout=True,
         histories=True,

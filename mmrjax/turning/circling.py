@@ -173,18 +173,9 @@ class _BroydenSearch(eqx.Module):
     solved: Array
 
 
-class _LinearisedBalance(eqx.Module):
-    """Linearisation of `_scaled_balance` at the end of a search.
-
-    Attributes:
-        jacobian: Jacobian of `_scaled_balance`.
-        sound: True if it is a turn, and a stable one.
-        known: True once it has been computed.
-    """
-
-    jacobian: Float[Array, "9 9"]
-    sound: Array
-    known: Array
+#: Jacobian of `_scaled_balance` at the end of a search, True if it is a turn, and a stable one, and True once it has
+#: been computed.
+_LinearisedBalance = tuple[Array, Array, Array]
 
 
 class _EulerSearch(eqx.Module):
@@ -292,7 +283,7 @@ def _jacobian_and_value(robot: Robot, conditions: Conditions, y: Array) -> tuple
 
 
 def _no_linearisation(held: tuple[Robot, Conditions, Array, Array]) -> _LinearisedBalance:
-    return _LinearisedBalance(jnp.asarray(_jacobian_at_rest(held[1])), jnp.asarray(False), jnp.asarray(False))
+    return jnp.asarray(_jacobian_at_rest(held[1])), jnp.asarray(False), jnp.asarray(False)
 
 
 def _linearise_balance(held: tuple[Robot, Conditions, Array, Array], _: _LinearisedBalance) -> _LinearisedBalance:
@@ -300,15 +291,15 @@ def _linearise_balance(held: tuple[Robot, Conditions, Array, Array], _: _Lineari
     slope, residual = _jacobian_and_value(*held[:2], y)
     inverted, determinant = inverse(-slope)
     close = jnp.max(jnp.abs(inverted @ residual)) < CLOSE
-    return _LinearisedBalance(slope, solved & close & (determinant > 0), jnp.asarray(True))
+    return slope, solved & close & (determinant > 0), jnp.asarray(True)
 
 
 def _begin_euler(held: tuple[Robot, Conditions, Array, _LinearisedBalance]) -> _EulerSearch:
     """State before the first step, which has length 0 and only evaluates."""
-    y, unknowns = held[2:]
-    y = jnp.where(unknowns.sound, y, _search_start(*held[:2]))
-    slope = jnp.where(unknowns.sound, unknowns.jacobian, _jacobian_at_rest(held[1]))
-    return _EulerSearch(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), unknowns.sound)
+    y, (jacobian, sound, _) = held[2:]
+    y = jnp.where(sound, y, _search_start(*held[:2]))
+    slope = jnp.where(sound, jacobian, _jacobian_at_rest(held[1]))
+    return _EulerSearch(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), sound)
 
 
 def _euler_step(held: tuple[Robot, Conditions, Array, _LinearisedBalance], search: _EulerSearch) -> _EulerSearch:
@@ -343,7 +334,7 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
     first = lanes.loop_until(
         _begin_broyden, _broyden_step, lambda s: (s.looks >= SOON) | s.solved, inputs, lambda s: (s.y, s.solved)
     )
-    solution = lanes.loop_until(_no_linearisation, _linearise_balance, lambda s: s.known, (*inputs, *first))
+    solution = lanes.loop_until(_no_linearisation, _linearise_balance, lambda s: s[2], (*inputs, *first))
     end = lanes.loop_until(
         _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*inputs, first[0], solution), most=FEW
     )

@@ -148,12 +148,9 @@ def _loss_derivatives(run: HalfRobotSystem, motion: PlaneMotion, sides: _Contact
     return jnp.stack([jnp.maximum(-jax.jvp(f, (zero,), (one,))[1], 0.0) for f in (along, shaft)])
 
 
-class _ContactLevers(eqx.Module):
-    """Motion of each contact along the robot, to its left and off the ground, per velocity of `OF_SIDE`."""
-
-    along: Float[Array, "2 contacts 8"]
-    across: Float[Array, "2 contacts 8"]
-    off: Float[Array, "2 contacts 8"]
+#: Motion of each contact along the robot, to its left and off the ground, per velocity of `OF_SIDE`, each of shape
+#: (2, contacts, 8).
+_ContactLevers = tuple[Array, Array, Array]
 
 
 def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactState) -> _ContactLevers:
@@ -165,7 +162,7 @@ def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactSta
     along: list[Any] = [cos * one, sin * one, none, -y * one, z, none, at.rate_x * front, at.rate_x * rear]
     across: list[Any] = [-sin * one, cos * one, none, x, none, -z, none, none]
     off: list[Any] = [none, none, one, none, -x, y * one, at.rate_z * front, at.rate_z * rear]
-    return _ContactLevers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
+    return jnp.stack(along, axis=-1), jnp.stack(across, axis=-1), jnp.stack(off, axis=-1)
 
 
 def generalized_forces(
@@ -202,18 +199,17 @@ def damping_matrix(
     contacts).
     """
     levers, touching = _contact_levers(run, motion, sides.at), sides.at
+    along, across, off = levers
     assert pulled.aside is not None
     sliding = jax.vmap(side_contacts.sliding_speeds)(signals, touching)
     weight = jnp.asarray(signals.adhesion)[:, None] * touching.force
     rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
     rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]
     least = jnp.maximum(touching.force, 1e-9)
-    moves = jnp.concatenate([levers.along, levers.across, levers.off], axis=1)
-    falls = touching.damped[..., None] * levers.off
+    moves = jnp.concatenate(levers, axis=1)
+    falls = touching.damped[..., None] * off
     pushes = [
-        rises[k, 0][..., None] * levers.along
-        + rises[k, 1][..., None] * levers.across
-        + (f / least)[..., None] * falls
+        rises[k, 0][..., None] * along + rises[k, 1][..., None] * across + (f / least)[..., None] * falls
         for k, f in enumerate((pulled.force, pulled.aside))
     ]
     side_matrices = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
@@ -321,9 +317,7 @@ def _damping_product(
     gained_forces = gained_forces.at[jnp.asarray([X, Y, YAW])].add(
         jnp.stack([cos * jnp.sum(rolling_damping), sin * jnp.sum(rolling_damping), -y @ rolling_damping])
     )
-    for lever, now, then in zip(
-        (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, touching.force), after, strict=True
-    ):
+    for lever, now, then in zip(levers, (pulled.force, pulled.aside, touching.force), after, strict=True):
         side_products = jnp.einsum("sci,sc->si", lever, now - then)
         gained_forces = gained_forces.at[OF_SIDE[0]].add(side_products[0]).at[OF_SIDE[1]].add(side_products[1])
     return run.robot.sides / 2 * gained_forces
@@ -338,10 +332,8 @@ def _state_after_step(
         of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
         return half_robot.other_states_after_step(*of_side, signals)
 
-    side_memories = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
-    after = HalfRobotState(
-        motion.q + run.step * v, v, side_memories.current, side_memories.discharge[0], side_memories.memory
-    )
+    current, discharge, memory = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
+    after = HalfRobotState(motion.q + run.step * v, v, current, discharge[0], memory)
     return after, _signals_after_step(run, motion, found, gained), found.pulled.guided
 
 
@@ -353,7 +345,7 @@ def contact_forces_after_step(
     Each has the shape (2, contacts).
     """
     of_side = gained[OF_SIDE]
-    along, across, off = (jnp.einsum("sci,si->sc", x, of_side) for x in (levers.along, levers.across, levers.off))
+    along, across, off = (jnp.einsum("sci,si->sc", x, of_side) for x in levers)
     down, least = at.damped * off, jnp.maximum(at.force, 1e-9)
     assert pulled.aside is not None
     ahead, aside = (

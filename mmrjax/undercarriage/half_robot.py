@@ -289,31 +289,24 @@ def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors
     )
 
 
-class _StateAfterStep(eqx.Module):
-    """State after a step other than coordinates and velocities."""
-
-    current: Scalar
-    discharge: Scalar
-    memory: Mapping[str, Scalar]
-
-
-def other_states_after_step(run: HalfRobotSystem, motion: HalfRobotState, signals: Signals) -> _StateAfterStep:
+def other_states_after_step(
+    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals
+) -> tuple[Scalar, Scalar, dict[str, Scalar]]:
     """Currents, charge and memories after one time step."""
     charge = balances.charge_drawn(run.robot, run.conditions, signals.total_current)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
     }
-    return _StateAfterStep(
-        current_after(run.robot, run.conditions, run.step, signals), motion.discharge + run.step * charge, memory
-    )
+    current = current_after(run.robot, run.conditions, run.step, signals)
+    return current, motion.discharge + run.step * charge, memory
 
 
 def _state_after_motion(
-    motion: HalfRobotState, step: Scalar, later: _StateAfterStep, fallen: Array, gained: Array, signals: Signals
+    motion: HalfRobotState, step: Scalar, later: tuple[Any, ...], fallen: Array, gained: Array, signals: Signals
 ) -> tuple[HalfRobotState, Signals]:
     v = motion.v + gained
-    after = HalfRobotState(motion.q + step * v, v, later.current, later.discharge, later.memory)
+    after = HalfRobotState(motion.q + step * v, v, *later)
     traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
     return after, dataclasses.replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
 
@@ -376,7 +369,7 @@ def _contact_inputs(run: HalfRobotSystem, motion: HalfRobotState) -> dict[str, S
 
 def _step_residual(
     run: HalfRobotSystem, motion: HalfRobotState, gained: Coordinates, linearized: LinearizedSums
-) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
+) -> tuple[Array, Array, tuple[Any, ...], Signals, Scalar]:
     """Residual of a time step at constant Δv, K Δv of x and z, and the other results of the step.
 
     The residual is Δt τ - Δt c - (M + Δt K) Δv, see `advance`.

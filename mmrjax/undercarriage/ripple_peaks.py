@@ -23,26 +23,16 @@ from mmrjax.undercarriage.running_gear import TEETH_PULLEY
 Series = Float[np.ndarray, " samples"]
 
 
-class Ripple(NamedTuple):
-    """Periodic fluctuation of a signal about its mean.
-
-    Attributes:
-        mean: mean [unit of the signal].
-        amplitude: half of the peak-to-peak value, relative to the mean [-].
-        period: period of repetition [s]. NaN: no repetition within half the record.
-    """
-
-    mean: float
-    amplitude: float
-    period: float
-
-
-def measure_ripple(time: Series, values: Series) -> Ripple:
+def measure_ripple(time: Series, values: Series) -> tuple[float, float, float]:
     """Ripple of evenly sampled `values`, with a linear drift removed.
 
     Two events per pitch (a grouser lands in front, another lifts at the rear) make a harmonic the strongest
     line of the spectrum. The period is therefore the first lag with an autocorrelation of at least 0.9 of the
     largest. It is refined by a parabola and by counting on to the last such repetition.
+
+    Returns:
+        Mean [unit of the signal], half of the peak-to-peak value relative to the mean [-], and period of repetition
+        [s]. NaN: no repetition within half the record.
     """
     time, values = np.asarray(time, float), np.asarray(values, float)
     detrended = values - np.polyval(np.polyfit(time, values, 1), time)
@@ -60,37 +50,28 @@ def measure_ripple(time: Series, values: Series) -> Ripple:
         near = np.abs(good / fundamental - period_counts) < 0.2
         last = good[near][-1]
         period = float(_parabola_vertex(agreement, last) / np.round(last / fundamental) * (time[1] - time[0]))
-    return Ripple(float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period)
+    return float(values.mean()), float(np.ptp(detrended) / 2 / abs(values.mean())), period
 
 
-class Fluctuation(NamedTuple):
-    """Fluctuation of a signal about its mean, and its strongest frequency.
+def measure_fluctuation(time: Series, values: Series) -> tuple[float, float, float]:
+    """Fluctuation of evenly sampled `values`, with a linear drift removed and a Hann window for the spectrum.
 
-    Attributes:
-        mean: mean [unit of the signal].
-        deviation: standard deviation, relative to the mean [-].
-        frequency: frequency of the strongest line of its spectrum [Hz]. NaN: it is constant.
+    Returns:
+        Mean [unit of the signal], standard deviation relative to the mean [-], and frequency of the strongest line of
+        the spectrum [Hz]. NaN: it is constant.
     """
-
-    mean: float
-    deviation: float
-    frequency: float
-
-
-def measure_fluctuation(time: Series, values: Series) -> Fluctuation:
-    """Fluctuation of evenly sampled `values`, with a linear drift removed and a Hann window for the spectrum."""
     time, values = np.asarray(time, float), np.asarray(values, float)
     mean = float(values.mean())
     if not np.isfinite(values).all() or mean == 0.0:
-        return Fluctuation(mean, float("nan"), float("nan"))
+        return mean, float("nan"), float("nan")
     detrended = values - np.polyval(np.polyfit(time, values, 1), time)
     deviation = float(detrended.std() / abs(mean))
     if deviation < 1e-13:  # rounding
-        return Fluctuation(mean, deviation, float("nan"))
+        return mean, deviation, float("nan")
     size = 1 << (8 * len(detrended) - 1).bit_length()  # zero padding, for a fine grid of frequencies
     power = np.abs(np.fft.rfft(detrended * np.hanning(len(detrended)), size)) ** 2
     best = int(np.argmax(power[1:-1])) + 1
-    return Fluctuation(mean, deviation, float(_parabola_vertex(power, best) / (size * (time[1] - time[0]))))
+    return mean, deviation, float(_parabola_vertex(power, best) / (size * (time[1] - time[0])))
 
 
 def _parabola_vertex(values: Series, k: int) -> float:
@@ -182,7 +163,7 @@ class Vibrations:
         speed: mean speed [m/s].
         passing: passing frequency of grousers or teeth [Hz].
         mean, deviation, frequency: mean, relative deviation and strongest frequency of each of `SIGNALS`, see
-            `Fluctuation`.
+            `measure_fluctuation`.
     """
 
     status: np.ndarray

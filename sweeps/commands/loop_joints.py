@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import UnivariateSpline
 from scipy.ndimage import maximum_filter1d
 
-from calibration.data import Names, delimited
+from calibration.data import Names
 from calibration.data import runs as records
 from calibration.data.column_names import check_units
 from calibration.data.columns import CURRENT, LOAD, SPEED, Column
@@ -275,7 +275,7 @@ def run_joints(
     robots = {name: robot_of_joint(config, name) for name in joint_names}
     if not data.is_file():
         raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
-    log = reading.read_whole_table(data) or delimited.read_csv_columns(data, data.name)
+    log = reading.read_whole_table(data)
     runs = runs_of_joints(log, chain, {name: robot for name, (_, robot) in robots.items()})
     folder = beside.out or store.default_path("loop")
     code, rows = 0, []

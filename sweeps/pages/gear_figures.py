@@ -108,14 +108,12 @@ def gear_runs(
 def ripple_row(gear: GearRun) -> tuple[Any, ...]:
     """Row of the table of ripples: run, pitch, period measured and by eq. (34), amplitudes, load on the guides."""
     tail, signals = gear.tail(TAIL), gear.signals
-    line, travel, reaction = (
-        ripple_peaks.measure_ripple(gear.time[tail], x[tail])
-        for x in (signals.total_current, signals.speed, signals.normal)
-    )
+    shown = signals.total_current, signals.speed, signals.normal
+    ripples = [ripple_peaks.measure_ripple(gear.time[tail], x[tail]) for x in shown]
     pitch = "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm"
-    amplitudes = (100 * ripple.amplitude for ripple in (line, travel, reaction))
+    amplitudes = (100 * amplitude for _, amplitude, _ in ripples)
     on_guides = 100 * gear.guide_share if gear.on_tracks else None
-    return gear.name, pitch, 1e3 * line.period, 1e3 * gear.period, *amplitudes, on_guides
+    return gear.name, pitch, 1e3 * ripples[0][2], 1e3 * gear.period, *amplitudes, on_guides
 
 
 def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:

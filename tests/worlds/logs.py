@@ -255,11 +255,11 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
     """Readings of each channel for each member, a dictionary each of shape (runs, rows) [units of the columns].
 
     Args:
-        members: constants of each.
+        members: constants of each, of which one may differ from run to run.
         terms: of each.
     """
     count, per, (runs, length) = len(members), r.per, r.inputs.shape
-    p = {n: np.repeat([m[n] for m in members], runs) for n in r.p}
+    p = {n: np.concatenate([np.broadcast_to(m[n], runs) for m in members]) for n in r.p}
     inputs = np.tile(r.inputs, (count, 1))
     every = _side_by_side(terms or (), runs)
     quasi_static, electric = r.long and r.imposed != "motor_speed", any(t.law.balance == "electrical" for t in every)
@@ -495,17 +495,26 @@ def oracle(term: Term, left: np.ndarray, tried: Sequence[Term], units: Sequence[
     return told_apart(apart, size, term.law.cls)
 
 
-def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) -> Case:
+def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True, run: int | None = None) -> Case:
     """A case. `name` empty is a clean one. Effects are sized so that a linear refit of the constants leaves `sigmas`.
     The label says how many a refit really leaves.
 
     Args:
+        run: number of a run in which the constant `name` differs, so that a refit leaves `sigmas`. None: `name` is an
+            effect.
         stated: True for a table with the sds of its readings, without the rounding by the stated steps.
     """
     rng = np.random.default_rng([98, seed])
     terms: tuple[Term, ...] = ()
-    effects = []
-    if name:
+    constants, effects = r.p, []
+    if run is not None:
+        _, base, _ = slopes(r, r.p, ())
+        inside = np.arange(len(r.inputs)) == run
+        change = (base[r.names.index(name)] * inside[:, None]).ravel()
+        left = np.linalg.norm(remainder(change, np.stack([b.ravel() for b in base], 1)))
+        constants = {**r.p, name: np.where(inside, moved(r.p, name, sigmas / left)[name], r.p[name])}
+        effects.append({"name": name, "class": "", "balance": "", "sigmas": sigmas, "run": run})
+    elif name:
         term, tried = shaped(name, rng, LAWS[name].at(r.scale)), [] if r.long else rivals(r)
         ladder = LONG_LADDER if r.long else LADDER
         rungs = [dataclasses.replace(term, amplitude=x * term.law.size) for x in ladder]
@@ -520,8 +529,8 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
         sizes = np.maximum.accumulate([np.linalg.norm(x) for x in left[: len(rungs)]])
         share = np.exp(np.interp(np.log(sigmas), np.log(sizes), np.log(ladder)))
         terms = (dataclasses.replace(term, amplitude=float(share) * term.law.size),)
-    shown = histories(r, [r.p], [terms])[0]
-    if name:
+    shown = histories(r, [constants], [terms])[0]
+    if terms:
         change = whitened(r, shown) - y
         apart = oracle(terms[0], left_of(change), tried, left[len(rungs) :])
         sigmas = float(np.linalg.norm(left_of(change))) if r.long else left_over(r, y + change)
@@ -548,7 +557,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
         if stated:
             table[f"{head}_sd_{unit}"] = np.full(runs * length, r.noise(n))
     label = {
-        "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
+        "kind": "clean" if not name else "fault" if run is not None else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
         "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p, "alone": r.alone,
         "coarse": bool(r.steps), "stated": stated,
         "sound": bool(all(np.isfinite(x).all() for x in shown.values())),

@@ -1,20 +1,112 @@
-"""Parquet, Feather and Arrow files."""
+"""Tables of columns: pandas, polars, Arrow, xarray and dicts of arrays, and Parquet, Feather and Arrow files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calibration.data import input_files
-from calibration.data.sources.recorded_signals import Load, Signal
+from calibration.data.input_errors import BadData
+from calibration.data.sources import json_records
+from calibration.data.sources.recorded_signals import (
+    Clock,
+    Load,
+    Signal,
+    refused_type,
+    signals_of_arrays,
+    unit_of_clock,
+    values_in_memory,
+)
+
+EXPECTED = (
+    "a path, a pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records"
+)
 
 #: Longest list whose elements become signals.
 MOST = 64
 #: Keys of a column's metadata that hold its unit.
 _UNITS = (b"unit", b"units", b"Unit")
+
+
+def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
+    """Kind of an object in memory, and its signals.
+
+    Raises:
+        BadData: the object is of another kind.
+    """
+    library = type(source).__module__.partition(".")[0]
+    kind = type(source).__name__
+    if library == "pandas" and kind == "DataFrame":
+        return "the DataFrame", tuple(_of_frame(source))
+    if library == "polars" and kind in ("DataFrame", "LazyFrame"):
+        try:
+            frame = source.collect() if kind == "LazyFrame" else source
+        except Exception as error:  # polars has its own errors
+            raise BadData(f"the LazyFrame: polars cannot evaluate it ({' '.join(str(error).split())})") from error
+        return "the DataFrame", signals_of_arrow_table(frame.to_arrow())
+    if library == "pyarrow" and kind in ("Table", "RecordBatch"):
+        import pyarrow as pa
+
+        return "the Arrow table", signals_of_arrow_table(pa.table(source))
+    if library == "xarray" and kind in ("Dataset", "DataArray"):
+        return f"the {kind}", _of_xarray(
+            source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
+        )
+    if isinstance(source, np.ndarray) and source.dtype.names:
+        return "the array", signals_of_arrays(
+            "the array", {n: (source.shape, source.dtype[n], values_in_memory(source[n])) for n in source.dtype.names}
+        )
+    if isinstance(source, Mapping):
+        return "the dict", json_records.signals_of_json_content(source, "the dict")
+    if isinstance(source, list | tuple) and source and all(isinstance(item, Mapping) for item in source):
+        return "the records", json_records.signals_of_json_content(list(source), "the records")
+    library = type(source).__module__.partition(".")[0]
+    kind = f"{library} {type(source).__name__}".removeprefix("builtins ")
+    raise BadData(f"the source: got {kind}; expected {EXPECTED}")
+
+
+def _of_frame(frame: Any) -> Iterator[Signal]:
+    """Signals of a pandas DataFrame, and of its index if that has a name or times."""
+    import pyarrow as pa
+
+    levels = [frame.index.get_level_values(level) for level in range(frame.index.nlevels)]
+    named = [(level.name or "time", level) for level in levels if level.name is not None or level.dtype.kind in "mM"]
+    for title, series in (*named, *((title, frame.iloc[:, j]) for j, title in enumerate(frame.columns))):
+        name = ".".join(filter(None, map(str, title if isinstance(title, tuple) else (title,))))
+        try:
+            yield from signals_of_arrow_table(pa.table([pa.array(series, from_pandas=True)], [name]))
+        except pa.ArrowException:  # complex numbers, or objects of several kinds
+            yield Signal(name, len(frame), lambda: np.empty(0), refused=refused_type(series.dtype))
+
+
+def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
+    """Signals of a Dataset. If its variables have several dimensions of time, each variable has its own clock."""
+    dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
+    several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
+    signals_found: list[Signal] = []
+    for name, array in {**dataset.coords, **dataset.data_vars}.items():
+        if not array.dims:
+            continue
+        clock = None
+        time = array.dims[0]
+        if several and time in dataset.coords:
+            unit = str(dataset.coords[time].attrs.get("units", "")) or unit_of_clock(str(time)) or ""
+            clock = Clock(str(time), _values(dataset.coords[time]), unit)
+        shape, dtype = array.shape, array.dtype
+        signals = signals_of_arrays(
+            "the Dataset", {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
+        )
+        signals_found += [dataclasses.replace(s, clock=clock) for s in signals]
+    return tuple(signals_found)
+
+
+def _values(array: Any) -> Load:
+    return lambda: np.asarray(array.values)
 
 
 def signals_of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
@@ -23,13 +115,8 @@ def signals_of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
 
     file = parquet.ParquetFile(path)
     rows, schema = file.metadata.num_rows, file.schema_arrow
-    size = input_files.VALUE * rows * file.metadata.num_columns
-    input_files.check_declared(name, file.metadata.num_columns, size, path.stat().st_size)
-
-    def column(field: str) -> Load:
-        return lambda: values_of_arrow_column(file.read([field], use_threads=True).column(0))
-
-    return tuple(s for field in schema for s in _signals(field, rows, column(field.name), file.read))
+    input_files.check_declared(name, len(schema), input_files.VALUE * rows * len(schema), path.stat().st_size)
+    return _signals(schema, rows, lambda k: file.read([schema.names[k]], use_threads=True).column(0))
 
 
 def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
@@ -39,66 +126,51 @@ def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     """
     import pyarrow as pa
 
-    def reader(file: Any, **options: Any) -> Any:
-        stream = file.read(6) != b"ARROW1"
-        file.seek(0)
-        return (pa.ipc.open_stream if stream else pa.ipc.open_file)(file, **options)
+    opened = pa.ipc.open_file if input_files.first_bytes(path, name).startswith(b"ARROW1") else pa.ipc.open_stream
 
     def column(k: int) -> Any:
         with pa.OSFile(str(path)) as file:
-            return reader(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all()
+            return opened(file, options=pa.ipc.IpcReadOptions(included_fields=[k])).read_all().column(0)
 
     with pa.OSFile(str(path)) as file:
-        schema = reader(file).schema
+        schema = opened(file).schema
     input_files.check_declared(name, len(schema))
-    rows = column(0).num_rows if len(schema) else 0
-
-    def values(k: int) -> Load:
-        return lambda: values_of_arrow_column(column(k).column(0))
-
-    def whole(k: int) -> Callable[[list[str]], Any]:
-        return lambda names: column(k)
-
-    return tuple(s for k, field in enumerate(schema) for s in _signals(field, rows, values(k), whole(k)))
+    return _signals(schema, len(column(0)) if len(schema) else 0, column)
 
 
 def signals_of_arrow_table(table: Any) -> tuple[Signal, ...]:
     """Signals of a `pyarrow.Table`."""
-
-    def column(field: str) -> Load:
-        return lambda: values_of_arrow_column(table.column(field))
-
-    return tuple(
-        s for field in table.schema for s in _signals(field, table.num_rows, column(field.name), table.select)
-    )
+    return _signals(table.schema, table.num_rows, table.column)
 
 
-def _signals(field: Any, rows: int, load: Load, read: Callable[[list[str]], Any]) -> list[Signal]:
-    """Signals of a column. A column of lists has one signal for each element, `name[0]`."""
-    import pyarrow.types as kinds
+def _signals(schema: Any, rows: int, column: Callable[[int], Any]) -> tuple[Signal, ...]:
+    """Signals of columns. A column of lists has one signal for each element, `name[0]`.
 
-    kind = field.type
-    if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
-        return [_signal(field, rows, load)]
+    Args:
+        column: function that reads a column by its index.
+    """
     import pyarrow as pa
+    import pyarrow.types as kinds
     from pyarrow import compute
 
-    column = read([field.name]).column(0)
-    lengths = compute.unique(compute.list_value_length(column)).to_pylist()
-    if len(lengths) != 1 or not lengths[0]:
-        why = "holds lists of several lengths; expected one length in every row"
-        return [Signal(field.name, rows, load, refused=why)]
+    signals = []
+    for k, field in enumerate(schema):
+        kind, whole = field.type, functools.partial(column, k)
+        if not (kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind)) or not rows:
+            signals.append(_signal(field, rows, whole))
+            continue
+        lengths = compute.unique(compute.list_value_length(whole())).to_pylist()
+        if len(lengths) != 1 or not lengths[0]:
+            why = "holds lists of several lengths; expected one length in every row"
+            signals.append(Signal(field.name, rows, whole, refused=why))
+            continue
+        for j in range(min(lengths[0], MOST)):
+            element = functools.partial(lambda read, j: compute.list_element(read(), j), whole, j)
+            signals.append(_signal(pa.field(f"{field.name}[{j}]", kind.value_type), rows, element))
+    return tuple(signals)
 
-    def element(k: int) -> Load:
-        return lambda: values_of_arrow_column(compute.list_element(column, k))
 
-    return [
-        _signal(pa.field(f"{field.name}[{k}]", kind.value_type), rows, element(k))
-        for k in range(min(lengths[0], MOST))
-    ]
-
-
-def _signal(field: Any, rows: int, load: Load) -> Signal:
+def _signal(field: Any, rows: int, column: Callable[[], Any]) -> Signal:
     import pyarrow.types as kinds
 
     kind, metadata = field.type, field.metadata or {}
@@ -109,6 +181,7 @@ def _signal(field: Any, rows: int, load: Load) -> Signal:
     number = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind) or kinds.is_decimal(kind)
     timed = kinds.is_timestamp(kind) or kinds.is_duration(kind)
     refused = "" if words or number or timed or kinds.is_null(kind) else f"holds {kind}; expected numbers or words"
+    load = lambda: values_of_arrow_column(column())  # noqa: E731
     return Signal(field.name, rows, load, unit, words=words, refused=refused)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,27 +22,15 @@ SAME = 1e-3
 _STEPS = {"ms": 1e2, "us": 1e5, "ns": 1e8}
 
 
-class Elapsed(NamedTuple):
-    """Times of a clock.
-
-    Attributes:
-        time: time since its first sample [s], shape (n,).
-        first: clock reading of the first sample [s].
-        unit: unit of its numbers, empty for dates.
-        period: period of a counter that wraps, otherwise 0.
-    """
-
-    time: np.ndarray
-    first: float
-    unit: str
-    period: float = 0.0
-
-
-def clock_seconds(clock: Clock) -> Elapsed:
+def clock_seconds(clock: Clock) -> tuple[np.ndarray, float, str, float]:
     """Returns the times of a clock.
 
     If a clock does not state its unit, the size of its numbers since 1970 or their steps determine it. Numbers that
     are not whole are seconds. Wraps of a counter are removed.
+
+    Returns:
+        Time since its first sample [s], shape (n,). Clock reading of the first sample [s]. Unit of its numbers, empty
+        for dates. Period of a counter that wraps, otherwise 0.
 
     Raises:
         BadData: a time stamp is missing or infinite.
@@ -56,14 +43,14 @@ def clock_seconds(clock: Clock) -> Elapsed:
         )
     if raw.dtype.kind in "Mm":
         ticks = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
-        return Elapsed((ticks - ticks[:1]) * 1e-9, float(ticks[0]) * 1e-9, "")
+        return (ticks - ticks[:1]) * 1e-9, float(ticks[0]) * 1e-9, "", 0.0
     if raw.dtype.kind in "iu":
         raw = raw.astype(np.int64)
     unit, period = clock.unit or guessed_unit(raw), 0.0
     if (np.diff(raw) < 0).any():
         raw, period = unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
     seconds_per_unit = UNITS[unit]
-    return Elapsed((raw - raw[:1]) * seconds_per_unit, float(raw[0]) * seconds_per_unit, unit, period)
+    return (raw - raw[:1]) * seconds_per_unit, float(raw[0]) * seconds_per_unit, unit, period
 
 
 def guessed_unit(raw: np.ndarray) -> str:
@@ -116,8 +103,8 @@ def signals_on_one_grid(
         read = {key: clock_seconds(clock) for key, clock in clocks.items()}
     except BadData as error:
         raise BadData(f"{name}, {str(error).removeprefix(f'{name}, ')}") from error
-    begin = min(elapsed.first for elapsed in read.values())
-    times = {key: elapsed.time + (elapsed.first - begin) for key, elapsed in read.items()}
+    begin = min(first for _, first, *_ in read.values())
+    times = {key: time + (first - begin) for key, (time, first, *_) in read.items()}
     order = {key: _sample_order(time) for key, time in times.items()}
     late = {key: int(np.count_nonzero(np.diff(times[key]) < 0)) for key, rows in order.items() if rows is not None}
     times = {key: time if order[key] is None else time[order[key]] for key, time in times.items()}
@@ -170,7 +157,7 @@ def signals_on_one_grid(
     if not is_covered.all():
         notes.append(f"{name}: {np.count_nonzero(~is_covered)} rows before the first command are left out")
     for key, clock in clocks.items():
-        unit, period = read[key].unit, read[key].period
+        *_, unit, period = read[key]
         if key in late:
             notes.append(
                 f"{name}: {count_noun(late[key], 'sample')} of {clock.name} arrived late. Samples are sorted by time "

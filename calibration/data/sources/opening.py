@@ -19,7 +19,7 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
-from calibration.data.sources import in_memory
+from calibration.data.sources import columnar
 from calibration.data.sources.recorded_signals import Load, Signal, Source, plain_values, refused_type
 
 #: Separator between the path of a file and the path of signals in it.
@@ -180,9 +180,9 @@ def open_object(source: Any) -> Source:
     """The signals of a table in memory.
 
     Raises:
-        BadData: for the same reasons as `in_memory.signals_of_object`.
+        BadData: for the same reasons as `columnar.signals_of_object`.
     """
-    kind, signals = in_memory.signals_of_object(source)
+    kind, signals = columnar.signals_of_object(source)
     return checked_source(kind, kind, signals)
 
 

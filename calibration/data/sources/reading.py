@@ -30,31 +30,20 @@ from mmrjax.model import channels, quantities
 
 #: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
 Mapped = tuple[tuple[str, str, float], ...]
+#: Columns of a source, and those that have other names there.
+ReadColumns = tuple[NamedArrays, Mapped]
 #: Most values of columns that the model does not use, which are read to find correlations with residuals.
 EXTRA_VALUES = 20_000_000
 #: Ratio of the rms currents along d and q above which the field counts as weakened [-].
 WEAKENED = 0.3
 
 
-@dataclasses.dataclass(frozen=True)
-class Reading:
-    """Columns of a source, with their names in this program.
-
-    Attributes:
-        arrays: the columns.
-        mapped: columns with other names in the source.
-    """
-
-    arrays: NamedArrays
-    mapped: Mapped
-
-
-def read_columns(source: Any, layout: Layout, columns: Preset | None = None, between: str = "held") -> Reading:
-    """Returns the columns of a file or of a table in memory.
+def read_columns(source: Any, layout: Layout, columns: Preset | None = None, between: str = "held") -> ReadColumns:
+    """Returns the columns of a file or of a table in memory, and those with other names in the source.
 
     Args:
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
-            (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
+            (`columnar.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
         layout: layout of the table's robot.
         columns: names of the source's columns, in addition to those in the robot file, over which they take
             precedence.
@@ -79,22 +68,23 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
     return _of_table(arrays, layout, columns)
 
 
-def _of_group(readings: Sequence[Reading], name: str) -> Reading:
+def _of_group(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
     """Tables of several files joined into one. Each file is a run, named after the file.
 
     Raises:
         BadData: the files have different columns or units.
     """
-    first_table = readings[0].arrays
-    for other in readings[1:]:
-        if other.arrays.header != first_table.header or other.arrays.units != first_table.units:
-            differing = sorted({*first_table.header} ^ {*other.arrays.header})
+    tables = [table for table, _ in readings]
+    first_table = tables[0]
+    for other in tables[1:]:
+        if other.header != first_table.header or other.units != first_table.units:
+            differing = sorted({*first_table.header} ^ {*other.header})
             raise BadData(
-                f"{name}: {other.arrays.name} and {first_table.name} differ in "
+                f"{name}: {other.name} and {first_table.name} differ in "
                 f"{list_some(differing) if differing else 'the order or units of their columns'}; expected the same "
                 "columns in every file"
             )
-    values = [[r.arrays.values[k] for r in readings] for k in range(len(first_table.header))]
+    values = [[table.values[k] for table in tables] for k in range(len(first_table.header))]
     joined = [
         np.concatenate(parts)
         if all(isinstance(v, np.ndarray) for v in parts)
@@ -103,17 +93,15 @@ def _of_group(readings: Sequence[Reading], name: str) -> Reading:
     ]
     header, units = first_table.header, first_table.units
     if RUN not in header:
-        joined.append([Path(r.arrays.name).stem for r in readings for _ in range(len(r.arrays))])
+        joined.append([Path(table.name).stem for table in tables for _ in range(len(table))])
         header, units = (*header, RUN), (*units, "") if units else ()
-    digest = hashlib.sha256("".join(r.arrays.digest for r in readings).encode()).hexdigest()
-    notes = tuple(dict.fromkeys(note for r in readings for note in r.arrays.notes))
-    return Reading(
-        NamedArrays(name, header, tuple(joined), units, first_table.units_from, notes, digest), readings[0].mapped
-    )
+    digest = hashlib.sha256("".join(table.digest for table in tables).encode()).hexdigest()
+    notes = tuple(dict.fromkeys(note for table in tables for note in table.notes))
+    return NamedArrays(name, header, tuple(joined), units, first_table.units_from, notes, digest), readings[0][1]
 
 
-def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
-    """All columns of a table in a file, unchanged. None for text, in which comments have a meaning.
+def read_whole_table(path: Path, within: str = "") -> NamedArrays:
+    """All columns of a table in a file, unchanged.
 
     Raises:
         BadData: for the same reasons as `read_columns`. Signals with separate clocks, which do not form one table.
@@ -121,7 +109,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     name = path.name or str(path)
     form = opening.format_of(path, name)
     if form is None:
-        return None
+        return delimited.read_csv_columns(path, name)
     source = opening.open_signals(path, within, name, form)
     signals = {s.path if len(matching_signals(source.signals, s.name)) > 1 else s.name: s for s in source.signals}
     for signal in signals.values():
@@ -144,9 +132,9 @@ def _with_header(arrays: NamedArrays, columns: Preset) -> NamedArrays:
     return dataclasses.replace(arrays, header=columns.header, values=values, notes=(*arrays.notes, note))
 
 
-def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Reading:
+def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> ReadColumns:
     if columns is None:
-        return Reading(arrays, layout.mapped)
+        return arrays, layout.mapped
     by_name = dict(zip(arrays.header, arrays.values, strict=True))
 
     def has_readings(name: str) -> bool:
@@ -159,9 +147,8 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     notes = (*arrays.notes, *notes, *weakened_field_notes(columns, by_name))
     read = map(columns.column_of, arrays.header)
     values = tuple(map(_decode_raw_numbers, read, arrays.values))
-    return Reading(
-        dataclasses.replace(arrays, values=values, notes=notes), presets_file.merge_columns(mapped, layout.mapped)
-    )
+    mapped = presets_file.merge_columns(mapped, layout.mapped)
+    return dataclasses.replace(arrays, values=values, notes=notes), mapped
 
 
 def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
@@ -194,7 +181,7 @@ def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
     )
 
 
-def _of_signals(source: Source, layout: Layout, columns: Preset | None, between: str) -> Reading:
+def _of_signals(source: Source, layout: Layout, columns: Preset | None, between: str) -> ReadColumns:
     """Columns of the signals with a meaning, and of some others."""
     signals = source.signals
 
@@ -243,7 +230,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
         (*source.notes, *more, *notes, *missing),
         source.digest,
     )
-    return Reading(arrays, mapped)
+    return arrays, mapped
 
 
 def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
