@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mmrjax.fidelities.steady import steady
 from mmrjax.model.conditions import Conditions
-from mmrjax.numerics.newton import FewUnknowns, root
+from mmrjax.numerics.newton import FewUnknowns, root, root_alone
 
 TOLERANCE = 1e-13
 
@@ -25,7 +25,7 @@ def circle(y, _, radius):
 
 
 def meeting_of(radius, linear):
-    return jnp.stack(root(circle, START, None, radius, TOLERANCE, circle if linear else None, linear)[0])
+    return jnp.stack(root(circle, START, None, radius, TOLERANCE, circle if linear else None)[0])
 
 
 meeting = partial(meeting_of, linear=False)
@@ -53,7 +53,7 @@ def test_root_finder_serves_optimistix():
     radius = jnp.asarray(2.3)
     found = optx.root_find(lambda y, of: circle(y, *of), FewUnknowns(atol=TOLERANCE), START, (None, radius))
     assert_allclose(found.value, exact(2.3), rtol=1e-13)
-    at, solved = root(circle, START, None, radius, TOLERANCE, None, False)
+    at, solved = root(circle, START, None, radius, TOLERANCE, None)
     assert_array_equal(found.value, at)
     assert solved and found.state.solved
 
@@ -65,15 +65,17 @@ def test_root_of_a_batch_is_that_of_its_members():
 
 
 def test_root_has_no_derivative_by_its_start():
-    sensitivity = jax.jacfwd(lambda s: root(circle, s, None, jnp.asarray(2.3), TOLERANCE, None, False)[0])(START)
+    sensitivity = jax.jacfwd(lambda s: root(circle, s, None, jnp.asarray(2.3), TOLERANCE, None)[0])(START)
     assert not np.any(sensitivity)
 
 
 def test_root_reports_members_without_one_and_harms_no_other():
     radii = jnp.asarray([1.0, jnp.nan, 2.0])
-    _, solved = jax.vmap(lambda r: root(circle, START, None, r, TOLERANCE, None, False))(radii)
+    _, solved = jax.vmap(lambda r: root(circle, START, None, r, TOLERANCE, None))(radii)
     assert solved.tolist() == [True, False, True]
-    nowhere = root(lambda y, _, a: (y[0] ** 2 + a,), START[:1], None, jnp.asarray(1.0), TOLERANCE, None, False)
+    alone, ended = jax.vmap(lambda r: root_alone(circle, START, None, r, TOLERANCE))(radii)
+    assert_allclose(jnp.stack(alone, 1)[ended], [exact(1.0), exact(2.0)], rtol=1e-13)
+    nowhere = root(lambda y, _, a: (y[0] ** 2 + a,), START[:1], None, jnp.asarray(1.0), TOLERANCE, None)
     assert not nowhere[1]
 
 
@@ -82,7 +84,7 @@ def test_root_derivative_is_zero_where_the_linearisation_is_singular():
         return y[0] - a, 0.0 * y[1]
 
     def at(a):
-        return jnp.stack(root(flat, START[1:], None, a, TOLERANCE, None, False)[0])
+        return jnp.stack(root(flat, START[1:], None, a, TOLERANCE, None)[0])
 
     assert jax.jacfwd(at)(1.0).tolist() == jax.jacrev(at)(1.0).tolist() == [0.0, 0.0]
 
@@ -92,7 +94,7 @@ def test_root_takes_data_shared_by_a_batch_or_of_its_members():
         return (slope * y[0] - height,)
 
     def crossing(slope, height):
-        return root(line, START[:1], slope, height, TOLERANCE, line, True)[0][0]
+        return root(line, START[:1], slope, height, TOLERANCE, line)[0][0]
 
     slope, heights = jnp.asarray(2.0), jnp.asarray([1.0, -3.0])
     assert_allclose(jax.vmap(crossing, (None, 0))(slope, heights), heights / 2, rtol=1e-15)

@@ -43,7 +43,7 @@ from mmrjax.model.signals import (
     State,
 )
 from mmrjax.numerics.linear_equations import Vector
-from mmrjax.numerics.newton import root
+from mmrjax.numerics.newton import root, root_alone
 from mmrjax.numerics.one_sided import clip
 from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import Unknowns
@@ -147,17 +147,17 @@ def _initial_guess(robot: Robot, conditions: Conditions) -> Vector:
     )
 
 
-def _solve_balances(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
-    """The root of the balances, and whether the search converged. Derivatives are implicit.
-
-    `large` selects the program for large batches. The other compiles sooner.
-    """
+def _search_arguments(robot: Robot, conditions: Conditions) -> tuple[Callable, Vector, Robot, Any, float]:
+    """Residuals, first guess, robot, a run's own inputs and tolerance, as `newton.root` takes them."""
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _conditions_are_sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_initial_guess(robot, sound))
-    inputs = conditions, travel_direction(robot, sound)
-    linear = _residuals_without_limit if large and not robot.effects else None
-    return root(_residuals, start, robot, inputs, tolerance, linear, large)
+    return _residuals, start, robot, (conditions, travel_direction(robot, sound)), tolerance
+
+
+def _solve_balances(robot: Robot, conditions: Conditions) -> tuple[Vector, Array]:
+    """The root of the balances, and whether the search converged. Derivatives are implicit."""
+    return root(*_search_arguments(robot, conditions), None if robot.effects else _residuals_without_limit)
 
 
 @compiled
@@ -357,8 +357,8 @@ def _settled_results(robot: Robot, conditions: Conditions) -> Result:
 def _solve_run(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Array, ""]]:
     if conditions.turns:
         return circling.solve_turn(robot, conditions)
-    unknowns, is_root = _solve_balances(robot, conditions, large=False)
-    return jax.lax.stop_gradient((jnp.stack(unknowns), is_root))
+    unknowns, is_root = root_alone(*_search_arguments(robot, conditions))
+    return jnp.stack(unknowns), is_root
 
 
 def _results_at_unknowns(
@@ -413,14 +413,13 @@ def _check_run(robot: Robot, conditions: Conditions, options: Mapping[str, float
     if conditions.turns and np.any(np.asarray(conditions.slope_deg) != 0):
         steepest = np.asarray(conditions.slope_deg).flat[int(np.argmax(np.abs(np.asarray(conditions.slope_deg))))]
         raise ValueError(
-            f"got a slope of {steepest:g} deg for a robot that turns: its heading changes there continuously, so it "
-            "has no steady state; follow it over time: --model drive"
+            f"got a slope of {steepest:g} deg for a robot that turns, so it has no steady state; use --model drive"
         )
     for k, (name, load) in enumerate(robot.configurations.items()):
         if np.any(np.asarray(load.torque_gravity) > 0) and np.any(np.asarray(conditions.configuration) == k):
             raise ValueError(
-                f"{name} has a torque of gravity that depends on its angle (torque_gravity above 0), so it has no "
-                "steady state; follow it over time: --model drive, and tables with a column time_s"
+                f"{name} has a gravity torque that depends on its angle, so it has no steady state; use --model "
+                "drive, and tables with time_s"
             )
 
 

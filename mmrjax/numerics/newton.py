@@ -21,6 +21,7 @@ import optimistix as optx
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
+from mmrjax.numerics import lanes
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
 from mmrjax.numerics.rarely import compute_if_needed
 
@@ -34,6 +35,8 @@ Function = Callable[[Vector, tuple[Any, Any]], tuple[Vector, Any]]
 MAX_STEPS = 60
 #: Turns of full steps before a search is bounded.
 PATIENCE = 8
+#: Members that turn together where each ends on its own: enough to fill vectors.
+TOGETHER = 64
 
 
 def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix, Vector]:
@@ -208,7 +211,6 @@ def root(
     own: Any,
     tolerance: float,
     linear: Residual | None,
-    apart: bool,
 ) -> tuple[Vector, Bool[Array, ""]]:
     """Solves f(y) = 0 by `FewUnknowns`, until every member of a batch has converged.
 
@@ -219,7 +221,7 @@ def root(
         shared, own: arguments of f other than y: data of all members of a batch and of each. Derivatives with respect
             to both are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero if
             ∂f/∂y is singular. The program holds no host callback.
-        tolerance, apart: as for `FewUnknowns`.
+        tolerance: as `FewUnknowns.atol`.
         linear: f in its usual branches, where it is linear in y, None if it has none. Its root is computed first, so
             that XLA fuses it over a batch with the code before and after. The search runs only for members in which
             that leaves |f| above the tolerance.
@@ -231,7 +233,7 @@ def root(
     own = jax.tree.map(jnp.asarray, own)
 
     def search(start: Vector, shared: Any, own: Any) -> tuple[Vector, Array]:
-        method: Any = FewUnknowns(atol=tolerance, apart=apart)
+        method: Any = FewUnknowns(atol=tolerance, apart=True)
         solution: optx.Solution = optx.root_find(
             function, method, start, (shared, own), has_aux=True, max_steps=MAX_STEPS, throw=False
         )
@@ -239,10 +241,27 @@ def root(
 
     if linear is None:
         return search(start, shared, own)
-    jacobian, value = _linearised(_function(linear), start, (shared, own), apart)
+    jacobian, value = _linearised(_function(linear), start, (shared, own), True)
     y = _subtract_step(start, _solve_step(factorise(jacobian), value))
     solved = _is_small(residual(y, shared, own), tolerance)
     return compute_if_needed(~solved, search, (y, shared, own), (y, solved))
+
+
+def root_alone(residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float) -> tuple[Vector, Array]:
+    """`root` without derivatives, by a program of a third of the size.
+
+    In a batch each member ends on its own. One without a root takes every turn, but does not delay the others.
+    """
+    method, function = FewUnknowns(atol=tolerance), _function(residual)
+    found: tuple[Vector, Array] = lanes.loop_until(
+        lambda given: method.init(function, given[0], given[1:], {}, None, None, frozenset()),
+        lambda given, state: method.step(function, state.y, given[1:], {}, state, frozenset())[1],
+        lambda state: state.solved | (state.turns >= MAX_STEPS),
+        (start, shared, own),
+        lambda state: (state.y, state.solved),
+        TOGETHER,
+    )
+    return found
 
 
 def _function(residual: Residual) -> Function:
@@ -251,12 +270,12 @@ def _function(residual: Residual) -> Function:
 
 @root.def_jvp
 def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tuple[Any, None]]:
-    residual, start, shared, inputs, tolerance, linear, apart = primals
-    y, solved = root(residual, start, shared, inputs, tolerance, linear, apart)
+    residual, start, shared, inputs, tolerance, linear = primals
+    y, solved = root(residual, start, shared, inputs, tolerance, linear)
     input_change = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, inputs), tangents[2:4])[1]
     if input_change is None or all(m is None for m in input_change):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, inputs), apart)[0]))
+    factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, inputs), True)[0]))
     step = substitute(factors, input_change)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)

@@ -55,8 +55,9 @@ LOAD = "output_torque_Nm"
 CONTRADICTION = 6.0
 #: The same for replicates with unknown sd, as a share of their mean.
 CONTRADICTION_SHARE = 0.25
-#: Searches that run together on a core: for a robot without effects, and with effects.
-MANY, FEW = 16, 4
+#: Searches that run together on a core: for a robot without effects, and with effects. Rows of the latter, because
+#: searches wait for the slowest.
+MANY, FEW, FEW_ROWS = 16, 4, 1024
 #: Least spread of a fitted speed or current, over its largest value, for curves over it [-].
 VARIES = 0.05
 #: Least size of the torque at the output as a share of the motors' torque [-].
@@ -189,7 +190,7 @@ class SettledRuns(Observer):
                     )
                 )
         if remarks and len(alike) == 1:
-            raise BadData(f"{describe(remarks[0])}; no condition varies, so nothing can be fitted")
+            raise BadData(f"{describe(remarks[0])}; no condition varies")
         whole_table = runs.whole
         thinned = (
             []
@@ -366,7 +367,7 @@ class SettledRuns(Observer):
 
         Fewer if effects make the model costly, so that few searches wait for the slowest.
         """
-        return FEW if problem.base.effects else MANY
+        return max(1, min(FEW, FEW_ROWS // len(problem.data.measured))) if problem.base.effects else MANY
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
