@@ -52,7 +52,8 @@ DRIVERS: dict[str, tuple[str, ...]] = {
     "commutation_spark": ("current", "speed"), "commutation_lag": ("speed", "load"),
     "grease_thinning": ("speed", "load"), "mixed_mesh": ("load", "speed"), "tight_side_flexing": ("load", "speed"),
     "guide_glide": ("speed", "weight"), "rear_hysteresis": ("slope", "speed"), "top_heavy": ("slope", "load"),
-    "hop": ("speed", "load"), "tread_heating": ("demand", "speed"), "order_two": ("order 2",), "warming": ("time",),
+    "hop": ("speed", "load"), "tread_heating": ("demand", "speed"), "warming": ("time",),
+    "order_two": ("order 2 of the driving shaft",),
     "supply_recovery": ("time",),
 }  # fmt: skip
 #: Laws of `DRIVERS` with one variable but two words for it.

@@ -29,9 +29,11 @@ INTERRUPTED = 130
 app = typer.Typer(
     name="mmrjax", add_completion=False, pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    help="Simulate the drive and running gear of a small robot, and compare the model with measured data.\n\n"
-    "[bold]Exit codes[/bold]: 0 done, whatever the answer. 1 internal error. 2 usage or configuration. 3 done, but a "
-    "solver failed. 4 bad data. 130 interrupted, and the same command continues.",
+    help=(
+        "Simulate a small robot's drive and compare it with measured data.\n\n[bold]Exit codes[/bold]: 0 done, "
+        "whatever the answer. 1 internal error. 2 usage or configuration. 3 done, but a solver failed. 4 bad "
+        "data. 130 interrupted, and the same command continues."
+    ),
 )  # fmt: skip
 
 
@@ -58,7 +60,7 @@ _Effects = Annotated[
 ]
 _Columns = Annotated[
     str | None,
-    typer.Option("--columns", help="Preset or preset file for the column names of the data (docs/howto/formats.md)."),
+    typer.Option("--columns", help="Preset for the column names, or its file (docs/howto/formats.md)."),
 ]
 
 
@@ -70,7 +72,7 @@ def _command(
     common: str,
     example: str,
     room: str = "",
-    failure: str = "the solver failed at some runs (status failed). Runs that stall or slide give 0",
+    failure: str = "the solver failed at some runs. Runs that stall or slide give 0",
     resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[[], None]], None]:
     """Decorator for the name and help of a command whose options are the fields of two configurations.
@@ -251,8 +253,9 @@ def render() -> None:
     group=DATA,
     common="robot columns noise prior free fix verbose out",
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
-    failure="the fit, or a fit with a block left out, did not converge, or the solver failed for a row. An "
-    "inadequate fit, or a row in which the robot slides, gives 0",
+    failure=(
+        "a fit did not converge, or the solver failed for a row. An inadequate fit, or a row that slides, gives 0"
+    ),
 )
 def calibrate() -> None:
     """Fit parameters to measured runs, with intervals.
@@ -273,7 +276,7 @@ def calibrate() -> None:
     common="robot columns shortest drift out",
     example="mmrjax settle log.csv --robot rig.toml --out settled, then "
     "mmrjax loop settled/settled.csv --robot rig.toml",
-    failure="does not occur, since no equations are solved",
+    failure="does not occur",
 )
 def settle() -> None:
     """Extract the settled runs of a log as a table.
@@ -290,8 +293,10 @@ def settle() -> None:
     group=DATA,
     common="robot columns noise prior forbid within verbose out",
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
-    failure="the proposed fit did not converge, or --within ran out before a verdict (the same command with more "
-    "time continues). Every verdict gives 0",
+    failure=(
+        "the proposed fit did not converge, or --within ran out before a verdict (the same command continues). "
+        "Every verdict gives 0"
+    ),
 )
 def loop() -> None:
     """Find the effect that the model lacks, and add it.
@@ -343,7 +348,7 @@ def resonance() -> None:
     group=MODEL,
     common="robot step stairs gap find levers-front levers-rear out",
     example="mmrjax climb --step 120 --levers-front 45 --levers-rear -8.5 --voltage 6; mmrjax climb --find step",
-    failure="the simulation broke down (verdict failed). A robot that does not get over the obstacle gives 0",
+    failure="the simulation broke down. A robot that does not get over gives 0",
 )
 def climb() -> None:
     """Simulate a climb over a step, stairs, a gap or a terrain.
@@ -361,7 +366,7 @@ def climb() -> None:
     group=DESIGN,
     common="robot set changes out",
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
-    failure=f"{_AT_CORNER}. If only a requirement is missed, the code is 0",
+    failure=f"{_AT_CORNER}. A missed requirement gives 0",
 )
 def check() -> None:
     """Check a robot against requirements.
@@ -377,7 +382,7 @@ def check() -> None:
     group=DESIGN,
     common="robot objective pareto motors verbose out",
     example="mmrjax size requirements.toml --pareto mass,energy",
-    failure=f"{_AT_CORNER} of the best design. If no design meets all requirements, the code is 0",
+    failure=f"{_AT_CORNER} of the best design. Missed requirements give 0",
 )
 def size() -> None:
     """Choose motor, gearbox and cells that meet requirements.
@@ -393,7 +398,7 @@ def size() -> None:
     group=ELSEWHERE,
     common="to data configuration joint out",
     example="mmrjax export found/robot.toml --to mujoco --data runs.csv --out exported",
-    failure="does not occur: runs that do not settle are left out of the comparison",
+    failure="does not occur",
     room="export_drive",
 )
 def export() -> None:
@@ -407,7 +412,7 @@ def export() -> None:
 
 rig = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich",
-    help="Describe your own bench or robot in a file, and check it.",
+    help="Describe your bench or robot in a file.",
 )  # fmt: skip
 app.add_typer(rig, name="rig", rich_help_panel=DATA)
 
@@ -425,22 +430,20 @@ def new(
     kind: Annotated[
         str | None,
         typer.Option(
-            help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  \\[default: from the load "
-            "on the joint of --from, else bench]"
+            help=(
+                "tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  \\[default: from the "
+                "joint of --from, else bench]"
+            )
         ),
     ] = None,
-    source: Annotated[Path | None, typer.Option("--from", help="URDF or MuJoCo model with the driven joint.")] = None,
-    joint: Annotated[
-        str | None, typer.Option(help="Name of the revolute joint.  \\[default: the only driven one]")
-    ] = None,
+    source: Annotated[Path | None, typer.Option("--from", help="URDF or MuJoCo model.")] = None,
+    joint: Annotated[str | None, typer.Option(help="The revolute joint.  \\[default: the only driven one]")] = None,
     from_sheet: Annotated[
         bool,
-        typer.Option(
-            "--from-sheet", help="Read the data of a motor. The options below imply it.", rich_help_panel=_SHEET
-        ),
+        typer.Option("--from-sheet", help="Read a motor. The options below imply it.", rich_help_panel=_SHEET),
     ] = False,
     voltage: Annotated[
-        str | None, typer.Option(help="Voltage to which the data below refer: V or mV.", rich_help_panel=_SHEET)
+        str | None, typer.Option(help="Voltage of the data below: V or mV.", rich_help_panel=_SHEET)
     ] = None,
     no_load_speed: Annotated[
         str | None, typer.Option(help="No-load speed: rpm, 1/min or rad/s.", rich_help_panel=_SHEET)
@@ -456,7 +459,7 @@ def new(
     resistance: Annotated[
         str | None, typer.Option(help="Terminal resistance: ohm or mohm.", rich_help_panel=_SHEET)
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file.")] = False,
 ) -> int:
     """Write a rig's file to fill in.
 
@@ -483,7 +486,7 @@ def rig_check(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The rig's file.")],
     data: Annotated[
         str | None,
-        typer.Argument(metavar="[DATA]", help="Table of runs or log, in any format (docs/howto/formats.md)."),
+        typer.Argument(metavar="[DATA]", help="Table or log (docs/howto/formats.md)."),
     ] = None,
     columns: _Columns = None,
     effects: _Effects = None,
@@ -510,7 +513,7 @@ def rig_check(
     "inspect", rich_help_panel=DATA, epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json"
 )
 def inspect_file(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Data file. ::PATH selects a part of it.")],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Data file. ::PATH selects a part.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of text.")] = False,
 ) -> int:
     """List the signals of a data file, and propose column names.
@@ -526,10 +529,7 @@ def inspect_file(
 def explain(
     name: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Effect, status, flag, output, channel, parameter or word of a report. Without a "
-            "name, all are listed."
-        ),
+        typer.Argument(help="Effect, status, flag, output, channel, parameter or word of a report. None: list all."),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,

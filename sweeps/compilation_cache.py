@@ -38,17 +38,14 @@ def cache_location() -> Path | None:
         path = path.expanduser()
     except RuntimeError:  # nobody's home
         return None
-    return path / f"xla-{importlib.metadata.version('jaxlib')}-{_processor()}"
-
-
-def _processor() -> str:
-    """Short hash of the processor features that native code depends on."""
+    # Native code depends on the features of the processor.
     try:
         flags = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
     except OSError:
         flags = []
     kind = " ".join([platform.machine(), platform.processor(), *flags])
-    return f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
+    processor = f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
+    return path / f"xla-{importlib.metadata.version('jaxlib')}-{processor}"
 
 
 def keep_programs() -> Path | None:
@@ -104,8 +101,7 @@ def _is_unsafe(folder: str) -> bool:
         from sweeps.console import print_message
 
         print_message(
-            f"compiled programs are not cached: {reason}. Set {VARIABLE} to a folder of your own, or remove write "
-            "access for others (chmod go-w)"
+            f"compiled programs are not cached: {reason}. Set {VARIABLE} to a folder of yours, or chmod go-w it"
         )
     return bool(reason)
 

@@ -77,7 +77,7 @@ class RobotPart(Part):
         {}, "Change a parameter (SI units). May be repeated: 6T2A.ground.friction.static=0.6"
     )
     effects: Names = option_field(
-        (), "Python file with your own effects. Its code is run. May be repeated", verbatim=True, executes=True
+        (), "Python file with effects. Its code is run. May be repeated", verbatim=True, executes=True
     )
 
 
@@ -97,18 +97,14 @@ class VerbosePart(FolderPart):
 class Measured(FolderPart):
     """Measured data of a command."""
 
-    data: str = option_field(
-        "measured", "Measured runs or logs in any format, or measured (packaged runs)", argument=True
-    )
+    data: str = option_field("measured", "Runs or logs in any format, or measured (packaged)", argument=True)
 
 
 class ComparedRuns(Measured):
     """Data of `compare`."""
 
-    data: str = option_field(
-        "measured", "Measured runs in any format, or measured, or simulated_by_paper", argument=True
-    )
-    own_mass: bool = option_field(False, "Use the robot's own mass and the payload, not the total mass in the table")
+    data: str = option_field("measured", "Runs in any format, measured, or simulated_by_paper", argument=True)
+    own_mass: bool = option_field(False, "Use the robot's mass and the payload, not total_mass_kg")
 
 
 class SettledLog(FolderPart):
@@ -116,7 +112,7 @@ class SettledLog(FolderPart):
 
     data: str = option_field(
         ...,
-        "Log over time in any format, with time_s, the imposed quantity and channels",
+        "Log in any format, with time_s, the imposed quantity and channels",
         argument=True,
         metavar="LOG",
     )
@@ -127,8 +123,7 @@ class DataPart(Part):
 
     columns: str | None = option_field(
         None,
-        f"Meaning of the columns: a preset ({', '.join(presets_file.PACKAGED)}; with its numbers, such as "
-        "vesc,pole_pairs=7) or a preset file",
+        f"Column names: a preset ({', '.join(presets_file.PACKAGED)}, with numbers: vesc,pole_pairs=7) or its file",
         usual="[columns] of the robot's file",
     )
 
@@ -213,7 +208,7 @@ class BatchPart(FidelityPart):
 
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None,
-        "Number of runs that are simulated together",
+        "Runs simulated together",
         usual=", ".join(f"{name} {facts.at_once(accelerator=False)}" for name, facts in fidelities.TABLE.items())
         + " on processors",
     )
@@ -222,9 +217,9 @@ class BatchPart(FidelityPart):
 class SupplyPart(Part):
     """Supply of the motors."""
 
-    battery: bool = option_field(False, "Supply the robot from its battery")
+    battery: bool = option_field(False, "Use the robot's battery")
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = option_field(
-        0.0, "Charge already taken from the battery"
+        0.0, "Charge taken from the battery before"
     )
 
     @model_validator(mode="after")
@@ -238,7 +233,7 @@ class SupplyPart(Part):
         return self
 
 
-SURFACE = "Surface of Table 5, which scales the adhesion of lacquered_wood. For a rig, one of its own surfaces"
+SURFACE = "Surface of Table 5, or one of the rig's"
 
 
 def _values_text(values: Iterable[float]) -> str:
@@ -251,9 +246,7 @@ class OneRun(Part):
     The run itself checks its values (`inputs.one_run`), like a row of a table.
     """
 
-    configuration: str | None = option_field(
-        None, "Configuration of the robot, such as 6T2A or 4W2T", usual="its first"
-    )
+    configuration: str | None = option_field(None, "Configuration, such as 6T2A or 4W2T", usual="its first")
     supply_voltage_V: float | None = option_field(
         None,
         "Supply voltage (V), negative in reverse",
@@ -266,18 +259,16 @@ class OneRun(Part):
     slope_deg: float | None = option_field(None, "Slope, positive uphill", usual="0")
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
     total_mass_kg: float | None = option_field(
-        None, "Total mass", usual="the robot's own mass and the payload", flag="--mass"
+        None, "Total mass", usual="the robot's mass and the payload", flag="--mass"
     )
     levers_front_deg: float | None = option_field(
         None,
         "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
         usual="the robot's",
     )
-    levers_rear_deg: float | None = option_field(
-        None, "Angle of the rear levers, with the same convention", usual="the robot's"
-    )
+    levers_rear_deg: float | None = option_field(None, "Angle of the rear levers, likewise", usual="the robot's")
     load_torque_Nm: float | None = option_field(
-        None, "Brake torque at the output of each drive (N·m), for loads on a shaft",
+        None, "Brake torque at each output (N·m), for a shaft",
         usual="none"
     )  # fmt: skip
 
@@ -290,14 +281,14 @@ class OneRun(Part):
 class GivenRuns(OneRun, FolderPart):
     """Runs of `simulate`: one run from options, or those in a file."""
 
-    runs: Path | None = option_field(None, "CSV of runs to simulate instead")
+    runs: Path | None = option_field(None, "CSV of runs to simulate")
 
     @model_validator(mode="after")
     def _once(self) -> Self:
         if self.runs is not None and self.stated:
             raise PydanticCustomError(
-                "idle", f"{', '.join(f'`{name}`' for name in self.stated)}: not allowed with `runs`, whose "
-                        "columns give the conditions of each run; give it there, or omit `runs`",
+                "idle", f"{', '.join(f'`{name}`' for name in self.stated)}: not allowed with `runs`; give it as a "
+                    "column there, or omit `runs`",
             )  # fmt: skip
         return self
 
@@ -319,21 +310,21 @@ class AxesPart(Part):
     """
 
     configurations: Several[str] | None = option_field(
-        None, "Configurations of the robot, comma-separated", usual="all configurations"
+        None, "Configurations, comma-separated", usual="all configurations"
     )
     voltages_V: Several[Voltage] | None = option_field(
         None,
-        "Supply voltages (V). The default for a rig is thirds of its voltage_limit",
+        "Supply voltages (V). Default of a rig: thirds of voltage_limit",
         usual=_values_text(VOLTAGES_V),
     )
     motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
         None, "Imposed motor speeds (rpm)", usual="thirds of speed_limit"
     )
     payloads_kg: Several[Payload] | None = option_field(
-        None, "Additional load masses (kg), 0 for a rig", usual=_values_text(PAYLOADS_KG)
+        None, "Additional load masses (kg)", usual=_values_text(PAYLOADS_KG)
     )
     slopes_deg: Several[Slope] | None = option_field(
-        None, "Slopes (deg), positive uphill. The default for a rig is 0", usual=_values_text(SLOPES_DEG)
+        None, "Slopes (deg), positive uphill. Default of a rig: 0", usual=_values_text(SLOPES_DEG)
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
 
@@ -343,7 +334,7 @@ class GridPart(AxesPart):
 
     motor_currents_A: Several[MotorCurrent] | None = option_field(None, "Imposed currents per motor (A)")
     load_torques_Nm: Several[LoadTorque] | None = option_field(
-        None, "Brake torques at the output of each drive (N·m), for loads on a shaft", usual="none"
+        None, "Brake torques at each output (N·m), for a shaft", usual="none"
     )
 
 
@@ -355,12 +346,11 @@ class InferencePart(Part):
     )
     noise: str = option_field(
         "",
-        "Standard deviations of current, motor_speed and speed in % or in A, rpm, mm/s: current=2%,speed=5mm/s",
-        usual="from the file's columns. Otherwise estimated. For settled rows without series, the loop assumes 2, "
-        "0.5 and 1 %",
+        "Standard deviations in % or in A, rpm, mm/s: current=2%,motor_speed=10rpm,speed=5mm/s",
+        usual="from the columns, else estimated. Settled rows without series in the loop: 2, 0.5 and 1 %",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used. Larger data are thinned evenly"
+        ROWS, "Most rows used. Larger data are thinned evenly"
     )
     seed: Seed = option_field(0, "Random seed")
 
@@ -386,12 +376,12 @@ class LoopBeside(FittedRuns):
 class TurnPart(Part):
     """Separate commands for the left and right sides of the robot. None: both sides get the same command."""
 
-    left_V: Voltage | None = option_field(None, "Voltage of the left motor (V), together with --right")
+    left_V: Voltage | None = option_field(None, "Voltage of the left motor (V), with --right")
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
-    duty_left: Duty | None = option_field(None, "Duty of the left motor (share of the supply voltage)")
+    duty_left: Duty | None = option_field(None, "Duty of the left motor")
     duty_right: Duty | None = option_field(None, "Duty of the right motor")
     speed_m_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Speed of the settled turn (m/s), together with --yaw-rate"
+        None, "Speed of the settled turn (m/s), with --yaw-rate"
     )
     yaw_rate_rad_s: Annotated[float, number_between(-100, 100)] | None = option_field(
         None, "Yaw rate of the settled turn (rad/s), positive to the left"
@@ -419,8 +409,7 @@ class TurnPart(Part):
         if len(side_options) > 1:
             raise PydanticCustomError(
                 "idle",
-                f"`{side_options[0]}` cannot be combined with `{side_options[1]}`; give voltages, duties, or speed "
-                "and yaw rate",
+                f"`{side_options[0]}` cannot be combined with `{side_options[1]}`; give one pair",
             )
         return self
 
@@ -429,7 +418,7 @@ class PosteriorPart(Part):
     """Uncertainty of results from the posterior of a calibrated robot."""
 
     posterior: Annotated[int, Field(ge=10, le=100_000)] | None = option_field(
-        None, "Report results with ±, from this many draws from the posterior.nc of --robot"
+        None, "Report ± from this many draws of --robot's posterior.nc"
     )
 
 
@@ -437,7 +426,7 @@ class OutputPart(Part):
     """Files written in addition to the numbers."""
 
     report: bool = option_field(True, "Write report.html")
-    table: Literal["csv", "parquet"] = option_field("csv", "Format of tables: CSV only, or Parquet as well")
+    table: Literal["csv", "parquet"] = option_field("csv", "Format of tables: CSV, or Parquet as well")
 
 
 class ProfilePart(FidelityPart):
@@ -445,11 +434,10 @@ class ProfilePart(FidelityPart):
 
     profile: Annotated[str, Field(min_length=1)] | None = option_field(
         None,
-        "A mission over time, as a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
-        "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left and "
-        "duty_right, "
-        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed. Or one of stair, stop_and_go, shuttle, "
-        "patrol (docs/reference/profiles.md)",
+        "Mission: a CSV with time_s and any of speed_mm_s, motor_speed_rpm, duty, mode, supply_voltage_V, "
+        "slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left and duty_right, "
+        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed. Or one of stair, stop_and_go, "
+        "shuttle, patrol (docs/reference/profiles.md)",
     )
 
     @model_validator(mode="before")
@@ -466,8 +454,7 @@ class ProfilePart(FidelityPart):
         if self.model != PROFILED:
             raise PydanticCustomError(
                 "idle",
-                f"`profile` has an effect only with `model` {PROFILED}, which simulates a profile; got "
-                f"`model` {self.model}",
+                f"`profile` has an effect only with `model` {PROFILED}; got {self.model}",
             )
         if self.duration_s is not None:
             raise PydanticCustomError(
@@ -515,9 +502,7 @@ class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, PosteriorPart, OutputPar
 class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
-    against: str | None = option_field(
-        None, "Second robot, simulated on the same rows", metavar="ROBOT.toml", format="path"
-    )
+    against: str | None = option_field(None, "Second robot on the same rows", metavar="ROBOT.toml", format="path")
 
 
 class Render(RobotPart, FidelityPart, SupplyPart):
@@ -531,7 +516,7 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
-        None, "Length of a run (s). Ripple is evaluated in its second half", usual="1.5", minimum=0.5
+        None, "Length of a run (s). Its second half shows the ripple", usual="1.5", minimum=0.5
     )
     configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     voltages_V: Several[Voltage] = option_field(
@@ -543,7 +528,7 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     payloads_kg: Several[Payload] = option_field(PAYLOADS_KG, "Additional load masses")
     slope_deg: Slope = option_field(0.0, "Slope, positive uphill")
     surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
-        BENCH, "Surface of Table 5, which scales the adhesion"
+        BENCH, "Surface of Table 5"
     )
 
 
@@ -559,20 +544,20 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
     gap_mm: Height | None = option_field(None, "Width of a trench")
     terrain: Path | None = option_field(
-        None, "CSV of a ground profile (polyline) with columns x_m and z_m, or x_mm and z_mm", format="path"
+        None, "CSV of the ground with columns x_m and z_m, or x_mm and z_mm", format="path"
     )
-    nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Radius of the edges of a step or stairs")
+    nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Edge radius of steps and stairs")
     levers_front_deg: Angle | None = option_field(
         None,
         "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
         usual="from the robot's file",
     )
     levers_rear_deg: Angle | None = option_field(
-        None, "Angle of the rear levers, with the same convention", usual="from the robot's file"
+        None, "Angle of the rear levers, likewise", usual="from the robot's file"
     )
     sequence: Path | None = option_field(
         None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg. "
-              "Or front_V and rear_V, voltages of the lever motors, starting from the given angles",
+            "Or front_V and rear_V, voltages of the lever motors",
         format="path",
     )  # fmt: skip
     levers_voltage_V: Annotated[float, positive_number(1e6)] | None = option_field(
@@ -581,16 +566,16 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
     payload_kg: Payload = option_field(0.0, "Additional load mass")
     surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
-        BENCH, "Surface of Table 5, which scales the adhesion"
+        BENCH, "Surface of Table 5"
     )
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None,
-        "Search for the largest obstacle that the robot gets over. For stairs: largest rise at the tread of --stairs",
+        "Find the largest obstacle. For stairs: largest rise at the tread of --stairs",
     )
     derivatives: Names = option_field(
         (),
-        "Also compute derivatives with respect to these, comma-separated: any parameter, adhesion, payload, voltage "
-        "(with --battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
+        "Compute derivatives by these, comma-separated: any parameter, adhesion, payload, voltage (with "
+        "--battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
     duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
     time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step")
@@ -602,7 +587,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         ]
         if len(obstacle_options) > 1:
             raise PydanticCustomError(
-                "idle", f"`{obstacle_options[0]}` and `{obstacle_options[1]}` are both given; keep one obstacle"
+                "idle", f"`{obstacle_options[0]}` and `{obstacle_options[1]}` are both given; keep one"
             )
         if not obstacle_options and self.find is None:
             raise PydanticCustomError(
@@ -632,23 +617,18 @@ class FeedforwardPart(Part):
 
     feedforward: Literal["simple", "elevator", "arm"] | None = option_field(
         None,
-        "Fit kS, kV, kA (and kG) of this mechanism instead of a robot, and compute feedback gains "
-        "(docs/howto/wpilib.md)",
+        "Fit kS, kV, kA (and kG) of this mechanism, with gains (docs/howto/wpilib.md)",
         usual="no",
     )
     unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
-        None, "Unit of the position in kV and kA, with --feedforward", usual="rotation; for a travel m"
+        None, "Unit of position in kV and kA", usual="rotation; for a travel m"
     )
-    position_error: Annotated[float, positive_number(1e6)] = option_field(
-        1.0, "Largest acceptable position error, for the gains [unit]"
-    )
-    velocity_error: Annotated[float, positive_number(1e6)] = option_field(
-        1.5, "Largest acceptable velocity error, for the gains [unit/s]"
-    )
+    position_error: Annotated[float, positive_number(1e6)] = option_field(1.0, "Acceptable position error [unit]")
+    velocity_error: Annotated[float, positive_number(1e6)] = option_field(1.5, "Acceptable velocity error [unit/s]")
     effort_V: Annotated[float, positive_number(1e4)] = option_field(7.0, "Largest voltage of the feedback (V)")
     period_s: Annotated[float, positive_number(10)] = option_field(0.02, "Period of the controller (s)")
     measurement_delay_s: Annotated[float, number_between(0, 10)] | None = option_field(
-        None, "Delay of the measured position and velocity (s)", usual="from the log"
+        None, "Delay of the measurement (s)", usual="from the log"
     )
 
 
@@ -665,26 +645,24 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = option_field(
         None,
-        "Members of each generation of the gradient-free search",
+        "Members of a gradient-free search",
         usual="256 if the running gear is fitted, else 0",
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Largest number of generations of the population", usual="30"
+        None, "Most generations of the population", usual="30"
     )
-    profiles: bool | None = option_field(
-        None, "Compute the profile likelihood of each parameter", usual="for steady, except turns"
-    )
-    hold_out: bool | None = option_field(None, "Refit with each block of runs left out in turn", usual="steady only")
+    profiles: bool | None = option_field(None, "Compute profile likelihoods", usual="for steady, except turns")
+    hold_out: bool | None = option_field(None, "Refit with each block of runs left out", usual="steady only")
 
 
 class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
     shortest_s: Annotated[float, positive_number(3600)] | None = option_field(
-        None, "Shortest stretch that counts as settled", usual="0.3, and at least 20 samples"
+        None, "Shortest settled stretch", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
-        0.02, "Largest change of a channel's mean within a stretch, as a fraction of the mean"
+        0.02, "Largest change of a mean within a stretch, as a fraction"
     )
 
 
@@ -701,13 +679,11 @@ class Export(RobotPart, OutputPart):
     to: Literal["mujoco", "jax", "onnx", "mjlab", "table", "randomization"] = option_field(
         "mujoco", "Format (docs/howto/export.md)"
     )
-    data: str | None = option_field(
-        None, "Runs or log to compare the exported drive with", usual="a grid without readings"
-    )
+    data: str | None = option_field(None, "Runs or log to compare with", usual="a grid without readings")
     configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
-    joint: str = option_field("drive", "Name of the joint in the simulator's model, for mujoco")
+    joint: str = option_field("drive", "Name of the joint, for mujoco")
     draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(
-        1000, "Number of samples from the posterior, for randomization"
+        1000, "Samples from the posterior, for randomization"
     )
     seed: Seed = option_field(0, "Random seed of the samples")
 
@@ -716,29 +692,28 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of the closed loop."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = option_field(
-        500, "Number of bootstrap tables. Time histories use at least 333"
+        500, "Bootstrap tables. Time histories use at least 333"
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "Criterion for the first of several indistinguishable effects: misfit, or error on held-out blocks",
+        "Order of indistinguishable effects: by misfit, or by held-out error",
     )
     forbid: Names = option_field(
-        (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', or a configuration"
+        (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', a configuration"
     )
     resolve: bool = option_field(
         False,
-        "Test with the track model whether a different running gear explains the remaining error. Takes tens of "
-        "minutes",
+        "Test if another running gear explains the remaining error. Takes tens of minutes",
     )
     population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
-        None, "Members of each generation of the search for --resolve", usual="128"
+        None, "Members of the search of --resolve", usual="128"
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Largest number of generations for --resolve", usual="20"
+        None, "Most generations of --resolve", usual="20"
     )
     model: Path | None = option_field(
         None,
-        "MuJoCo model with several joints. The loop runs for each, with the model's torque as its load",
+        "MuJoCo model of several joints, whose torques are their loads",
     )
     joints: Names = option_field((), "Joints of --model, comma-separated, or all")
 
@@ -765,14 +740,14 @@ class RequirementsPart(Part):
 class Check(RequirementsPart, RobotPart, OutputPart):
     """A check of a robot against requirements."""
 
-    changes: bool = option_field(True, "Search for changes that meet the missed requirements")
+    changes: bool = option_field(True, "Find changes that meet missed requirements")
 
 
 class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
     objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m) or cost (EUR)")
-    pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front instead")
+    pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front")
     motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all in the catalogue")
     starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Number of searches")
     seed: Seed = option_field(0, "Random seed of the starts")
@@ -799,7 +774,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
-        None, "Smallest total number of model evaluations", usual="1000000; for runs over time 100000"
+        None, "Least number of model evaluations", usual="1000000; for runs over time 100000"
     )
     seed: Seed = option_field(0, "Random seed of the sample")
     posterior: bool = option_field(False, "Use the posterior.nc of the calibrated --robot as inputs")

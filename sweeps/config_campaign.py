@@ -92,19 +92,11 @@ class StoreOptions(FolderPart):
     plan: Path | None = option_field(
         None, "TOML file with [axes] or [samples] (docs/reference/plans.md)", argument=True, metavar="[CONFIG.toml]"
     )
-    zarr: bool = option_field(False, "Write a Zarr store even for a small grid")
-    outputs: Names = option_field(
-        (), "Outputs to store for each point, comma-separated", usual="the channels of its instruments"
-    )
-    dry_run: bool = option_field(
-        False, "Print the number of points and chunks, the size and the expected time, and write nothing"
-    )
-    export: tuple[Literal["csv", "parquet"], ...] = option_field(
-        (), "Also write the store as csv or parquet. May be repeated"
-    )
-    shard: str | None = option_field(
-        None, "Simulate the i-th of n shares, such as 3/8, in one process of a job array"
-    )
+    zarr: bool = option_field(False, "Write a Zarr store for small grids too")
+    outputs: Names = option_field((), "Outputs to store, comma-separated", usual="the channels of its instruments")
+    dry_run: bool = option_field(False, "Print points, chunks, size and expected time, and write nothing")
+    export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. May be repeated")
+    shard: str | None = option_field(None, "Simulate the i-th of n shares, such as 3/8, in a job array")
     scheduler: str | None = option_field(
         None,
         "Address of a dask scheduler, such as tcp://host:8786",
@@ -119,9 +111,7 @@ class StoreOptions(FolderPart):
                 "idle", f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8"
             )
         if self.shard is not None and self.scheduler is not None:
-            raise PydanticCustomError(
-                "idle", "`shard`: not allowed with `scheduler`, which distributes the chunks; give one of them"
-            )
+            raise PydanticCustomError("idle", "`shard`: not allowed with `scheduler`; give one of them")
         return self
 
     @property

@@ -10,7 +10,7 @@ from calibration.data import Json, Names, effect_file, posterior_file, robot_fil
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced_levers
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
@@ -45,16 +45,16 @@ def load_robot(config: RobotPart) -> RobotFile:
         type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
     ):
         raise BadConfiguration(
-            f"--robot {file.name}: its controller follows a goal over time, which this command does not simulate; "
-            "use calibrate, compare, loop or rig check with a log, export, or mmrjax.simulate in Python"
+            f"--robot {file.name}: its controller follows a goal over time; use calibrate, compare, loop or rig "
+            "check with a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         wide_words = f"± {100 * stated.EXAMPLE_SHARE:g} %"
         notes.append(
-            f"{file.name}: these values are still example numbers of the template: {examples}. The fit widens each ± "
-            f"among them to {wide_words}"
+            f"{file.name}: still example numbers of the template: {examples}. The fit widens each ± among them "
+            f"to {wide_words}"
         )
     for note in (*notes, *unlike):
         print_message(note)
@@ -67,7 +67,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     if (
         resolves and runs and not capabilities.states_running_gear(robot)
     ):  # otherwise the model itself would be rejected
-        print_message("the robot's file has no running_gear: wheelbase, belt and internal masses are example values")
+        print_message("the robot's file has no running_gear: its wheelbase, belt and masses are examples")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
 
@@ -92,8 +92,7 @@ def posterior_beside_robot(file: RobotFile) -> Posterior:
     """
     if Path(file.source).suffix != ".toml":
         raise BadConfiguration(
-            f"--posterior: {file.source} has no posterior; expected --robot FOLDER/robot.toml, written by "
-            "calibrate or loop"
+            f"--posterior: {file.source} has no posterior; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
     path = Path(file.source).with_name(posterior_file.FILE)
     posterior = posterior_file.read_posterior(path)
@@ -114,11 +113,7 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
         BadConfiguration: the robot does not have it. The message has `where` and the robot's configurations.
     """
     for name in names:
-        if name not in robot.configurations:
-            raise BadConfiguration(
-                f"{where}: got {name}; the robot has no such configuration; "
-                f"{allowed_words(name, robot.configurations)}"
-            )
+        stated_word(name, robot.configurations, where, f"got {name}; the robot has no such configuration")
 
 
 def check_surface(robot: Robot, names: Collection[str], surface: str | None) -> None:

@@ -137,7 +137,7 @@ class Folder:
         elif not force:
             hint = "--force replaces a run folder"
         elif (file_names := listed_names(self.path)) is None:
-            hint = "it is not a run folder, so --force does not replace it"
+            hint = "--force replaces only run folders"
         else:
             foreign = sorted({p.name for p in self.path.iterdir()} - {*file_names, *self.further})
             if not foreign:
@@ -427,8 +427,8 @@ class RunFolder(Folder):
             if holds_work(self.partial) or FOREIGN in _json(self.partial / LOCK):
                 if not self._force:
                     raise BadConfiguration(
-                        f"--out: {self.partial} contains interrupted work of another configuration, table or "
-                        "version; choose another path, or use --force to start again"
+                        f"--out: {self.partial} contains interrupted work of another configuration; choose "
+                        "another path, or use --force to start again"
                     )
                 print_message(f"{self.partial}: was made with another configuration, so it is started again")
             self._clear()

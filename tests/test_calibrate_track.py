@@ -62,7 +62,7 @@ def test_in_track_the_guide_friction_stands_for_the_product(base):
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
     assert priors.parameters_by_name(base)[GUIDE_SHARE].value == 0.3
-    assert "fit guide_friction there" in table_words.would_measure(GUIDE_SHARE)
+    assert "in track, fit guide_friction" in table_words.would_measure(GUIDE_SHARE)
 
 
 @pytest.fixture(scope="module")
@@ -102,4 +102,4 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     stiff = params.replace(base, {"running_gear.span_stiffness": 1e8})
     (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2")
-    assert "the track model's step of 0.0001 s is above the largest stable one" in said
+    assert "the step of 0.0001 s is above the largest stable one" in said

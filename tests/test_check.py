@@ -305,14 +305,14 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
     steepest = math.degrees(math.atan(0.32))
     assert capsys.readouterr().err == (
         "mmrjax: r.toml, speed_m_s: the envelope's slope_deg goes up to 20; lacquered_wood holds 6T2A up to "
-        f"{steepest:.1f} deg at most (adhesion 0.32), whatever drives it\n"
+        f"{steepest:.1f} deg (adhesion 0.32), whatever drives it\n"
     )
     sheet.reject_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
     file.write_text('speed_m_s = 1\n[envelope]\nconfiguration = "4W2"\n')
     assert command(["check", file, "--out", tmp_path / "run"]) == 2
     assert "the robot has no configuration 4W2; did you mean 4W2T?" in capsys.readouterr().err
     assert command(["check", tmp_path / "none.toml"]) == 2
-    assert "no such file; expected a TOML file of requirements" in capsys.readouterr().err
+    assert "no such file; expected a TOML file" in capsys.readouterr().err
     assert not (tmp_path / "run").exists() and not (tmp_path / "run.partial").exists()
 
 
@@ -408,7 +408,7 @@ def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
         assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
         lacking = "motor.resistance_thermal_winding, motor.resistance_thermal_housing"
         assert (
-            f"asked.toml, {name}: depends on the winding temperature, for which the robot's file lacks {lacking}"
+            f"asked.toml, {name}: needs the winding temperature, for which the robot's file lacks {lacking}"
             in " ".join(capsys.readouterr().err.split())
         )
 

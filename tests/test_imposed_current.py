@@ -260,8 +260,8 @@ def test_commands_take_a_current_or_say_what_to_state(tmp_path, mmrjax):
         (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; give --motor-current [A]"),
         (["simulate"], "--motor-current: not given; give it [A], such as --motor-current 2"),
         (["simulate", "--battery"], "--battery: the motors' current is imposed on this robot"),
-        (["sensitivity"], "sensitivity: the motor current is imposed on this robot"),
-        (["simulate", "--model", "track", "--motor-current", "1"], "which has no running gear"),
+        (["sensitivity"], "sensitivity: this robot imposes the motor current"),
+        (["simulate", "--model", "track", "--motor-current", "1"], "a shaft has no running gear"),
     ):  # fmt: skip
         code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")
         assert code == 2 and said in " ".join(err.split()), err

@@ -92,7 +92,7 @@ def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, ma
 
 
 @pytest.mark.parametrize(("delay", "stated", "words"), [
-    (0.149, True, "searched up to a tenth of a run"), (-0.2, False, "earlier than its column states, and the equations"),
+    (0.149, True, "a longer delay is not searched"), (-0.2, False, "earlier than its column states, and a longer delay"),
     (0.1, False, "the rig file gives no delay. To start"), (0.1, True, ""), (0.003, False, ""),
 ])  # fmt: skip
 def test_a_delay_at_the_end_of_its_search_is_reported(robot, delay, stated, words):
@@ -117,8 +117,8 @@ def test_an_error_in_the_first_sample_after_each_step_is_named_with_its_share(ro
     assert (note.channel, note.rows, note.share) == (runs.channels[1].name, len(steps), pytest.approx(share))
     text = describe(note)
     rest = np.delete(off[:, 1], steps + late)
-    assert f"the rms error falls to {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} % of it" in text
-    assert f"{share:.0%} of the squared error" in text and "may be negative" in text and len(text) <= 400
+    assert f"the rms error falls to {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} %" in text
+    assert f"{share:.0%} of the squared error" in text and "0 ± 0.02" in text and len(text) <= 400
     off[:, 1] = 5.0
     assert error_after_steps(runs, off) == []  # an error everywhere
 
@@ -155,7 +155,7 @@ def test_a_delay_is_freed_if_the_error_lies_after_the_steps(robot, tmp_path, mon
     if freed:
         (z,) = found.starts
         assert dict(zip(again[0], z, strict=True)) == dict.fromkeys(first, 1.0) | {"rig.delay": 0.0}
-        assert "The fit therefore includes rig.delay" in describe(setting.ready.weighed[-1])
+        assert "so rig.delay is fitted" in describe(setting.ready.weighed[-1])
 
 
 @pytest.mark.parametrize("late", [-0.004, 0.01])

@@ -133,7 +133,7 @@ def test_units_of_a_log_reach_each_joint(tmp_path):
         return loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)["elbow"]
 
     table = runs("s,V,V,A,A,deg,deg")
-    assert any("contains units" in note for note in table.notes)
+    assert any("is units" in note for note in table.notes)
     assert_allclose(np.median(table["motor_current_sd_A"]), 0.01, rtol=0.1)
     milli = [
         ",".join(x if k != 4 else f"{1e3 * float(x):.9g}" for k, x in enumerate(line.split(","))) for line in lines
@@ -186,8 +186,8 @@ def test_currents_of_a_joint_are_not_late(tmp_path, joint):
     ("old", "new", "joints", "message"),
     [
         ("", "", "wrist", r"--joints: got wrist; arm.xml has no such driven joint"),
-        ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow slides, is free"),
-        ('<body>\n  <joint name="shoulder"', '<body><freejoint name="base"/><geom size="1"/><body>\n  <joint name="shoulder"', "all", "joint base slides, is free"),
+        ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow is no named hinge"),
+        ('<body>\n  <joint name="shoulder"', '<body><freejoint name="base"/><geom size="1"/><body>\n  <joint name="shoulder"', "all", "joint base is no named hinge"),
         ('<motor joint="elbow"/>', '<motor joint="elbow"/><motor joint="elbow"/>', "all", "elbow has several actuators"),
         ("</actuator>", '</actuator><equality><joint joint1="elbow" joint2="shoulder"/></equality>', "all", "closed loops"),
     ],

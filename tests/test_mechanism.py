@@ -1,10 +1,12 @@
 """A mechanism stands by what it explains, predicts and is found again by, whatever its exact law."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
@@ -32,6 +34,7 @@ def test_a_mechanism_needs_each_of_its_tests():
         "gain": {"gain": 0.2},
         "again": {"again": 0.79},
         "many": {"families": tuple(f"loss torque that changes with {x}" for x in "abcd")},
+        "run": {"run": 2},
     }
     assert {name: dataclasses.replace(stands, **change).fails for name, change in worse.items()} == {
         name: (name,) for name in worse
@@ -68,15 +71,20 @@ def found(monkeypatch):
     monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
+    monkeypatch.setattr(room, "_linear_gain_of_curve", lambda *_: Gain(1.0, 0.1))
+    differs = [(None, "", 0.0)]
+    monkeypatch.setattr(room, "changed_run", lambda *_: differs[0])
+    left = SimpleNamespace(linear=SimpleNamespace(jacobian=0.0, residual=0.0))
     monkeypatch.setattr(room, "evidence_over_curves", lambda *_: 0.0)
     monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
 
-    def of(*ladder, curve, where=SPEED, long=False):
+    def of(*ladder, curve, where=SPEED, long=False, reads=True, run=(None, "", 0.0)):
         space.bare.observe.long = space.bare.observe.over_time = long
+        space.bare.observe.reads, differs[0] = reads, run
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
         beside = SimpleNamespace(where=where, curve=drawn)
         return room.find_mechanism(
-            space, None, fitted(explains=0.0), SimpleNamespace(linear=None), ladder, (), beside, {}, settings_for(SettledRuns)
+            space, None, fitted(explains=0.0), left, ladder, (), beside, {}, settings_for(SettledRuns)
         )  # fmt: skip
 
     return of
@@ -124,8 +132,14 @@ def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechan
     assert found(large, curve=1900.0).effects == ("stribeck",)  # a mechanism claims no size
     assert found(dataclasses.replace(large, supplying=("stribeck",)), curve=1900.0).effects == ()
     where = dataclasses.replace(SPEED, explained=1900.0)  # histories: by what it explains linearly
-    assert found(fitted("leads", explains=1500.0), curve=np.nan, where=where, long=True) is None
-    assert found(fitted("stribeck", explains=1500.0), curve=np.nan, where=where, long=True).effects == ("stribeck",)
+    of_log = functools.partial(found, curve=np.nan, where=where, long=True)
+    leads, stribeck = fitted("leads", explains=1500.0), fitted("stribeck", explains=1500.0)
+    assert of_log(leads).families == (SPEED.family,) and of_log(leads).fails == ()
+    assert of_log(leads, reads=False) is None  # no simulation confirms a curve of windows
+    assert of_log(stribeck).effects == of_log(stribeck, reads=False).effects == ("stribeck",)
+    # a constant that differs in one run explains more
+    assert of_log(leads, run=(2, "motor.inertia", 44.0)).fails == ("run",)
+    assert of_log(leads, run=(2, "motor.inertia", 43.0)).fails == ()
 
 
 def test_an_effect_that_a_curve_refutes_is_listed_with_the_drivers_of_curves(found, monkeypatch):
@@ -204,3 +218,40 @@ def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     np.testing.assert_array_equal(
         room._within_seen_range(space, beside, masks), [False, True, True, False, True, False]
     )
+
+
+def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(monkeypatch):
+    rng = np.random.default_rng(7)
+    rows, free = 40, 3
+    columns, jacobian = rng.standard_normal((rows, 2)), rng.standard_normal((rows, free))
+    jacobian = np.concatenate([jacobian, np.eye(free)])
+    residual = np.append(2.0 * columns[:, 0] + 0.3 * rng.standard_normal(rows), np.zeros(free))
+    linear = SimpleNamespace(jacobian=jacobian, residual=residual, readings=rows)
+    monkeypatch.setattr(room, "location_columns", lambda *_: columns)
+    kinds = {"run": {name: np.arange(rows) // 10 == k for k, name in enumerate("abcd")}}
+    monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: kinds)
+    monkeypatch.setattr(room.blocks_room, "parts_over_time", lambda _: {"half": np.arange(rows) % 4 < 2})
+    data = SimpleNamespace(sd=np.full((rows, 1), 0.5))
+    space = SimpleNamespace(weight=np.ones((rows, 1)), included=np.ones(rows, bool), bare=SimpleNamespace(data=data))
+    beside = SimpleNamespace(left=SimpleNamespace(linear=linear), where=SPEED, bases=())
+    got = room._linear_gain_of_curve(space, range(rows), None, beside, {})
+
+    def errors(design, out):
+        kept = np.append(~out, np.ones(len(design) - rows, bool))
+        e = np.append(residual, np.zeros(len(design) - len(residual)))
+        return (e + design @ np.linalg.lstsq(design[kept], -e[kept], rcond=None)[0])[:rows]
+
+    wide = np.block([[jacobian, np.append(columns, np.zeros((free, 2)), 0)], [np.zeros((2, free)), np.eye(2)]])
+    density = [
+        sum(np.where(out, t.logpdf(errors(x, out), 4), 0.0) for out in kinds["run"].values())
+        for x in (wide, jacobian)
+    ]
+    none = np.zeros(rows, bool)
+    change = np.abs(errors(wide, none) - errors(jacobian, none))
+    counts = change >= room.CHANGED * np.sqrt(np.mean(change**2))
+    assert 4 < counts.sum() < rows and got.mean == pytest.approx((density[0] - density[1])[counts].mean(), rel=1e-9)
+    assert got.mean > 5 * got.se > 0
+    wave = SimpleNamespace(
+        **vars(beside) | {"where": dataclasses.replace(SPEED, variable="order 2 of the driving shaft")}
+    )
+    assert list(room._linear_gain_of_curve(space, range(rows), None, wave, {}).errors) == ["part"]

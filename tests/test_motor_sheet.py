@@ -114,7 +114,7 @@ def test_numbers_that_differ_widen_the_constant():
         ({"no-load-speed": "-3 rpm"}, r"--no-load-speed: got -3 rpm; expected a positive number"),
         ({"stall-current": "39,3 A"}, r"--stall-current: got 39,3 A; expected a positive number"),
         ({"no-load-speed": None, "stall-torque": None}, r"--no-load-speed and --stall-torque: both missing"),
-        ({"no-load-current": None}, r"--no-load-current: missing; without it"),
+        ({"no-load-current": None}, r"--no-load-current: missing; the motor friction"),
         ({"voltage": None, "resistance": None, "stall-current": None}, r"missing --voltage, --stall-current, --resistance"),
     ],
 )  # fmt: skip

@@ -151,14 +151,14 @@ def test_posterior_of_another_robot_is_refused(robot, posterior, fitted):
         posterior.check(robot, "here")
     other = dataclasses.replace(posterior, coordinates=("8W8T.mass", *posterior.coordinates[1:]))
     with pytest.raises(
-        BadData, match=r"here: this robot has no 8W8T.mass, so the posterior belongs to another.*6T2A.mass"
+        BadData, match=r"here: this robot has no 8W8T.mass, so the posterior is another robot's.*6T2A.mass"
     ):
         other.check(fitted, "here")
 
 
 def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
     path = tmp_path / room.FILE
-    with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc that calibrate and loop write"):
+    with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc next to robot\.toml"):
         room.read_posterior(path)
     path.write_text("nothing of the kind")
     with pytest.raises(BadData, match="not a readable posterior"):
@@ -166,7 +166,7 @@ def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
     skew = posterior.covariance.copy()
     skew[0, 1] = skew[1, 0] = 5.0  # more than their sds allow
     room.write_posterior(dataclasses.replace(posterior, covariance=skew), path)
-    with pytest.raises(BadData, match="the covariance is invalid"):
+    with pytest.raises(BadData, match="a number is missing, invalid"):
         room.read_posterior(path)
 
 
@@ -190,7 +190,7 @@ def test_a_file_with_a_number_that_cannot_be_is_refused(posterior, tmp_path, col
     sound = _written(posterior, tmp_path)
     sound[column][0] = value
     sound.to_netcdf(tmp_path / room.FILE, engine="scipy")
-    with pytest.raises(BadData, match="or a number is missing or out of range; write the file again"):
+    with pytest.raises(BadData, match="a number is missing, invalid or out of range; write the file again"):
         room.read_posterior(tmp_path / room.FILE)
 
 

@@ -162,7 +162,7 @@ def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_im
         space, bare=posed, equipped=dataclasses.replace(space.equipped, observe=posed.observe)
     )
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    run, changed, root = standing._changed_run(space, linear, (), jacobian, residual)
+    run, changed, root = standing.changed_run(space, linear, (), jacobian, residual)
     effects = standing._largest_root(jacobian, residual, np.asarray(linear.signatures))
     if "rough" in fault:
         assert (run, changed) == (3, "motor.friction_coulomb") and root > 1.2 * effects

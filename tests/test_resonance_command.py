@@ -172,7 +172,7 @@ def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
         if key.endswith(("_percent", "_Hz", "mm_s")):
             table[key][:] = np.nan
     none = dataclasses.replace(found, table=table, peaks=[], crossings=[])
-    assert none.statement() == "No run of 6T2A travels, so there is no ripple (status gives the reason)."
+    assert none.statement() == "No run of 6T2A travels (see status)."
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -182,7 +182,7 @@ def test_wheels_have_no_grousers_and_nothing_to_avoid(tmp_path, kind):
         assert command([*SMALL, "--configuration", "4W2T", "--out", out]) == 0
     result = read_json(out / "result.json")
     assert result["passing"]["of"] == "teeth" and result["avoid"] == []
-    assert "no grousers" in result["statement"]
+    assert "Without grousers" in result["statement"]
     assert {m["name"] for m in result["modes"]} == {"bounce", "pitch"}
 
 

@@ -131,7 +131,7 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
     np.savetxt(tmp_path / "log.csv", cells, delimiter=",", header=",".join(columns), comments="")
     runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     nothing = noise.Noise(*(None for _ in dataclasses.fields(noise.Noise)))
-    cure = rf"expected readings with a sign, negative in reverse; or state \[instruments.{shown}\] signed = false"
+    cure = rf"expected negative readings in reverse; or set \[instruments.{shown}\] signed = false"
     bridge = duty and shown == "total_current"  # which turns the supply's current back
     refused = pytest.raises(BadData, match=rf"{said} at -6 V; {cure}")
     with refused if said and not bridge else contextlib.nullcontext():

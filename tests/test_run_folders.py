@@ -54,7 +54,9 @@ def test_force_replaces_no_folder_that_is_none_of_ours(tmp_path, manifest):
     else:
         (folder / "manifest.json").write_bytes(manifest.encode("latin1"))
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match="thesis.txt" if manifest is None else "it is not a run folder"):
+    with pytest.raises(
+        BadConfiguration, match="thesis.txt" if manifest is None else "--force replaces only run folders"
+    ):
         finished(tmp_path / "x", force=True)
     assert names(tmp_path) == before
 

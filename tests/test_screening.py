@@ -108,14 +108,14 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
 def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
     found = dataclasses.replace(RANKING, parameters={"motor.inertia": (2.5e-4, 1e-6)})
     assert words.regression_verdict(found) == (
-        "regression only, not confirmed by simulation: perhaps a loss torque that changes with speed is "
+        "regression only, not confirmed: perhaps a loss torque that changes with speed is "
         "missing (churning). Parameters [SI]: motor.inertia 0.00025 ± 1e-06"
     )
     assert words.regression_verdict(dataclasses.replace(found, effects=(), parameters={})).endswith(
         "no effect explains it"
     )
     nothing = dataclasses.replace(RANKING, missing=False)
-    assert words.regression_verdict(nothing).endswith("simulation: no effect of the library exceeds chance")
+    assert words.regression_verdict(nothing).endswith("not confirmed: no effect of the library exceeds chance")
 
 
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
@@ -151,7 +151,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     assert code == 3 and "Strongest alone: churning\n" in err  # at once
     assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
-    assert "regression only, not confirmed by simulation: perhaps a loss torque that changes" in err
+    assert "regression only, not confirmed: perhaps a loss torque that changes" in err
     left = read_json(tmp_path / "found.partial/screening.json")
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]

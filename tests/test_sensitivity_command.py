@@ -250,12 +250,12 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     (["--configurations", "8W"], 2, "configurations: got 8W; the robot has no such configuration"),
     (["--noise", "curent=1%"], 2, "--noise curent=1%: no such channel; did you mean current?"),
     (["--candidates", "none.csv"], 4, "none.csv: no such file"),
-    (["--posterior"], 2, "--posterior: nominal has no posterior; expected --robot FOLDER/robot.toml, written by calibrate or loop"),
-    pytest.param(["--slopes", "40", "--outputs", "speed"], 2, "no operating point can be studied, because too many robots do not travel",
+    (["--posterior"], 2, "--posterior: nominal has no posterior; expected --robot FOLDER/robot.toml of calibrate or loop"),
+    pytest.param(["--slopes", "40", "--outputs", "speed"], 2, "too many robots do not travel at any operating point",
                  marks=pytest.mark.slow),
     pytest.param(["--parameters", "motor.inductance", "--outputs", "speed"], 2,
-                 "the derivative of every output by every input is zero", marks=pytest.mark.slow),
-    pytest.param(["--parameters", "motor.inductance"], 2, "the derivative of every output by every input is zero",
+                 "every derivative is zero", marks=pytest.mark.slow),
+    pytest.param(["--parameters", "motor.inductance"], 2, "every derivative is zero",
                  marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_what_is_refused(mmrjax, tmp_path, options, code, says):

@@ -23,13 +23,13 @@ from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, fit_smooth_curve, fit_smooth_surface
 from calibration.discovery.standing import (
-    _changed_run,
     _curve_evidence,
     _deficient_equations,
     _largest_root,
     _largest_variation,
     _most_influential_row,
     _recurrence,
+    changed_run,
     cost_of_names,
     equation_of_place,
     evidence_of_names,
@@ -358,10 +358,10 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
         for name, column in zip([*names, "slip"], [*parameters.T, error[:, 0]], strict=True):
             extra = np.append(column * inside, np.zeros(len(residual) - readings))[:, None]
             best = max(best, (left(jacobian) - left(np.c_[jacobian, extra]), k + 1, name))
-    run, changed, root = _changed_run(space, linear, (), jacobian, residual)
+    run, changed, root = changed_run(space, linear, (), jacobian, residual)
     assert (run, changed) == best[1:] and root**2 == pytest.approx(best[0], rel=1e-6)
     runs[:] = [np.arange(toy.rows)]
-    assert _changed_run(space, linear, (), jacobian, residual) == (None, "", 0.0)
+    assert changed_run(space, linear, (), jacobian, residual) == (None, "", 0.0)
 
 
 @pytest.mark.parametrize(

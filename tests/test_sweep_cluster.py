@@ -113,8 +113,8 @@ def test_scheduler_that_does_not_answer_is_refused_in_ten_seconds(tmp_path):
         done = command(tmp_path, "--out", "s", "--scheduler", address, timeout=60)
         took = time.perf_counter() - begin
     assert done.returncode == 2 and done.stderr.removeprefix("sweep: working\n") == (
-        f"mmrjax: --scheduler: got {address}; no scheduler answers there within 4 s (silence); expected the address that "
-        "dask scheduler prints, such as tcp://host:8786\n"
+        f"mmrjax: --scheduler: got {address}; no scheduler answers there within 4 s (silence); expected one such "
+        "as tcp://host:8786\n"
     )
     assert took < 10 and [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
@@ -210,9 +210,7 @@ def test_chunk_that_kills_its_workers_ends_the_sweep(tmp_path, job, monkeypatch)
     monkeypatch.setattr(cluster, "RETRIES", 0)
     pool = cluster.connect_workers(restarting.address)
     try:
-        with pytest.raises(
-            cluster.LostWorkers, match=r"chunk 3 lost its worker 1 times, perhaps because of too little memory"
-        ):
+        with pytest.raises(cluster.LostWorkers, match=r"chunk 3 lost its worker 1 times, perhaps for lack of memory"):
             list(pool.produce(job, [3]))
     finally:
         pool.client.close(timeout=2)

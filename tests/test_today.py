@@ -126,10 +126,10 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
         assert code == 2
         assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
     ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages cannot be combined with --battery")
-    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: has no effect on battery power")
+    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: has no effect on a battery")
     (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
     code, _, err = mmrjax("sweep plan.toml")
-    assert code == 2 and err.startswith("mmrjax: plan.toml: voltage has no effect on battery power")
+    assert code == 2 and err.startswith("mmrjax: plan.toml: voltage has no effect on a battery")
     (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
     code, _, err = mmrjax("simulate --battery --runs runs.csv")
     assert code == 4

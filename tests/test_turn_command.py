@@ -150,7 +150,7 @@ REFUSED = {
     "track, one side": (("--left", "3", "--model", "track"), "--left needs --right"),
     "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left cannot be combined with --profile"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
-    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there continuously"),
+    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "so it has no steady state"),
     "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
     "shaft": (("--left", "3", "--right", "1", "--robot", "SHAFT"), "the robot's load is a shaft"),
 }
@@ -393,7 +393,7 @@ ONE_SIDE = dataclasses.replace(paper_robots.nominal(), sides=jnp.asarray(1.0))
         (ONE_SIDE, {"profile": TURNING}, "profile: got a robot of 1 side; expected sides = 2"),
         (mm.nominal(), {"profile": "patrol"}, "profile: got str; expected mmrjax.profile"),
         (mm.nominal(), {"profile": TURNING, "model": "steady"}, "model: got steady with a profile; expected drive"),
-        (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 with a profile; its last row"),
+        (mm.nominal(), {"profile": TURNING, "duration": 3.0}, "duration: got 3.0 with a profile, whose last row"),
         (mm.nominal(), {"start": "rest"}, "start: got one without a profile"),
     ],
 )

@@ -143,7 +143,7 @@ def test_a_fidelity_that_resolves_the_running_gear_says_where_it_is_an_examples(
     read(tmp_path, kept.partition("[rover.turning]")[0] + kept.partition("inertia = 0.2\n")[2], "voltage", DRIVEN)
     for model in ("steady", "track"):
         load_robot(Simulate(robot=str(tmp_path / "rig.toml"), set={"rover.inertia": 0.001}, model=model))
-        assert ("are example values" in capsys.readouterr().err) == (said and model == "track")
+        assert ("masses are examples" in capsys.readouterr().err) == (said and model == "track")
 
 
 def test_a_parameter_that_is_set_is_known(tmp_path):

@@ -349,7 +349,7 @@ OVER = PlacedCurve("slip", ("slope",))
     [
         (None, ""),
         (NameSupport(True), ""),
-        (NameSupport(False, "implausible"), "every effect that explains the discrepancy has an implausible size"),
+        (NameSupport(False, "implausible"), "every effect that explains it has an implausible size"),
         (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but only at an implausible size"),
         (
             NameSupport(False, "better curve", ("a",), (PlacedCurve("speed", ("speed_motor", "slope")),)),
@@ -371,7 +371,7 @@ OVER = PlacedCurve("slip", ("slope",))
             ),
             "a explains 1.2 σ next to smooth curves (slip balance over slope), where chance alone reaches 3.4 σ; b is a worse "
             "explanation than a smooth curve in its place and depends on row 10 alone; c is chosen again in only 75 % of the "
-            "fits with one block left out, explains less than d and e at an implausible size and leaves an error in "
+            "fits without one block, explains less than d and e at an implausible size and leaves an error in "
             "its own equation",
         ),
         (
@@ -384,7 +384,7 @@ OVER = PlacedCurve("slip", ("slope",))
                 "beside",
                 tests=(NameTest("a", 6.91, 3.27, (OVER,), 1.0, 11, 5.8), NameTest("b", 5.0, 3.27, (), 0.0)),
             ),
-            "each effect, added to the fit of the others, explains more than chance would: a scores 6.9 σ (chance "
+            "each effect, added to the others, explains more than chance: a scores 6.9 σ (chance "
             "alone reaches 3.3 σ, and 5.8 σ remain without row 11), b scores 5.0 σ (chance alone reaches 3.3 σ)",
         ),
     ],
@@ -401,7 +401,7 @@ def test_verdict_of_a_complete_model():
         loop_words.verdict_sentences(VerdictSummary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
     )
     aside = loop_words.verdict_sentences(VerdictSummary("none", 0.4, None, aside=10, of=100))
-    assert aside == f"10 of 100 rows (10 %) are outliers and are set aside. {said}"
+    assert aside == f"10 of 100 rows (10 %) are set aside as outliers. {said}"
 
 
 def test_verdict_tells_what_is_tentative():
@@ -470,7 +470,9 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
 
 
 def test_every_doubt_about_a_mechanism_has_words():
-    none = Mechanism(tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0)
+    none = Mechanism(
+        tuple(f"loss torque that changes with {x}" for x in "abcd"), (), 0.1, 0.0, np.inf, 0.0, run=2, changed="track"
+    )
     assert set(none.fails) == set(loop_words.NO_MECHANISM) and all(loop_words.no_mechanism(none).split())
 
 
@@ -602,12 +604,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(False, 812.3, 600.0, 1e-9, AdequacyFinding(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "a term is missing and the parameters may absorb its effect. Run mmrjax loop to find it",
+            "a term is missing, which parameters may absorb. Run mmrjax loop to find it",
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, AdequacyFinding("motor_speed", "follow", "slope_deg"), False),
-            "Not adequate: the residuals of motor speed depend on slope_deg (p = 0.0021, with the noise estimated from the residuals), "
-            "so a term is missing and the parameters may absorb its effect. Run mmrjax loop to find it",
+            "Not adequate: the residuals of motor speed depend on slope_deg (p = 0.0021, with estimated noise), "
+            "so a term is missing, which parameters may absorb. Run mmrjax loop to find it",
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, AdequacyFinding(what="repeats"), True),
@@ -616,12 +618,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(True, 50.0, 50.0, 0.4, AdequacyFinding(), False),
             "Adequate as far as can be tested: the residuals show no structure (p = 0.4). The noise was estimated from "
-            "them, so χ² cannot test the fit",
+            "them",
         ),
         (
             Adequacy(None, 5.0, 2.5, None, AdequacyFinding(), False),
-            "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom are too few "
-            "to show structure. State the noise with --noise",
+            "Adequacy cannot be tested: the noise was estimated from the misfit, with only 2.5 degrees of freedom. "
+            "State it with --noise",
         ),
     ],
 )
@@ -645,15 +647,15 @@ def clustered(levels, **other):
     [
         (
             clustered({"1": -14.42, "2": 3.6}, alike=("direction_deg",)),
-            "residuals of speed differ between the levels of wheel (simulated minus measured, by level: 1: -14 mm/s, 2: +3.6 mm/s, p = 2e-07), "
+            "residuals of speed differ between the levels of wheel (simulated minus measured: 1: -14 mm/s, 2: +3.6 mm/s, p = 2e-07), "
             "a column that the model does not use (as well by direction_deg). Give each level its own configuration, or find what "
-            "differs between them",
+            "differs",
         ),
         (
             clustered({"1": -1.0, "2": 1.0}, reversing=True, within="configuration", coarser=(("axle", 0.91),)),
             "residuals of speed differ between the levels of wheel within configuration, with opposite signs in the two directions of travel "
-            "(simulated minus measured, by level: 1: -1 mm/s, 2: +1 mm/s, p = 2e-07), a column that the model does not use (axle alone "
-            "91% of it). Give each level its own configuration, or find what differs between them",
+            "(simulated minus measured: 1: -1 mm/s, 2: +1 mm/s, p = 2e-07), a column that the model does not use (axle alone "
+            "91% of it). Give each level its own configuration, or find what differs",
         ),
         (
             clustered({}, correlation=-0.456),
@@ -682,8 +684,8 @@ def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
 
 
 def test_what_would_measure_is_found_by_either_end_of_a_name():
-    assert table_words.would_measure("motor.inductance").startswith("a time history of the start-up current")
-    assert re.search("slippery slope", table_words.would_measure("6T2A.ground.friction.dynamic"))
+    assert table_words.would_measure("motor.inductance").startswith("a history of the starting current")
+    assert re.search("faster than V_d", table_words.would_measure("6T2A.ground.friction.dynamic"))
     assert table_words.would_measure("x.y") == "runs under conditions in which it has an effect"
 
 

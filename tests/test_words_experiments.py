@@ -80,7 +80,7 @@ def test_what_to_do_next_is_said_as_recorded():
 def test_every_instruction_and_every_risk_has_a_sample():
     instructions = [*INSTRUCTIONS, denser_runs_instruction("slip", "speed", ONE), Remark("no_menu", word="turns")]
     assert {note.code for note in (*instructions, *WATCHED)} == set(words.SAID)
-    assert describe(instructions[-1]) == "The loop can propose experiments for straight travel only, not for turns"
+    assert describe(instructions[-1]) == "The menu has no experiments for turns"
 
 
 def test_the_zero_of_every_meter_is_read_at_rest():

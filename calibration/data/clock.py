@@ -178,14 +178,14 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
     if of_day:
         return passed, (
             *notes,
-            f"{name}: {meaning.shown} is a time of day. Time is counted from the first row of each run",
+            f"{name}: {meaning.shown} is a time of day, counted from the first row of each run",
         )
     run_index = run[np.flatnonzero(start_time[run])[0]]
     time_words = f"{start_time[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
     return passed, (
         *notes,
-        f"{name}: {meaning.shown} begins at {time_words}. Time is counted from the first row of a run. If the run "
-        "began earlier, add a row without readings at that time",
+        f"{name}: {meaning.shown} begins at {time_words}, and counts from the first row of a run. If it began "
+        "earlier, add a row without readings then",
     )
 
 

@@ -14,7 +14,6 @@ from calibration.data.columns import DRIVEN, DUTY, HEADING, SIDES, SPEED, SUPPLY
 from calibration.data.input_errors import BadData, allowed_words, parse_number
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import channels, quantities
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 #: Ratio to the largest allowed value from which another unit is probable.
@@ -101,10 +100,7 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
         return "" if match is None else _unit_hint(match[1], match[2], column_unit, columns_by_unit)
     is_far = abs(value) > FAR * max(map(abs, quantity.limits(column_unit)))
     if is_far and meaning.column in DUTY:
-        return (
-            "is the command scaled differently? divide it by its maximum, in a log with "
-            "[columns] duty = {column, factor}; "
-        )
+        return "is the command scaled? divide it by its maximum, in a log with [columns] duty = {column, factor}; "
     for unit, column in columns_by_unit.items():
         low, high = quantity.limits(unit)
         if is_far and unit != column_unit and low <= value <= high:
@@ -144,10 +140,13 @@ def match_column_names(
         raise BadData(
             f"{name}: column {repeated[0]} is present {matched_names.count(repeated[0])} times; expected once"
         )
-    if inferred:
-        layout = _with_channels(name, matched_names, layout, channels.EVERY)
-    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, matched_names) if m}:
-        layout = _with_channels(name, matched_names, layout, channels.OF_TURNS)
+    if inferred or of_turns:
+        every = dataclasses.replace(layout, channels=channels.EVERY)
+        present = {m.column for m in every.meanings(name, matched_names) if m is not None}
+        turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present
+        more = channels.EVERY if inferred else channels.OF_TURNS if turns else ()
+        read = (c for c in channels.EVERY if c in layout.channels or (c in more and c.column in present))
+        layout = dataclasses.replace(layout, channels=tuple(read))
     return matched_names, layout, tuple(notes)
 
 
@@ -166,16 +165,6 @@ def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool
             column = right
         columns_found.append(column)
     return columns_found, tuple(notes)
-
-
-def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
-    """Layout extended by each channel of `more` for which the file has a column."""
-    meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
-    mapped_columns = {m.column for m in meanings if m is not None}
-    with_channels = tuple(
-        c for c in channels.EVERY if c in layout.channels or (c in more and c.column in mapped_columns)
-    )
-    return dataclasses.replace(layout, channels=with_channels)
 
 
 def check_header(
@@ -202,9 +191,8 @@ def check_header(
         if column in required or (close and layout.complete):
             suggestion = f"; did you mean {close[0]}?" if close else ""
             if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
-                suggestion = (
-                    "; the columns that drive the two sides can be named in the robot's file under [columns]: "
-                    + ", ".join(f'{volts} = "motor_{volts}"' for volts in VOLTS)
+                suggestion = "; the columns that drive the sides can be named under [columns]: " + ", ".join(
+                    f'{volts} = "motor_{volts}"' for volts in VOLTS
                 )
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{suggestion} (required: {', '.join(required)})"
@@ -264,9 +252,8 @@ def _advice_on_unknown_columns(strange: list[str], column: str) -> str:
     guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
     names_text = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
-        f"; other columns: {names_text}; if one of them has these values, name it in the robot's file, with the "
-        f'factor for its unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect '
-        "proposes such lines)"
+        f"; other columns: {names_text}; if one has these values, name it in the robot's file, with its unit's "
+        f'factor: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
     )
 
 
@@ -283,8 +270,8 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
         meant = columns_of_sides.get(tuple(sorted_words(column)))
         if meant is not None and meant not in stated:
             raise BadData(
-                f"{name}: column {column}: the two sides must be called left and right; rename it to {meant}, or "
-                f'set [columns] {meant} = "{column}" in the robot\'s file'
+                f"{name}: column {column}: the sides are called left and right; rename it to {meant}, or set "
+                f'[columns] {meant} = "{column}" in the robot\'s file'
             )
         side = next((side for side in channels.SIDES if side in sorted_words(column)), None)
         turns = set(SIDES) <= set(columns_of_sides.values()) and not stated.isdisjoint(

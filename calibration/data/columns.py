@@ -254,9 +254,10 @@ class Layout:
             else:
                 meant = by_name.get(column)
                 meanings_found.append(None if meant is None or meant.column in taken else meant)
-        for k, meaning in enumerate(meanings_found):
-            twin = next((m for m in meanings_found[:k] if m and meaning and m.column == meaning.column), None)
-            if meaning and twin and meaning.shown != twin.shown:
+        first: dict[str, Column] = {}
+        for meaning in filter(None, meanings_found):
+            twin = first.setdefault(meaning.column, meaning)
+            if meaning.shown != twin.shown:
                 raise BadData(
                     f"{source}: columns {twin.shown} and {meaning.shown} have the same meaning; keep one of them"
                 )

@@ -9,8 +9,8 @@ from typing import Any
 
 import equinox as eqx
 
-from calibration.data import Json, rig_file
-from calibration.data.input_errors import BadConfiguration, stated_word
+from calibration.data import Json, Names, rig_file
+from calibration.data.input_errors import BadConfiguration, stated_as, stated_names, stated_word
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.contact import Friction
@@ -84,9 +84,8 @@ def loads_from_tables(
     missing: list[str] = []
     linear: set[str] = set()
     for name in names:
-        table, table_place = content.get(name, {}), f"{where}, {name}"
-        if not isinstance(table, dict):
-            raise BadConfiguration(f"{table_place}: got {table!r}; expected a table [{name}]")
+        table_place = f"{where}, {name}"
+        table = stated_as(content.get(name, {}), dict, table_place, f"a table [{name}]")
         kind = _load_kind(table, table_place)
         if kind == "linear":
             rig_file.linear_to_shaft(table, name, table_place, sds, _number_of_drives(content, base))
@@ -201,20 +200,19 @@ def _list_in_words(names: list[str]) -> str:
     return f"{', '.join(names)} {'are' if len(names) > 1 else 'is'}"
 
 
-def _names(stated: Any, where: str) -> list[str]:
+def _names(stated: Any, where: str) -> Names:
     where = f"{where}, configurations"
-    if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
-        raise BadConfiguration(f"{where}: got {stated!r}; expected a list of at least one name, such as {_EXAMPLE}")
-    for name in stated:
-        if stated.count(name) > 1:
-            raise BadConfiguration(f"{where}: {name} is listed {stated.count(name)} times; name each once")
+    names = stated_names(stated, where, f"a list of at least one name, such as {_EXAMPLE}")
+    for name in names:
+        if names.count(name) > 1:
+            raise BadConfiguration(f"{where}: {name} is listed {names.count(name)} times; name each once")
         if name in TAKEN:
             raise BadConfiguration(f"{where}: {name} has another meaning in robot files; choose a different name")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise BadConfiguration(
                 f"{where}: got {name!r}; expected letters, digits, underscores and hyphens, as {_EXAMPLE}"
             )
-    return stated
+    return names
 
 
 def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassis:

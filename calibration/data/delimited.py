@@ -219,7 +219,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
     note = f"{name}: columns are separated by {SEPARATORS[mark]}"
     columns = list(itertools.zip_longest(*rows[1:], fillvalue=""))
     commas, points, below = ([[*filter(x.fullmatch, column)] for column in columns] for x in (_COMMA, _POINT, _BELOW))
-    expectation = "expected either decimal commas or decimal points in a column, and no thousands separators"
+    expectation = "expected decimal commas or decimal points, without thousands separators"
     for j, (comma, point) in enumerate(zip(commas, points, strict=True)):
         if comma and point:
             raise BadData(f"{name}, {_column(rows, j)}: got {comma[0]} and {point[0]}; {expectation}")

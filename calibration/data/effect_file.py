@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from calibration.data import Json
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
 from mmrjax import effects
 from mmrjax.effects.base import THE_SIDE, Effect
 from mmrjax.model import balances, channels, paper_robots, params
@@ -114,11 +114,8 @@ def effect_library(paths: Sequence[Path | str]) -> Library:
         library[effect.name] = effect
     for path, effect in own_effects:
         other_names = [name for name in library if name != effect.name]
-        if effect.settles_to and effect.settles_to not in other_names:
-            raise BadConfiguration(
-                f"{_where(path, effect)}, settles_to: got {effect.settles_to}; "
-                f"{allowed_words(effect.settles_to, other_names)}"
-            )
+        if effect.settles_to:
+            stated_word(effect.settles_to, other_names, f"{_where(path, effect)}, settles_to")
     return library
 
 
@@ -278,15 +275,13 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         if not jnp.array_equal(term_at_size, term_of_external_supply, equal_nan=True):
             raise refuse(": its term reads a signal that is computed after its balance; see balances.moving_signals")
         if float(term_at_zero) != 0.0:
-            raise refuse(
-                f": its term is {float(term_at_zero):g} at amplitude 0; expected 0, so that the effect is off"
-            )
+            raise refuse(f": its term is {float(term_at_zero):g} at amplitude 0; expected 0")
         if not math.isfinite(float(slope)):
             raise refuse(f": the derivative of its term at amplitude 0 is {float(slope)}; expected a finite one")
         bent = abs(float(term_at_double) - 2 * float(term_at_size)) > 1e-6 * abs(float(term_at_double))
         if bent or (float(slope) == 0) != (float(term_at_size) == 0):
             raise refuse(
-                ": its term is not proportional to its amplitude; expected amplitude times a function of the signals"
+                ": its term is not proportional to its amplitude; expected amplitude times a function of signals"
             )
         if not all(math.isfinite(float(jnp.sum(x))) for x in memory_rates):
             raise refuse(": the rate or settled value of its memory is not finite")
@@ -296,7 +291,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         if not alike and effect.driver != THE_SIDE:
             raise refuse(
                 f", driver: got {effect.driver!r} for a term that differs between the sides; expected "
-                f'"{THE_SIDE}", since a robot with this effect turns unless it is steered'
+                f'"{THE_SIDE}", since the robot turns unless it is steered'
             )
         if effect.needs_battery and float(fed) != 0.0:
             raise refuse(f", needs_battery: its term is {float(fed):g} on an external supply; expected 0")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
+from calibration.data import Names
 from mmrjax.errors import allowed_words as allowed_words
 from mmrjax.errors import printable, shorten
 
+T = TypeVar("T")
 #: Largest random seed.
 SEEDS = 2**32 - 1
 
@@ -77,18 +79,45 @@ def stated_count(value: Any, where: str, low: int, high: int) -> int:
     return int(value)
 
 
-def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -> str:
+def stated_as(value: Any, kind: type[T], where: str, expected: str) -> T:
+    """Returns a value of a file after checking its type.
+
+    Raises:
+        BadConfiguration: it is of another type.
+    """
+    if not isinstance(value, kind):
+        raise BadConfiguration(f"{where}: got {value!r}; expected {expected}")
+    return value
+
+
+def stated_names(value: Any, where: str, expected: str, least: int = 1) -> Names:
+    """Returns a list of texts of a file after checking it.
+
+    Args:
+        least: fewest texts.
+
+    Raises:
+        BadConfiguration: it is no list, or has fewer texts, an empty one, or another value.
+    """
+    is_list = isinstance(value, list | tuple) and len(value) >= least
+    if not is_list or not all(isinstance(text, str) and text for text in value):
+        raise BadConfiguration(f"{where}: got {value!r}; expected {expected}")
+    return tuple(value)
+
+
+def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "", most: int = 1) -> str:
     """Returns a word of a file or an argument after checking that it is known.
 
     Args:
         wrong: beginning of the message about an unknown word. Empty: the message quotes the word.
+        most: largest number of suggestions.
 
     Raises:
         BadConfiguration: an unknown word. The message lists the nearest ones.
     """
-    if value not in known:
-        raise BadConfiguration(f"{where}: {wrong or f'got {value}'}; {allowed_words(str(value), known)}")
-    return str(value)
+    if not isinstance(value, str) or value not in known:
+        raise BadConfiguration(f"{where}: {wrong or f'got {value}'}; {allowed_words(str(value), known, most)}")
+    return value
 
 
 def stated_number(

@@ -105,8 +105,8 @@ def check_declared(where: str | Path, columns: int, size: float = 0.0, held: flo
         )
     if size > max(RATIO * held, SMALL):
         raise BadData(
-            f"{where}: declares {size / 1e9:.3g} GB of values in a file of {held:,.0f} bytes; expected a file that "
-            "holds its values; it may be cut off or damaged; export or copy it again"
+            f"{where}: declares {size / 1e9:.3g} GB of values in a file of {held:,.0f} bytes; it may be cut off "
+            "or damaged; export or copy it again"
         )
 
 
@@ -159,8 +159,8 @@ def csv_bytes(path: Path, where: str | Path) -> bytes:
     format_name = format_name or next((word for begin, word in TEXTS.items() if begin.match(content)), None)
     if format_name is not None:
         raise BadData(
-            f"{where}: is {format_name}; expected CSV (a header line with the columns' names, then one line for each "
-            "row), Parquet, or another format of docs/howto/formats.md; export it as CSV, from Python with "
+            f"{where}: is {format_name}; expected CSV (a header line, then one line for each row), Parquet, or "
+            "another format of docs/howto/formats.md; export it as CSV, from Python with "
             "pandas.DataFrame(...).to_csv(..., index=False)"
         )
     return content

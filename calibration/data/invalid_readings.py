@@ -47,21 +47,18 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             f"{runs.source}, {torque}: equals {line[1]:.4g} times {current} in every row, to the last "
             "digit, so it was "
         )
-        computed += "computed, not measured, and contains no information on torque constant, friction or efficiency"
+        computed += "computed, not measured, and does not show torque constant, friction or efficiency"
         if torque == TORQUE:
             columns.pop(torque)
             notes.append(f"{computed}. It is left out")
         elif runs.sampled or set(shown_columns) <= {current, TORQUE} or current not in shown_columns:
-            raise BadData(
-                f"{computed}; remove the column and keep only rows without a load, or give the torque set at the "
-                "brake"
-            )
+            raise BadData(f"{computed}; remove it and keep rows without a load, or give the torque set at the brake")
         else:
             columns[torque] = _load_for_current(runs, robot, shown_columns[current], runs[current])
             columns.pop(current)
             notes.append(
-                f"{computed}. It is left out. The load of each row follows from {current} and the robot's file, "
-                "so this current is not a reading either. These rows contribute only voltages and speeds"
+                f"{computed}. It is left out. The load follows from {current} and the robot's file, so this "
+                "current is no reading either. Only voltages and speeds are used"
             )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 
@@ -132,14 +129,14 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
         if not_read.any():
             rows = rows_text(np.flatnonzero(not_read).tolist(), *SHOWN)
             notes.append(
-                f"{runs.source}, {channel.column}: 0 in {rows} although the current is that of a turning motor. "
-                "These readings are treated as missing"
+                f"{runs.source}, {channel.column}: 0 in {rows} although the current is a turning motor's. These "
+                "readings count as missing"
             )
     if is_limited.any():
         rows = rows_text(np.flatnonzero(is_limited).tolist(), *SHOWN)
         notes.append(
-            f"{runs.source}, {rows}: the readings no longer change while the command rises, so the supply or the "
-            "driver is at a limit. These rows are set aside"
+            f"{runs.source}, {rows}: readings no longer change while the command rises: supply or driver is at a "
+            "limit. These rows are set aside"
         )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 

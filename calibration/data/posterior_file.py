@@ -118,7 +118,7 @@ class Posterior:
             if name not in values:
                 alike = [n for n in values if n.rpartition(".")[2] == name.rpartition(".")[2]]
                 raise BadData(
-                    f"{where}: this robot has no {name}, so the posterior belongs to another robot; "
+                    f"{where}: this robot has no {name}, so the posterior is another robot's; "
                     f"{allowed_words(name, alike or values)}"
                 )
         with np.errstate(invalid="ignore"):  # NaN from a damaged file is rejected below
@@ -127,8 +127,8 @@ class Posterior:
         for name, value, width in zip(self.names, robot_at_mean, sd, strict=True):
             if not abs(values[name] - value) <= APART * width + 1e-6 * abs(value):  # also if one is NaN
                 raise BadData(
-                    f"{where}: {name} is {values[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
-                    "posterior: take the robot.toml from the same folder, without changes to fitted parameters"
+                    f"{where}: {name} is {values[name]:.6g} in the robot; expected {value:.6g}, the centre of "
+                    "its posterior: use the robot.toml of its folder, unchanged"
                 )
 
     @property
@@ -195,7 +195,7 @@ def read_posterior(path: Path | str) -> Posterior:
 
     path = Path(path)
     if not path.is_file():
-        raise BadData(f"{path}: no such file; expected the {FILE} that calibrate and loop write next to robot.toml")
+        raise BadData(f"{path}: no such file; expected the {FILE} next to robot.toml")
     try:
         with xr.open_dataset(path, engine="scipy") as data:
             data.load()
@@ -216,9 +216,7 @@ def read_posterior(path: Path | str) -> Posterior:
         and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not is_valid:
-        raise BadData(
-            f"{path}: the covariance is invalid, or a number is missing or out of range; write the file again"
-        )
+        raise BadData(f"{path}: a number is missing, invalid or out of range; write the file again")
     return posterior
 
 

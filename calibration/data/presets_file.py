@@ -18,7 +18,9 @@ from calibration.data.input_errors import (
     BadData,
     allowed_words,
     parse_number,
+    stated_as,
     stated_count,
+    stated_names,
     stated_number,
     stated_word,
 )
@@ -125,7 +127,7 @@ class Preset:
                 missing_words = " or ".join(by_name[needs].theirs)
                 raise BadData(
                     f"{name}: has no {missing_words}; --columns {self.name} needs it for {needs}, because "
-                    f"{present[own_column]} by itself does not give the motor voltage; record {missing_words}, or "
+                    f"{present[own_column]} alone does not give the motor voltage; record {missing_words}, or "
                     "set imposed to the speed or the current in the rig's file"
                 )
 
@@ -216,7 +218,7 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     for key in content:
         stated_word(key, KEYS, where, f"got the key {key}")
     numbers = _preset_numbers(content.get("ask", {}), where, given)
-    header = _list_of_texts(content.get("header", []), f"{where}, header")
+    header = stated_names(content.get("header", []), f"{where}, header", "a list of names", least=0)
     columns = content.get("columns", {})
     if not isinstance(columns, dict) or not columns:
         raise BadConfiguration(
@@ -236,8 +238,7 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
 
 def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
     """Numbers that the user gives for a preset, or their defaults, by name."""
-    if not isinstance(asked, dict):
-        raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
+    stated_as(asked, dict, f"{where}, ask", "a table")
     for key in given:
         if key not in asked:
             names_text = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
@@ -263,30 +264,23 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
 
 
 def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
-    form = f'expected {mine} = "LOGGER COLUMN", or {mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
+    form = f'{mine} = "LOGGER COLUMN", or {mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")
     column = table.get("column")
-    names = _list_of_texts([column] if isinstance(column, str) else column, f"{where}.column", form)
+    names = stated_names([column] if isinstance(column, str) else column, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
     for key in ("per", "times"):
         if key in table:
-            if table[key] not in numbers:
-                raise BadConfiguration(
-                    f"{where}.{key}: got {table[key]}; expected one of the numbers defined under [ask]; "
-                    f"{allowed_words(str(table[key]), numbers)}"
-                )
-            value = numbers[table[key]]
+            wrong = f"got {table[key]}; expected one of the numbers defined under [ask]"
+            value = numbers[stated_word(table[key], numbers, f"{where}.{key}", wrong)]
             if key == "per" and not value:
                 raise BadConfiguration(f"{where}.{key}: {table[key]} is 0; expected a number that is not 0")
             factor = factor * value if key == "times" else factor / value
     if not factor:
         raise BadConfiguration(f"{where}.factor: got 0; expected a number that is not 0")
-    texts = {key: table.get(key, "") for key in TEXTS}
-    for key, expected in TEXTS.items():
-        if not isinstance(texts[key], str):
-            raise BadConfiguration(f"{where}.{key}: got {texts[key]!r}; expected {expected}")
+    texts = {key: stated_as(table.get(key, ""), str, f"{where}.{key}", expected) for key, expected in TEXTS.items()}
     sign_bit = stated_count(table.get("sign_bit", 0), f"{where}.sign_bit", 0, 63)
     zero = stated_number(table.get("zero", 0.0), f"{where}.zero")
     theirs = tuple(_fill_in_numbers(name, where, numbers) for name in names)
@@ -303,12 +297,6 @@ def _fill_in_numbers(name: str, where: str, numbers: Mapping[str, float]) -> str
         if field in numbers:
             name = name.replace(f"{{{field}}}", f"{numbers[field]:g}")
     return name
-
-
-def _list_of_texts(stated: Any, where: str, form: str = "expected a list of names") -> Names:
-    if not isinstance(stated, list) or not all(isinstance(text, str) and text for text in stated):
-        raise BadConfiguration(f"{where}: got {stated!r}; {form}")
-    return tuple(stated)
 
 
 def merge_columns(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration.data import Json
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_as, stated_number, stated_word
 from calibration.data.input_files import toml_content, toml_text
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model.paper_tables import BENCH, SURFACES
@@ -145,9 +145,7 @@ def load_requirements(path: Path | None) -> Requirements:
         packaged = resources.files("calibration") / "data" / "aims" / f"{PAPER}.toml"
         return parse_requirements(packaged.read_text("utf-8"), f"{PAPER}.toml")
     if not path.is_file():
-        raise BadConfiguration(
-            f"{path}: no such file; expected a TOML file of requirements (see docs/howto/requirements.md)"
-        )
+        raise BadConfiguration(f"{path}: no such file; expected a TOML file (docs/howto/requirements.md)")
     return parse_requirements(toml_text(path, path), path.name)
 
 
@@ -170,10 +168,9 @@ def parse_requirements(text: str, where: str) -> Requirements:
     schema = content.pop("schema", SCHEMA)
     if schema != SCHEMA:
         raise BadConfiguration(f"{where}, schema: got {schema!r}; expected {SCHEMA}")
-    envelope_table = content.pop("envelope", {})
-    if not isinstance(envelope_table, dict):
-        raise BadConfiguration(f"{where}, envelope: got {envelope_table!r}; expected a table of {', '.join(KEYS)}")
-    envelope = _updated_envelope(Envelope(), envelope_table, f"{where}, envelope")
+    place = f"{where}, envelope"
+    envelope_table = stated_as(content.pop("envelope", {}), dict, place, f"a table of {', '.join(KEYS)}")
+    envelope = _updated_envelope(Envelope(), envelope_table, place)
     requirements: list[Requirement] = []
     for name, value in content.items():
         if name not in QUANTITIES:
@@ -230,15 +227,11 @@ def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> 
         if key in RANGES:
             envelope[key] = _parse_range(value, key_path, *RANGES[key])
         elif key == "battery":
-            if not isinstance(value, bool):
-                raise BadConfiguration(f"{key_path}: got {value!r}; expected true or false")
-            envelope[key] = value
-        elif key == "surface" and value not in SURFACES:
-            raise BadConfiguration(f"{key_path}: got {value!r}; {allowed_words(str(value), SURFACES)}")
-        elif not isinstance(value, str):
-            raise BadConfiguration(f"{key_path}: got {value!r}; expected the name of a configuration")
+            envelope[key] = stated_as(value, bool, key_path, "true or false")
+        elif key == "surface":
+            envelope[key] = stated_word(value, SURFACES, key_path, f"got {value!r}")
         else:
-            envelope[key] = value
+            envelope[key] = stated_as(value, str, key_path, "the name of a configuration")
     if "supply_voltage_V" in envelope:
         if envelope.setdefault("battery", False):
             raise BadConfiguration(f"{where}: battery and supply_voltage_V contradict each other; give one of them")
@@ -271,8 +264,7 @@ def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
     if not limits:
         raise BadConfiguration(f"{where}: expected least, most or both [{quantity.unit}]")
-    if not isinstance(source, str):
-        raise BadConfiguration(f"{where}, source: got {source!r}; expected text")
+    stated_as(source, str, f"{where}, source", "text")
     if name != "endurance_min" and (duty is not None or share is not None):
         raise BadConfiguration(f"{where}: duty and share can be used only with endurance_min")
     if name == STAIRS and tread is None:
@@ -310,8 +302,8 @@ def _parse_limit(value: Any, where: str, quantity: Quantity) -> float | None:
 
 
 def _parse_share(duty: Any, share: Any, where: str) -> float:
-    if duty is not None and duty not in DUTIES:
-        raise BadConfiguration(f"{where}, duty: got {duty!r}; {allowed_words(str(duty), DUTIES)}")
+    if duty is not None:
+        stated_word(duty, DUTIES, f"{where}, duty", f"got {duty!r}")
     if share is None:
         return 1.0 if duty == "driving" else 0.0
     share_value = stated_number(share, f"{where}, share", 0.0, 1.0, "")

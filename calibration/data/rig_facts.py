@@ -84,7 +84,7 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     if with_constant and with_resistance:
         size = constant**2 / resistance
         doubt = _reason_if_outside(
-            size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor. Check their units"
+            size, 1e-7, 1.0, "torque_constant and resistance fit no one motor. Check their units"
         )
         yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", doubt)
         if inertia > 0:
@@ -100,9 +100,7 @@ def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
     doubt = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
     if ratio >= STAGES and efficiency > EFFICIENCY:
-        doubt = (
-            f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
-        )
+        doubt = f"an efficiency of {efficiency:g} is high for three or more stages (0.5 to {EFFICIENCY:g})"
     if ratio == 1 and efficiency < 0.9:
         doubt = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
     yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", doubt)
@@ -281,8 +279,8 @@ def jitter_sentence(runs: Runs) -> str:
             run = f" of run {name}" if name else ""
             return (
                 f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
-                f"{three_digits(spread / 2**0.5)} s around even spacing. A fit uses these times unchanged. "
-                f"Replace them by even times, {three_digits(float(np.mean(steps)))} s apart"
+                f"{three_digits(spread / 2**0.5)} s around even spacing. Replace these times by even ones, "
+                f"{three_digits(float(np.mean(steps)))} s apart"
             )
     return ""
 
@@ -297,9 +295,8 @@ def constant_conditions_sentence(runs: Runs) -> str:
         return ""
     return (
         f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: "
-        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row. One level gives one steady "
-        "current and speed, which cannot separate losses that rise with current from losses that rise with "
-        "speed. Log three levels or more, in both directions if the drive reverses"
+        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row. One level does not separate "
+        "losses by current from those by speed. Log three or more, in both directions if the drive reverses"
     )
 
 
@@ -337,9 +334,9 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     row = int(np.flatnonzero(limited)[0])
     return (
-        f"{runs.source} row {row + 1}, {_drive_heading(runs)}: commands {three_digits(drive[row])} V, but current "
-        f"and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. The "
-        f"driver limits the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
+        f"{runs.source} row {row + 1}, {_drive_heading(runs)}: commands {three_digits(drive[row])} V, but "
+        f"current and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the "
+        f"log. Give the voltage that the driver applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -427,8 +424,7 @@ def held_sentence(runs: Runs) -> str:
                     column, last_row = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
                         f"{runs.source} rows {rows[begin] + 1} to {last_row}, {column}: the same reading while "
-                        f"{_drive_heading(runs)} changes, as if the last value was repeated. Empty "
-                        "these cells to use the other rows"
+                        f"{_drive_heading(runs)} changes, like repeats. Empty these cells to use the other rows"
                     )
     return ""
 
@@ -455,8 +451,8 @@ def swapped_sentence(runs: Runs) -> str:
             if both and sums[0] * sums[1] < 0 and min(map(abs, sums)) > SWAPPED:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
-                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
-                    f"{_drive_heading(runs)}. Correct the sign in one of the two parts"
+                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is opposite to "
+                    f"{_drive_heading(runs)}. Correct one part"
                 )
     return ""
 

@@ -10,7 +10,14 @@ from typing import Any
 
 from calibration.data import Json, Names
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
+from calibration.data.input_errors import (
+    BadConfiguration,
+    allowed_words,
+    is_number,
+    stated_as,
+    stated_names,
+    stated_word,
+)
 from calibration.data.writing import toml_value
 from mmrjax.model import channels, params
 from mmrjax.model.paper_robots import DYNAMIC_SHARE
@@ -44,7 +51,7 @@ _LEAST = {"mass_kg", *_TRAVEL}  # must be greater than 0
 #: Default values of a robot without a base, each with its reason. It has no limits and no other losses
 #: (`robots.blank`).
 DEFAULTS: dict[str, tuple[float, str]] = {
-    "motor.inertia": (0.0, "not stated: only the load's inertia counts; time histories from rest need the motor's"),
+    "motor.inertia": (0.0, "not stated: only the load's inertia counts; histories from rest need the motor's"),
     "battery.current_other": (0.0, "not stated: no other consumers on the battery"),
 }
 #: Time constant L / R assumed if the inductance is not stated [s]. Small motors have 0.05 to 1 ms.
@@ -109,8 +116,7 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
         raise BadConfiguration(
-            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of the "
-            "two: the travel per turn, or the radius of a drum or pulley"
+            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of the two"
         )
     if "mass_kg" not in values:
         raise BadConfiguration(f"{where}.mass_kg: missing; expected the mass that it moves [kg]")
@@ -218,10 +224,7 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
 
 def _parse_channels(stated: Any, where: str) -> Names:
     channel_names = channels.channel_names(channels.EVERY)
-    if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
-        raise BadConfiguration(
-            f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(channel_names)}"
-        )
+    stated_names(stated, where, f"a list of channels, at least one of {', '.join(channel_names)}")
     for name in stated:
         stated_word(name, channel_names, where)
         if stated.count(name) > 1:
@@ -231,9 +234,7 @@ def _parse_channels(stated: Any, where: str) -> Names:
 
 def _parse_surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
     table_place = f"{where}, surfaces"
-    if not isinstance(stated, dict):
-        raise BadConfiguration(f"{table_place}: got {stated!r}; expected a table [surfaces]")
-    for name, other in stated.items():
+    for name, other in stated_as(stated, dict, table_place, "a table [surfaces]").items():
         for word in (name, other):
             stated_word(word, loads, f"{table_place}.{name}")
     return tuple(stated.items())
@@ -245,14 +246,10 @@ FREE = "free"
 
 def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
     table_place = f"{where}, instruments"
-    if not isinstance(stated, dict):
-        raise BadConfiguration(f"{table_place}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
     instruments = []
-    for name, table in stated.items():
+    for name, table in stated_as(stated, dict, table_place, f"tables such as [instruments.{names[0]}]").items():
         stated_word(name, names, f"{table_place}.{name}", "the rig has no such channel")
-        if not isinstance(table, dict):
-            raise BadConfiguration(f"{table_place}.{name}: got {table!r}; expected a table [instruments.{name}]")
-        for key in table:
+        for key in stated_as(table, dict, f"{table_place}.{name}", f"a table [instruments.{name}]"):
             stated_word(key, ("signed", "quantum"), f"{table_place}.{name}.{key}", "no such key")
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
         channel = channels.find_channel(name)
@@ -273,8 +270,7 @@ def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[I
 
 def _parse_columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     table_place = f"{where}, columns"
-    if not isinstance(stated, dict):
-        raise BadConfiguration(f"{table_place}: got {stated!r}; expected a table [columns]")
+    stated_as(stated, dict, table_place, "a table [columns]")
     layout, entries = Layout(channels=channels.EVERY), []
     spellings = layout.spellings()
     for own_column, logger_column in stated.items():
@@ -341,9 +337,8 @@ def reject_missing(
         near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
         misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
         raise BadConfiguration(
-            f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter (mmrjax '
-            "rig new "
-            f"writes a file with all of them){misspelt}"
+            f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter '
+            f"(mmrjax rig new writes them){misspelt}"
         )
 
 

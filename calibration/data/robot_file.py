@@ -14,7 +14,14 @@ import jax.numpy as jnp
 from calibration.data import Json, Names, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolve_likes
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
+from calibration.data.input_errors import (
+    BadConfiguration,
+    allowed_words,
+    is_number,
+    stated_as,
+    stated_names,
+    stated_word,
+)
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
@@ -205,9 +212,8 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
         path.name,
         stated.example_numbers(text),
     )
-    present = content.get("effects", {})
-    if not isinstance(present, dict):
-        raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
+    place = f"{path.name}, effects"
+    present = stated_as(content.get("effects", {}), dict, place, "tables such as [effects.churning]")
     for name in present:
         if name not in {**effects.BESIDE, **library}:
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {allowed_words(name, library)}")
@@ -307,13 +313,10 @@ def add_effects(
         effect = library_with_built_in[name]()
         acting = (configurations or {}).get(name, effect.configurations)
         list_place = f"{where}, effects.{name}.configurations"
-        if not isinstance(acting, list | tuple) or not all(isinstance(c, str) for c in acting):
-            raise BadConfiguration(
-                f"{list_place}: got {acting!r}; expected a list of {', '.join(robot.configurations)}"
-            )
+        acting = stated_names(acting, list_place, f"a list of {', '.join(robot.configurations)}", least=0)
         for c in acting:
             stated_word(c, robot.configurations, list_place)
-        present.append(dataclasses.replace(effect, configurations=tuple(acting)))
+        present.append(dataclasses.replace(effect, configurations=acting))
     return dataclasses.replace(robot, effects=tuple(present))
 
 

@@ -88,20 +88,10 @@ class Signal:
         return float(np.isfinite(self.shown).mean())
 
 
-@dataclasses.dataclass(frozen=True)
-class Inertia:
-    """Current needed to accelerate the motors of a configuration.
-
-    Attributes:
-        speed, current: names of channels. `current` is empty if the current is imposed.
-        per_rate: current [A] for one unit of the speed column per second.
-        least: smallest current to which shares refer [A].
-    """
-
-    speed: str
-    current: str
-    per_rate: float
-    least: float
+#: Current needed to accelerate the motors of a configuration: channels of a speed and a current (empty if the current
+#: is imposed), current [A] for one unit of the speed column per second, and the smallest current to which shares
+#: refer [A].
+Inertia = tuple[str, str, float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -632,13 +622,14 @@ def _acceleration_reason(
     acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
 ) -> _Why | None:
     """Reason if acceleration takes too large a share of the current, otherwise None. `lasts`: duration [s]."""
-    if acting.speed not in seen or (acting.current and acting.current not in seen):
+    speed, current, per_rate, least = acting
+    if speed not in seen or (current and current not in seen):
         return None
-    a_second = acting.per_rate / lasts
-    _, sd, change = seen[acting.speed]
-    full_scale = max(abs(seen[acting.current][0] if acting.current else imposed), acting.least)
+    a_second = per_rate / lasts
+    _, sd, change = seen[speed]
+    full_scale = max(abs(seen[current][0] if current else imposed), least)
     share, noise = abs(a_second * change) / full_scale, OF_CHANGE * abs(a_second * sd) / full_scale
-    return ("accelerates", acting.speed, share) if share > drift + SDS * noise else None
+    return ("accelerates", speed, share) if share > drift + SDS * noise else None
 
 
 def _scale_of(signal: Signal, mean: float) -> float:
@@ -981,7 +972,7 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
         currents[""] = 1.0  # of the imposed one
         if is_known and speed and at_motor > 0 and constant > 0:
             per_rate = at_motor / constant * currents[current] / speeds[speed]
-            inertias[name] = Inertia(speed, current, per_rate, least=1e-3)
+            inertias[name] = speed, current, per_rate, 1e-3
     return inertias
 
 

@@ -94,14 +94,13 @@ def check_turns(runs: Runs) -> None:
         columns = f"{pair[0].column} and {pair[1].column}"
         _refuse_against(
             runs, columns, (left_value, right_value), right_value - left_value, drive,
-            "the larger value on the side that is driven faster; the left and right columns of one quantity are "
-            "exchanged",
+            "the larger value on the faster side; left and right columns of one quantity are exchanged",
         )  # fmt: skip
     for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):
         _refuse_against(
             runs, yaw, (runs[yaw],), runs[yaw], right - left,
-            "a positive value if the right side is faster: reverse its sign, in the robot's file with [columns] "
-            f"{yaw} = {{column, factor = -1}}, or exchange the columns of the sides",
+            f"a positive value if the right side is faster: reverse its sign with [columns] {yaw} = {{column, "
+            "factor = -1}, or exchange the columns of the sides",
         )  # fmt: skip
 
 

@@ -130,8 +130,8 @@ class Runs:
         own_columns = {column for c in robot.channels for column in (c.column, c.sd_column)}
         if lost_columns := [column for column in self.unknown if column in own_columns]:
             raise BadData(
-                f"{self.source}, {lost_columns[0]}: this channel of the robot was left out when the table was read; "
-                "read the table with robot=, set to this robot"
+                f"{self.source}, {lost_columns[0]}: the table was read without this channel; read it with "
+                "robot=, set to this robot"
             )
         own_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
         other_columns = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
@@ -293,10 +293,7 @@ class Runs:
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
-            raise BadData(
-                f"{self.source}: no {column}, which is the imposed quantity in the robot's file; the "
-                "table must contain it"
-            )
+            raise BadData(f"{self.source}: no {column}, the imposed quantity of the robot's file; add it")
         set_values = {
             c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)
         }

@@ -201,7 +201,9 @@ def discover(
             tell(progress_remark("others"))
         for f, verdict in verdicts.items():
             try:
-                sensitivity.append(verdict_at_noise(f, verdict.result(left()), ready.numbers))
+                other = verdict.result(left())
+                adequate, summary = not other.ends.test.rejected_with_margin, verdict_summary(other, ready.numbers)
+                sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
     finally:  # an interruption or the time limit waits for none of them
@@ -906,8 +908,8 @@ def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages
     run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
     if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
         return traced
-    if traced.verdict == "mechanism":
-        return dataclasses.replace(traced, verdict="place")
+    if traced.verdict == "mechanism" and traced.mechanism is not None:  # a curve is not simulated
+        return dataclasses.replace(traced, verdict="place") if traced.mechanism.effects else traced
     mechanism = find_mechanism(
         screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
         traced.predicted, windows.settings,
@@ -1088,12 +1090,6 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
-
-
-def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
-    """Verdict and summary at another noise level."""
-    adequate = not traced.ends.test.rejected_with_margin
-    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate)
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:

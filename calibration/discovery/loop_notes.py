@@ -231,6 +231,8 @@ class Mechanism:
         again: share of the informative blocks for which a fit without the block finds it again [-].
         errors: standard error of the gain for each kind of block [nat per reading].
         ammeter: those families that are errors of an ammeter beside a loss.
+        run, changed: run and constant of a log, see `NameTest`, if the constant explains as much by a difference in
+            that run. None and any constant otherwise.
     """
 
     families: Names
@@ -241,6 +243,8 @@ class Mechanism:
     again: float
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
     ammeter: Names = ()
+    run: int | None = None
+    changed: str = ""
 
     @property
     def drivers(self) -> Names:
@@ -267,6 +271,7 @@ class Mechanism:
             "gain": not self.gain > SURE * self.se,
             "again": self.again < AGAIN,
             "many": self.candidates > FEW,
+            "run": self.run is not None,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 

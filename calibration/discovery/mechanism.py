@@ -18,14 +18,14 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import errors_of_ammeters
-from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.discrepancy import BaseCurve, location_columns
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, BETTER, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
 from calibration.discovery.projection import explained_function
-from calibration.discovery.score_tests import family_columns
+from calibration.discovery.score_tests import augment_with_columns, family_columns
 from calibration.discovery.settings import Settings
-from calibration.discovery.standing import evidence_over_curves, recurrence_of_families
+from calibration.discovery.standing import changed_run, evidence_over_curves, kept_readings, recurrence_of_families
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
@@ -53,7 +53,7 @@ def find_mechanism(
     """Mechanism that explains most of the discrepancy of the base fit.
 
     It is the family of library effects that explains most. If no family explains as much as a smooth curve, it is the
-    equation and variable of the curve. For time histories the result is then None.
+    equation and variable of the curve, but not in windows, because no simulation confirms it there.
 
     Args:
         left: diagnosis of the base fit.
@@ -62,8 +62,8 @@ def find_mechanism(
         predicted: hold-out predictions of fits that are already known.
     """
     best, location_families = _best_by_family(space, ladder), _families_of_location(beside.where)
-    curved = not space.bare.observe.over_time
-    if not curved:  # fits of curves take long, and windows have none
+    over_time, linear = space.bare.observe.over_time, left.linear
+    if over_time:  # fits of curves take long, and windows have none
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
@@ -75,7 +75,7 @@ def find_mechanism(
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
     # Families that the curve cannot separate from its own may predict better by an effect.
     other_families = [f for f in location_families if f not in alike and explained[alike[0]] == by_curve]
-    by_name = [f for f in (*alike, *other_families) if f in best and (not curved or by_effects[f] >= HALF * most)]
+    by_name = [f for f in (*alike, *other_families) if f in best and by_effects[f] >= HALF * most]
     blocks = [
         mask
         for blocks_by_name in blocks_room.predictable_blocks(runs, space.bare).values()
@@ -83,11 +83,10 @@ def find_mechanism(
     ]
     mechanisms: list[Mechanism] = []
     excess = excess_misfit(space, base)
-    curve = (
-        ()
-        if not curved or location_families[0] in by_name or location_families[0] not in alike
-        else location_families[:1]
-    )
+    curved = location_families[0] in alike and location_families[0] not in by_name and space.bare.observe.reads
+    curve = location_families[:1] if curved else ()
+    fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    run, changed, root_changed = changed_run(space, linear, bases, *fit) if over_time else (None, "", 0.0)
     for leader in (*by_name[:1], *curve, *by_name[1:]):
         # A driver whose form a curve refutes is no better than those that smooth curves cannot separate.
         refuted = leader in by_name and (
@@ -109,11 +108,15 @@ def find_mechanism(
             if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_recurrence(space, left, bases, families, blocks, settings))
         else:
-            gain, effects = _hold_out_gain_of_curve(space, runs, base, beside, predicted), ()
+            held_out = _linear_gain_of_curve if over_time else _hold_out_gain_of_curve
+            gain, effects = held_out(space, runs, base, beside, predicted), ()
             again = _curve_recurrence(space, left, bases, families, blocks, settings)
         share = share_of_excess(excess, explained.get(leader, 0.0))
         ammeters = errors_of_ammeters(space, families)
-        mechanisms.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors, ammeters))
+        different = run if root_changed**2 >= explained.get(leader, 0.0) else None
+        mechanisms.append(
+            Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors, ammeters, different, changed)
+        )
         if not mechanisms[-1].fails:
             return mechanisms[-1]
     return mechanisms[0] if mechanisms else None
@@ -260,6 +263,39 @@ def _hold_out_gain_of_curve(
     return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
 
 
+def _linear_gain_of_curve(
+    space: CandidateSpace, runs: Runs, base: Candidate, beside: BaseCurve, predicted: Predicted
+) -> Gain:
+    """The gain of `_hold_out_gain_of_curve` for a log, to first order at the base fit.
+
+    A simulated fit of a curve takes minutes, and windows have no simulation. A wave has its own phase in each run, so
+    only parts of runs can be predicted.
+    """
+    linear, rows, kinds = beside.left.linear, len(runs), blocks_room.predictable_blocks(runs, space.bare)
+    if beside.where.variable in bases_room.ORDERS:
+        kinds = {blocks_room.PART: blocks_room.parts_over_time(runs)}
+    columns = location_columns(linear, beside.bases, beside.where)
+    fits = (np.asarray(linear.jacobian), np.asarray(linear.residual)), augment_with_columns(linear, columns)
+
+    def residuals(fit: tuple[np.ndarray, np.ndarray], out: np.ndarray) -> np.ndarray:
+        jacobian, residual = fit
+        kept = np.append(kept_readings(space, out, linear.readings), np.ones(len(residual) - linear.readings, bool))
+        z = np.linalg.lstsq(jacobian[kept], -residual[kept], rcond=None)[0]
+        return (residual + jacobian @ z)[: linear.readings].reshape(len(space.included), -1)[:rows]
+
+    def score(fit: tuple[np.ndarray, np.ndarray]) -> HeldOutScore:
+        nothing = np.zeros((rows, linear.readings // len(space.included)))
+        errors = {
+            kind: sum((np.where(out[:, None], residuals(fit, out), 0.0) for out in by_name.values()), nothing)
+            for kind, by_name in kinds.items()
+        }
+        return prediction.score_readings(errors, nothing, nothing + 1.0, space.weight[:rows] > 0, kinds)
+
+    sd, none = np.asarray(space.bare.data.sd)[:rows], np.zeros(rows, bool)
+    changed = _changed_readings(space, runs, *(sd * residuals(fit, none) for fit in fits))
+    return _gain_over_changed(score(fits[1]), score(fits[0]), changed)
+
+
 def _within_seen_range(space: CandidateSpace, beside: BaseCurve, masks: Sequence[np.ndarray]) -> np.ndarray:
     """True for rows whose value of the curve's variable lies within the range of the rows outside their block, shape
     (rows,).
@@ -335,7 +371,7 @@ def _curve_recurrence(
     A block is informative if half of the information on the curve remains without it. 1 if there is no such block.
     """
     linear, names = left.linear, bases_room.family_names(bases)
-    smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
+    smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES or v in bases_room.ORDERS]
     no_location = DiscrepancyLocation("", "", (), (), 0.0, 0.0)
     akin = [
         dataclasses.replace(no_location, place=names[k][0], variable=names[k][1]).family in families for k in smooth
@@ -348,12 +384,9 @@ def _curve_recurrence(
     ]
     again = []
     for out in blocks:
-        rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
-        kept_readings = np.repeat(~rows, linear.readings // len(rows))
-        kept_residuals = np.concatenate([kept_readings, np.ones(len(residual) - len(kept_readings), bool)])
-        explained = [
-            explained_function(jacobian[kept_residuals], residual[kept_residuals])(c[kept_readings]) for c in columns
-        ]
+        kept = kept_readings(space, out, linear.readings)
+        kept_residuals = np.append(kept, np.ones(len(residual) - len(kept), bool))
+        explained = [explained_function(jacobian[kept_residuals], residual[kept_residuals])(c[kept]) for c in columns]
         explained_by_akin = [f for f, a in zip(explained, akin, strict=True) if a]
         if not explained_by_akin or max(told for _, told in explained_by_akin) < 0.5 * max(explained_before):
             continue

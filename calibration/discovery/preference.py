@@ -105,19 +105,10 @@ def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
     The best fit (index 0) is first if its error is within `TOLD` of the smallest one, because such a difference
     decides nothing.
     """
-    able = _full_predictors(table)
-    least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
-    return sorted(able, key=lambda k: (k != 0 or not _is_draw(table[0], least), table[k].rms_sigma))
-
-
-def _full_predictors(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Indices of alternatives that predict at least as many readings as the first."""
-    return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
-
-
-def _is_draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
-    """True if the hold-out errors of two alternatives differ too little to decide."""
-    return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
+    able = [k for k, a in enumerate(table) if a.lost <= table[0].lost]
+    least = min(table[k].rms_sigma for k in able)
+    is_draw = not table[0].rms_sigma > (1 + TOLD) * least
+    return sorted(able, key=lambda k: (k != 0 or not is_draw, table[k].rms_sigma))
 
 
 def prefer_by_held_out(

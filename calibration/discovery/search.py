@@ -156,26 +156,21 @@ def _extend_set(
     names = _names_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
-        for pair in _best_pairs(space, left.scores):
+        effect, effect_names = space.library.of, space.library.names
+        pair_scores = np.triu(np.asarray(left.scores.pair))
+        pairs: list[tuple[str, str]] = []
+        for flat in np.argsort(-pair_scores, axis=None)[:PAIRS]:
+            i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
+            if i != j and (effect_names[i], effect_names[j]) not in pairs:
+                pairs.append((effect_names[i], effect_names[j]))
+            if len(pairs) == _batch_size(space):
+                break
+        for pair in pairs:
             pair_set, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if pair_set not in sources and swapped not in sources:
                 sources[pair_set] = (base, left)
     wanted = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
     return fit_in_addition(space, wanted, settings)
-
-
-def _best_pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
-    """As many pairs of effects as fit in one batch, by their joint score, strongest first."""
-    effect, names = space.library.of, space.library.names
-    pair = np.triu(np.asarray(scores.pair))
-    pairs: list[tuple[str, str]] = []
-    for flat in np.argsort(-pair, axis=None)[:PAIRS]:
-        i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
-        if i != j and (names[i], names[j]) not in pairs:
-            pairs.append((names[i], names[j]))
-        if len(pairs) == _batch_size(space):
-            break
-    return pairs
 
 
 def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:

@@ -306,7 +306,7 @@ def judge_each_name(
             signatures = after.linear.signatures
         row, root_without, changed, root_changed = None, math.inf, "", 0.0
         if over_time:
-            row, changed, root_changed = _changed_run(space, linear, bases, *beside[:2])
+            row, changed, root_changed = changed_run(space, linear, bases, *beside[:2])
         else:
             row, root_without = _most_influential_row(space, *beside)
         full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
@@ -520,9 +520,9 @@ def _recurrence(
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
     best_score = _projected_columns(*beside)[0].max()
     for out in blocks:
-        kept_readings = _kept_readings(space, out, len(signatures))
-        kept_signatures = signatures[kept_readings]
-        j, e, kept_parts = _restrict_readings(kept_readings, *beside)
+        kept = kept_readings(space, out, len(signatures))
+        kept_signatures = signatures[kept]
+        j, e, kept_parts = _restrict_readings(kept, *beside)
         if _projected_columns(j, e, kept_parts)[0].max() < 0.5 * best_score:
             continue
         roots = _score_roots(j, e, kept_signatures)
@@ -542,13 +542,13 @@ def _most_influential_row(
     for row in rows if len(rows) > 2 else ():
         out = np.arange(len(space.included)) == row
         root = _largest_root(
-            *_restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
+            *_restrict_readings(kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
         )
         least = (int(row) + 1, root) if root < least[1] else least
     return least
 
 
-def _changed_run(
+def changed_run(
     space: CandidateSpace, linear: Linearization, bases: Bases, jacobian: np.ndarray, residual: np.ndarray
 ) -> tuple[int | None, str, float]:
     """Run, constant and root of the best explanation by one constant that differs in one run. None for one run.
@@ -570,7 +570,7 @@ def _changed_run(
     for k, rows in runs if len(runs) > 1 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
-        inside = np.flatnonzero(~_kept_readings(space, out, readings))
+        inside = np.flatnonzero(~kept_readings(space, out, readings))
         of_run = constants[inside]
         norm2, scores = np.sum(of_run**2, 0), of_run.T @ projected_residual[inside]
         left = norm2 - np.sum((half[:, inside] @ of_run) ** 2, 0)
@@ -581,7 +581,7 @@ def _changed_run(
     return best
 
 
-def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
+def kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
     """True for readings that remain after some rows are left out, including padding, shape (readings,)."""
     rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
     return np.repeat(~rows, readings // len(rows))

@@ -80,13 +80,8 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
 
 
 def parts_over_time(runs: Runs) -> Columns:
-    """Label → mask of its rows, for `PARTS` consecutive parts of each run.
-
-    Empty if a configuration has several runs, because then whole runs are blocks.
-    """
+    """Label → mask of its rows, for `PARTS` consecutive parts of each run."""
     names, run = np.unique(runs.run_names, return_inverse=True)
-    if len(names) > len(np.unique(runs["configuration"])):
-        return {}
     part = np.zeros(len(runs), int)
     for k in range(len(names)):
         time = runs["time_s"][run == k]
@@ -102,8 +97,9 @@ def blocks_of_kind(runs: Runs, by: str) -> Columns:
     """
     if by == TURN:
         return blocks_by_sharpness(runs) if runs.turns else {}
-    if by == PART:
-        return parts_over_time(runs)
+    if by == PART:  # whole runs are blocks if a configuration has several
+        several = len(np.unique(runs.run_names)) > len(np.unique(runs["configuration"]))
+        return {} if several else parts_over_time(runs)
     columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}

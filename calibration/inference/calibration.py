@@ -321,8 +321,8 @@ def _search(
         search_result = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
         endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in search_result.items())
         raise BadConfiguration(
-            f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
-            f"in: {endings or 'none'}); begin from another robot, or free fewer parameters"
+            f"--population: none of {len(everyone.z)} members runs in every row (ended in: {endings or 'none'}); "
+            "begin from another robot, or free fewer parameters"
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, best_member)
     tell(progress_remark("derivatives"))

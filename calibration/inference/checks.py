@@ -222,12 +222,12 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
     size, name, unit = f"{float(f'{scatter:.2g}'):g}", channel.name, channel.unit
     if driven:
         raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {channel.column}: readings are noise about zero ({size} {unit}), "
-            f"so nothing moves; log it while it moves, or of a locked shaft state --noise {name}={size}{unit}"
+            f"{runs.source} rows 1 to {len(runs)}, {channel.column}: readings are noise about zero ({size} "
+            f"{unit}), so nothing moves; log motion, or for a locked shaft set --noise {name}={size}{unit}"
         )
     raise BadData(
-        f"{runs.source} rows 1 to {len(runs)}, {imposed}: nothing drives the motors and nothing moves; expected rows "
-        "in which they are driven; if another column drives them, name it under [columns] in the rig's file"
+        f"{runs.source} rows 1 to {len(runs)}, {imposed}: nothing drives the motors and nothing moves; log "
+        "driven motion, or name the column that drives them under [columns]"
     )
 
 
@@ -239,7 +239,7 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
     if readings >= needed * channels_with_readings:
         return
     also = f" and estimate {levels} noise levels" if levels else ""
-    cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
+    cure = "fix some with --fix, or set --noise" if levels else "fix some with --fix"
     is_complete = readings == len(runs) * channels_with_readings
     rows = count_noun(len(runs), "row")
     have = (
@@ -273,7 +273,7 @@ def _check_stuck_channels(runs: Runs) -> list[Remark]:
                 stiff.append(Remark("stiff_supply", column=channel.column, value=float(readings[0])))
                 continue
             raise BadData(
-                f"{runs.source}, {channel.column}: {readings[0]:g} in every row although the conditions vary; "
+                f"{runs.source}, {channel.column}: {readings[0]:g} in every row although conditions vary; "
                 f"{'nothing moved, ' * channel.zero_at_rest}the instrument was stuck or the column is a copy"
             )
     return stiff
@@ -313,14 +313,14 @@ def infeasible_error(
     if not slides.any():
         words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
         return BadConfiguration(
-            f"no start is feasible: the model has no result in {runs.source} rows {listed(lost)} ({words} at the "
-            "best point found); check their conditions, or widen the priors"
+            f"no start is feasible: the model has no result in {runs.source} rows {listed(lost)} ({words} at "
+            "best); check their conditions, or widen the priors"
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
     parameter = {c: f"{c}.ground.friction.static" for c in sliding}
     frictions = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
-        f"no start is feasible: {runs.source} rows {listed(slides)} were measured in steady travel, but the model "
-        f"slides there ({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
+        f"no start is feasible: {runs.source} rows {listed(slides)} were steady, but the model slides there "
+        f"({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
     )

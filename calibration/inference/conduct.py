@@ -59,15 +59,10 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
                     total=len(runs),
                 )
             )
-    return notes or _time_shift_remarks(runs, off)
-
-
-def _time_shift_remarks(runs: Runs, off: np.ndarray) -> list[Remark]:
-    """Remarks on channels whose error is mostly a shift in time: it is proportional to the simulated rate of
-    change.
-    """
-    notes, time = [], runs["time_s"]
-    rows_of_runs = list(runs.rows_by_run().values())
+    if notes:
+        return notes
+    # An error that is mostly a shift in time is proportional to the simulated rate of change.
+    time, rows_of_runs = runs["time_s"], list(runs.rows_by_run().values())
     for k, channel in enumerate(runs.channels):
         simulated, rate = runs.measured()[:, k] + off[:, k], np.zeros(len(runs))
         for rows in (r for r in rows_of_runs if len(r) > 1 and np.ptp(time[r]) > 0):

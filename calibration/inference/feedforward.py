@@ -154,8 +154,8 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     if len(windows["u"]) < WINDOWS:
         lacking = f"; missing: {', '.join(missing)}" if missing else ""
         raise BadData(
-            f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected the four tests of "
-            f"SysId{lacking}"
+            f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected SysId's four "
+            f"tests{lacking}"
         )
     if _fit_constants(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))
@@ -174,8 +174,16 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     sds = np.sqrt(np.diag(covariance))
     constants, spread = (dict(zip(CONSTANTS, x.tolist(), strict=False)) for x in (values, sds))
     if mechanism == "simple":
-        remarks += _direction_remarks(windows)
-    remarks += _battery_remarks(log)
+        # A constant voltage beside friction is half the difference of both directions.
+        with_bias, variances, _ = _fit_constants(windows, "elevator")
+        half, sd = with_bias[3], np.sqrt(variances[3, 3])
+        forward, backward = float(with_bias[0] + half), float(with_bias[0] - half)
+        if {*np.sign(windows["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(with_bias[0]):
+            remarks.append(Remark("feedforward_direction", forward=forward, backward=backward))
+    if log.battery is not None and np.isfinite(log.battery).any():
+        highest, lowest = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
+        if lowest < 0.9 * highest:
+            remarks.append(Remark("feedforward_sag", rest=highest, low=lowest))
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
     share = Z95 * spread["kA"] / constants["kA"]
@@ -416,17 +424,3 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
         material = misfit - cost > LEAST**2 * np.sum(w["dv"][above_limit] ** 2)
         bend, values = float(slope[-1] / slope[0]), slope[1:] / slope[0]
     return level, bend, cost if material else np.inf
-
-
-def _direction_remarks(w: Columns) -> Iterator[Remark]:
-    values, covariance, _ = _fit_constants(w, "elevator")  # a constant voltage beside friction is half the difference
-    half, sd = values[3], np.sqrt(covariance[3, 3])
-    if {*np.sign(w["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(values[0]):
-        yield Remark("feedforward_direction", forward=float(values[0] + half), backward=float(values[0] - half))
-
-
-def _battery_remarks(log: DriveLog) -> Iterator[Remark]:
-    if log.battery is not None and np.isfinite(log.battery).any():
-        highest, lowest = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
-        if lowest < 0.9 * highest:
-            yield Remark("feedforward_sag", rest=highest, low=lowest)

@@ -97,7 +97,7 @@ def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
     if not observe.axis:
         names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:
-        raise BadConfiguration("nothing to determine: every loss is zero and therefore fixed; give yours with a ±")
+        raise BadConfiguration("nothing to determine: every loss is zero; give yours with a ±")
     coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)
     posed = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
     z = jnp.zeros(len(names))

@@ -138,8 +138,9 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
         size, relative = shares.get(k, (START, True))
         if relative and not np.any(measured[finite, k] != 0):
             raise BadData(
-                f"{runs.source}: {channel.name} reads 0 in every row{', so nothing moves' * channel.zero_at_rest}; "
-                f"log it while it changes, or state its noise in {channel.unit} with --noise"
+                f"{runs.source}: {channel.name} reads 0 in every "
+                f"row{', so nothing moves' * channel.zero_at_rest}; log it while it changes, or give its noise "
+                f"in {channel.unit} with --noise"
             )
         sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")

@@ -282,7 +282,7 @@ def loop_parameter_names(
         drive, chassis: further parameters that the data determine, see `Observer.free`.
         idle: as in `names_to_fit`.
     """
-    present = set(configurations)
+    present, fields = set(configurations), parameters_by_name(robot)
     names = [
         name
         for c in robot.configurations
@@ -290,7 +290,7 @@ def loop_parameter_names(
         for name in (
             *friction_names(robot, c),
             *([f"{c}.radius"] if robot.shows_travel else []),
-            *(f"{c}.{n}" for n in chassis if _parameter_is_nonzero(robot, c, n)),
+            *(f"{c}.{n}" for n in chassis if f"{c}.{n}" in fields and float(fields[f"{c}.{n}"].value) != 0.0),
         )
     ]
     names = [n for n in names if _leading_parameter(robot, n) is None]
@@ -315,12 +315,6 @@ def _leading_parameter(robot: Robot, name: str) -> str | None:
     configuration, _, key = name.partition(".")
     leader = dict(robot.rig.surfaces).get(configuration)
     return None if leader is None or key.startswith(GROUND) else f"{leader}.{key}"
-
-
-def _parameter_is_nonzero(robot: Robot, configuration: str, name: str) -> bool:
-    """True if a load has a parameter of this name that is not zero."""
-    field = parameters_by_name(robot).get(f"{configuration}.{name}")
-    return field is not None and float(field.value) != 0.0
 
 
 #: Parameters of the drive that act only on the voltage.
@@ -375,8 +369,8 @@ def choose_free_names(
     names = [n for n in dict.fromkeys(free_names if free else default) if n not in fixed]
     if not names and not fix:
         raise BadConfiguration(
-            "no parameter to fit: every loss in the robot's file is zero or exact, so it is fixed, and no value "
-            "has a ±; give unknown values one, or name a parameter with --free"
+            "no parameter to fit: every loss is zero or exact, and no value has a ±; give values a ±, or name a "
+            "parameter with --free"
         )
     if not names:
         raise BadConfiguration("--fix leaves no parameter to fit; name at least one with --free")
@@ -429,7 +423,7 @@ def parse_prior(text: str) -> tuple[str, float, float]:
     except ValueError:
         raise BadConfiguration(f"--prior {text}: {form}") from None
     if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
-        raise BadConfiguration(f"--prior {text}: the sd must be a positive number; {form}")
+        raise BadConfiguration(f"--prior {text}: expected a positive sd; {form}")
     return match["name"], mean, sd
 
 
@@ -472,9 +466,7 @@ def parameter_coordinates(
     fields = parameters_by_name(robot)
     for name in names:
         if name in robot.rig.exact and name not in stated:
-            raise BadConfiguration(
-                f"--free {name}: the robot's file states it as exact (± 0); state how sure it is with --prior"
-            )
+            raise BadConfiguration(f"--free {name}: the robot's file states ± 0; state its ± with --prior")
     for name in stated:
         if name not in fields:
             raise BadConfiguration(
@@ -528,11 +520,11 @@ def _coordinate_of_parameter(
     if not low <= mean <= high:
         raise BadConfiguration(f"--prior {parameter.name}: got {mean:g}; expected {low:g} to {high:g} {spec.unit}")
     if stated is not None and not 0 < sd < math.inf:
-        raise BadConfiguration(f"--prior {parameter.name}: got a standard deviation of {sd:g}; expected more than 0")
+        raise BadConfiguration(f"--prior {parameter.name}: got an sd of {sd:g}; expected more than 0")
     if sd <= 0:
         raise BadConfiguration(
-            f"--free {parameter.name}: its prior has no width (nominal value 0 with a relative sd); "
-            f"state one with --prior {parameter.name}=value±sd"
+            f"--free {parameter.name}: its prior has no width (value 0 with a relative sd); state one with "
+            f"--prior {parameter.name}=value±sd"
         )
     if spec.relative_sd is None or low < 0 or mean <= 0:
         return mean, sd, low, high, False

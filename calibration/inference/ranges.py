@@ -79,7 +79,9 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
             continue
         units = _possible_units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (
-            unknown or kind.axis or _may_be_slip(robot, channel, factor)
+            unknown
+            or kind.axis
+            or (not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1)
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _range_factor(measured[:, k], possible[1:2, :, k])
@@ -192,11 +194,6 @@ def _possible_units(channel: Channel, measured: np.ndarray, possible: np.ndarray
     return sorted((u for u, x in distance.items() if x < math.log(ALIKE)), key=distance.__getitem__)
 
 
-def _may_be_slip(robot: Robot, channel: Channel, factor: float) -> bool:
-    """True if a low speed may be due to slip of tracks or wheels on an unspecified ground."""
-    return not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1
-
-
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     """Rejects a gear ratio if its inverse is the ratio of motor and output speeds."""
     readings = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
@@ -215,11 +212,9 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     measured_ratio = float(np.median(turns)) if turns.size else ratio
     if abs(math.log(measured_ratio * ratio)) < math.log(SAID):
         raise BadData(
-            f"{runs.source}: the motor turns about {float(f'{measured_ratio:.2g}'):g} times for one turn "
-            "of the output, "
-            f"but gearbox.ratio is {float(f'{ratio:.4g}'):g}: is it upside down? expected motor "
-            "turns per turn "
-            "of the output"
+            f"{runs.source}: the motor turns about {float(f'{measured_ratio:.2g}'):g} times for one turn of the "
+            f"output, but gearbox.ratio is {float(f'{ratio:.4g}'):g}: is it upside down? expected motor turns "
+            "per output turn"
         )
 
 
@@ -233,9 +228,8 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
             f"{runs.source}, total_mass_kg: about {float(f'{ratio:.2g}'):g} times too {size} for this robot "
-            f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check the "
-            "unit, kg, and the "
-            "mass in the robot's file"
+            f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check its unit, kg, and "
+            "the robot's mass"
         )
 
 

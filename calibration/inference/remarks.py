@@ -22,7 +22,12 @@ def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
     shares = ((c.name, found.noise[c.name].estimated_percent) for c in found.channels)
     if estimated := tuple((name, percent) for name, percent in shares if percent is not None):
         yield Remark("estimated_noise", percent=estimated)
-    yield from _search_remarks(found)
+    if not found.converged:
+        yield Remark("unsettled", names=found.undetermined)
+    if not found.profiled:
+        yield Remark("not_profiled")
+    if found.starts.agree < len(found.starts.cost):
+        yield found.starts.agreement
     yield from (Remark("residual_cluster", cluster=c) for c in found.residual_clusters)
     for k, word in enumerate(STATUSES):
         if k not in DONE and np.any(found.status == word):
@@ -42,15 +47,6 @@ def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for kind, block_errors in found.held_out.items():
         if not all(block.converged for block in block_errors.blocks.values()):
             yield Remark("block_not_converged", kind=kind)
-
-
-def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    if not found.converged:
-        yield Remark("unsettled", names=found.undetermined)
-    if not found.profiled:
-        yield Remark("not_profiled")
-    if found.starts.agree < len(found.starts.cost):
-        yield found.starts.agreement
 
 
 def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:

@@ -137,7 +137,15 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
     significant = [one for one in clusters if one[0] < LEVEL]
     if not significant:
         return ()
-    strongest = _permuted_p_values(channel_tests, seed)
+    # Smallest p-value of all tests for each permutation of the residuals.
+    random = np.random.default_rng(seed)
+    longest = max(len(tested.left) for _, tested in channel_tests)
+    times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
+    strongest = np.ones(times)
+    for _, tested in channel_tests:
+        permuted = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
+        for _, p_values in tested.p_values(tested.project_out(permuted)):
+            strongest = np.minimum(strongest, p_values)
     floor = 1 / (1 + len(strongest))
     answer: list[ResidualCluster] = []
     for k, tested in channel_tests:
@@ -497,19 +505,6 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
                 return indicators
             indicators = added_columns
     return indicators
-
-
-def _permuted_p_values(made: Sequence[tuple[int, _ChannelTests]], seed: int) -> np.ndarray:
-    """Smallest p-value of all tests for each permutation of the residuals, shape (permutations,)."""
-    random = np.random.default_rng(seed)
-    longest = max(len(tested.left) for _, tested in made)
-    times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
-    strongest = np.ones(times)
-    for _, tested in made:
-        permuted = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
-        for _, p in tested.p_values(tested.project_out(permuted)):
-            strongest = np.minimum(strongest, p)
-    return strongest
 
 
 def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:

@@ -41,9 +41,7 @@ def analyse_sensitivity(
     if method not in METHODS:
         raise BadConfiguration(f"--method: got {method}; expected one of {', '.join(METHODS)}")
     if inputs.is_posterior and method != "local":
-        raise BadConfiguration(
-            f"--method {method}: needs independent inputs, and those of a posterior are correlated; expected local"
-        )
+        raise BadConfiguration(f"--method {method}: needs independent inputs, unlike a posterior's; expected local")
     long = fidelities.fidelity_facts(model.fidelity).rollout or any(o in derived.OF_START for o in model.outputs)
     usual = EVALUATIONS_LONG if long else EVALUATIONS
     evaluations = usual if evaluations is None else evaluations
@@ -55,9 +53,7 @@ def analyse_sensitivity(
         raise BadConfiguration(_no_point_message(study, studies.statuses))
     idle = inert_inputs(study, studies, seed)
     if idle.all():
-        raise BadConfiguration(
-            "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
-        )
+        raise BadConfiguration("--parameters: every derivative is zero; choose others, or change --outputs")
     parts: dict[str, PartialResult] = {}
     if method != "local":
         study.tell(Remark("sampling", method=method, points=len(study.points)))
@@ -150,8 +146,8 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
 def _no_point_message(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     status_words = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
-        f"no operating point can be studied, because too many robots do not travel there ({status_words}). Choose "
-        "smaller --slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
+        f"too many robots do not travel at any operating point ({status_words}). Choose smaller --slopes, "
+        "another --voltages, or calibrate the adhesion"
     )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from calibration.data import Columns, Names
 from calibration.data.contradictions import reason_without_stance
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import outputs as table_of_outputs
@@ -96,13 +96,10 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
         for name in start if word == "start" else (word,):
             if not turns and name in of_turns and name not in channels.channel_names(robot.channels):
                 raise BadConfiguration(
-                    f"--outputs {name}: the robot travels straight; vary the drive of its sides independently, e.g. "
-                    f"--vary {OF_SIDES[0]}=0.2:0.8"
+                    f"--outputs {name}: the robot travels straight; drive its sides differently, e.g. --vary "
+                    f"{OF_SIDES[0]}=0.2:0.8"
                 )
-            if name not in outputs:
-                raise BadConfiguration(
-                    f"--outputs {name}: no such output; {allowed_words(name, [*outputs, 'start'])}"
-                )
+            stated_word(name, [*outputs, "start"], f"--outputs {name}", "no such output")
             if (row := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
                 raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which has no ground")
             if lacking := robot.unknown(row.rests_on):
@@ -111,7 +108,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                 )
             if turns and row in derived.OF_STRAIGHT:
                 raise BadConfiguration(
-                    f"--outputs {word}: only for straight travel; the varied inputs make the robot turn"
+                    f"--outputs {word}: only for straight travel, but varied inputs make the robot turn"
                 )
             if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")

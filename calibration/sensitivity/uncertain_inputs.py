@@ -168,8 +168,8 @@ def inputs_from_priors(
     for name in names:
         if not by_name[name].spec.prior_sd(float(by_name[name].value)) > 0:
             raise BadConfiguration(
-                f"--parameters {name}: its prior has no width (nominal value 0 with a relative sd), so nothing "
-                "depends on it; give it a value with --set, or remove it"
+                f"--parameters {name}: its prior has no width (value 0 with a relative sd); give it a value with "
+                "--set, or remove it"
             )
     try:
         coordinates = priors.parameter_coordinates(robot, names) if names else None

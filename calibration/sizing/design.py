@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Json, Names
-from calibration.data.requirements_file import Envelope, Requirement, Requirements
+from calibration.data.requirements_file import Requirement, Requirements
 from calibration.sizing import sheet
 from calibration.sizing.part_options import PartOptions
 from mmrjax.derived.requirements import (
@@ -150,7 +150,13 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
         demands.append(
             SizingDemand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner))
         )
-    middle = row(_envelope_middle(robot, asked.envelope))
+    e = asked.envelope
+    middle_demand = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
+        e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
+        state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
+        supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
+    ))  # fmt: skip
+    middle = row(jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle_demand)))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
     demands += [SizingDemand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
     points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *envelope_points)
@@ -192,15 +198,6 @@ def _envelope_corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[t
         charges = [*(high + (r.envelope.charge_end - high) * nodes), r.envelope.charge_end]
         return [tuple(dataclasses.replace(p, charge=jnp.asarray(float(c))) for c in charges) for p in corners]
     return [(p,) for p in corners]
-
-
-def _envelope_middle(robot: Robot, e: Envelope) -> EnvelopePoint:
-    middle = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
-        e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
-        state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
-        supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
-    ))  # fmt: skip
-    return jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle))
 
 
 def evaluate_design(asked: SizingTask, design: Design) -> tuple[Array, Array]:

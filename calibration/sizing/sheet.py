@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from calibration.data import Json, Names
 from calibration.data.contradictions import reason_without_stance
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
 from calibration.inference.fit_notes import Remark, progress_remark
 from mmrjax.compile.compiling import compiled
@@ -128,11 +128,9 @@ def reject_impossible(robot: Robot, asked: Requirements) -> None:
     for r in asked.each:
         e = r.envelope
         requirement_place = f"{asked.source}, {r.name}"
-        if e.configuration and e.configuration not in robot.configurations:
-            raise BadConfiguration(
-                f"{requirement_place}: the robot has no configuration {e.configuration}; "
-                f"{allowed_words(e.configuration, robot.configurations)}"
-            )
+        if e.configuration:
+            wrong = f"the robot has no configuration {e.configuration}"
+            stated_word(e.configuration, robot.configurations, requirement_place, wrong)
         turns = r.quantity.group in ("turn", "across")
         if turns and (why := turn_error(robot, (_configuration_name(robot, e),))):
             raise BadConfiguration(f"{requirement_place}: {why}")
@@ -144,8 +142,8 @@ def reject_impossible(robot: Robot, asked: Requirements) -> None:
         if SLOPE in r.quantity.axes and e.slope_deg[1] > steepest:
             raise BadConfiguration(
                 f"{requirement_place}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
-                f"{_configuration_name(robot, e)} up to {steepest:.1f} deg at most (adhesion {friction:.2f}), "
-                "whatever drives it"
+                f"{_configuration_name(robot, e)} up to {steepest:.1f} deg (adhesion {friction:.2f}), whatever "
+                "drives it"
             )
 
 

@@ -54,11 +54,11 @@ def join_slopes(angles: Sequence[float]) -> str:
 ACTS = {
     "zero current": "Switch the motors off and read the ammeter",
     "zero reading": "Switch the motors off, with the shaft at rest and unloaded, and read the {}",
-    "shunt": "Replace the robot with a load in series with a precision shunt, set {} on the shunt, and read the "
-    "ammeter",
+    "shunt": (
+        "Replace the robot with a load and a precision shunt in series, set {} on the shunt, and read the ammeter"
+    ),
     "strobe": "Set the motor to {} with a stroboscope and read the tachometer",
-    "timing": "Drive at {} between two light gates a measured distance apart, and compare the timed speed with "
-    "the speed that the bench shows",
+    "timing": "Drive at {} between two light gates a measured distance apart, and compare both speeds",
 }
 #: Units of what they set.
 UNITS = {"shunt": "A", "strobe": "rad/s", "timing": "m/s", "zero current": ""}
@@ -91,10 +91,7 @@ def _act(act: menu.CalibrationAct) -> str:
             len(configurations), "in each configuration, "
         )
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
-        return (
-            f"Weigh the robot {configuration_words}{laden}on scales accurate to 20 g, and compare the readings with "
-            "the total mass in the robot file"
-        )
+        return f"Weigh the robot {configuration_words}{laden}to within 20 g, and compare with the robot file"
     (kind,) = act.kinds
     if act.channel:
         return ACTS[kind].format(channels.find_channel(act.channel).label)
@@ -132,7 +129,7 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
         allowed: permitted temperature, None if unknown [°C].
     """
     settles = math.isfinite(temperature)
-    would = f"would reach {temperature:.0f} °C" if settles else "would burn out, as its temperature never settles"
+    would = f"would reach {temperature:.0f} °C" if settles else "would burn out"
     return f"a winding that stays energised {would}{'' if allowed is None else _temperature_limit(allowed)}"
 
 
@@ -150,8 +147,8 @@ def instruction_for_further_runs(what: SimpleNamespace) -> str:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
         return (
             "Mark the driving shaft, start every run with it at the mark, and record steady travel at "
-            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. A disturbance that "
-            f"keeps {what.variable} at every speed comes from the part that turns at that rate"
+            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. The part that turns at "
+            f"{what.variable} at every speed causes it"
         )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
@@ -160,7 +157,7 @@ def instruction_for_further_runs(what: SimpleNamespace) -> str:
         by_kind = _of_level(what)
     else:
         by_kind = {} if what.within.has_ground else _of_shaft(what)
-    last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its whole range"
+    last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
     return (_advice_by_variable(what) | by_kind).get(what.variable, last)
 
 
@@ -168,18 +165,14 @@ def _repeat_instruction(happens: bases.Window) -> str:
     """The same runs, where something happens for a while or at one level."""
     if happens.axis == "order":
         return (
-            f"Make runs {happens.low:.0f} to {happens.high:.0f} again, with as many runs before and after them, "
-            "in another order. An error that returns depends on the conditions of these runs. An error that does "
-            "not return was an event at that time"
+            f"Make runs {happens.low:.0f} to {happens.high:.0f} again in another order, with as many before and "
+            "after. An error that returns depends on their conditions, else it was an event"
         )
     if happens.axis != "time":
-        return (
-            f"Make the runs at {happens.words} again on another day, with as many runs slightly below and "
-            "slightly above that level"
-        )
+        return f"Make the runs at {happens.words} again on another day, with as many slightly below and above"
     return (
-        f"Repeat two of the runs, sampled as finely as the instruments allow from {happens.low:.3g} to "
-        f"{happens.high:.3g} s. In one of them, switch nothing during that time"
+        f"Repeat two runs, sampled as finely as possible from {happens.low:.3g} to {happens.high:.3g} s. In one, "
+        "switch nothing in that time"
     )
 
 
@@ -214,18 +207,27 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
     )
     return {
         "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
-        "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current covers the "
-        f"range from no load to about {within.current * within.motors:.2g} A evenly",
+        "current": (
+            f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current covers no load to "
+            f"about {within.current * within.motors:.2g} A evenly"
+        ),
         "speed_motor": f"Repeat on the level, unladen, with {crawl}",
-        "slope": f"Repeat at one voltage and payload with the slope from 0 to {what.slope:g} deg in steps of "
-        f"{angle:g} deg, and downhill",
-        "payload": f"Repeat at one voltage and slope with the payload from 0 to {what.payload:g} kg in steps of "
-        f"{mass:g} kg",
-        "speed": "Repeat on the level, unladen, with the travelling speed in equal steps from a crawl to its "
-        f"maximum, about {within.speed:.2g} m/s at {high:g} V",
-        "time": f"Record one condition for ten minutes from a cold start, at no more than {low:g} V, and repeat "
-        f"it at once while everything is warm. Watch the winding's temperature{_temperature_limit(within.hot)}",
-        "order": "Repeat the table in reverse order, and repeat one condition after every fifth run",
+        "slope": (
+            f"Repeat at one voltage and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} "
+            "deg, and downhill"
+        ),
+        "payload": (
+            f"Repeat at one voltage and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
+        ),
+        "speed": (
+            "Repeat on the level, unladen, with the speed in equal steps from a crawl to about "
+            f"{within.speed:.2g} m/s at {high:g} V"
+        ),
+        "time": (
+            f"Record one condition for ten minutes from a cold start, at no more than {low:g} V, and again while "
+            f"warm. Watch the winding's temperature{_temperature_limit(within.hot)}"
+        ),
+        "order": "Repeat the table in reverse order, with one condition after every fifth run",
     }
 
 
@@ -239,10 +241,10 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
     turning = f"with the {name}{_up_to(levels[0], what.runs, levels[1])}"
     words = {
         "speed_motor": f"{level} {turning}",
-        "speed": f"{level} {turning}, which also varies the travelling speed",
+        "speed": f"{level} {turning}",
         "slope": f"Repeat at one {name} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
         "payload": f"Repeat at one {name} and slope with the payload from 0 to {what.payload:g} kg",
-        "time": f"Repeat at one {name} for ten minutes from a cold start, and again at once while everything is warm",
+        "time": f"Repeat at one {name} for ten minutes from a cold start, and again while warm",
     }
     if not within_words.has_ground:
         words["current"] = (
@@ -271,30 +273,31 @@ def _of_shaft(what: SimpleNamespace) -> dict[str, str]:
 
 #: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "nothing_possible": "Every experiment that the loop can propose is forbidden or not possible on this bench",
-    "no_menu": "The loop can propose experiments for straight travel only, not for {word}",
+    "nothing_possible": "Every experiment of the menu is forbidden or impossible on this bench",
+    "no_menu": "The menu has no experiments for {word}",
     "nothing_tells": lambda names, sigma: (
-        f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} σ. "
-        "Repeat the runs to average out the noise, or measure one of these parts on its own"
+        f"No experiment of the menu separates {' and '.join(names)} by {sigma:g} σ. Repeat the runs to average "
+        "out noise, or measure one part alone"
     ),
-    "too_weak": "A series of runs over {variable} would show the missing term with only {sigma:.1f} σ. "
-    "Repeat the runs to average out the noise",
+    "too_weak": (
+        "Runs over {variable} would show the missing term with only {sigma:.1f} σ. Repeat them to average out noise"
+    ),
     "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
-        f"{instruction_for_further_runs(SimpleNamespace(**series))}. Read every channel. The series shows how the "
-        f"term that is missing in the {bases.place_in_words(series['place'])} depends on this variable"
+        f"{instruction_for_further_runs(SimpleNamespace(**series))}. Read every channel. This shows how the "
+        f"missing term of the {bases.place_in_words(series['place'])} depends on it"
     ),
     "overspeed": lambda speed, limit, voltage: (
-        f"the motor speed: expect about {speed / RPM:.0f} rpm unloaded at {voltage:g} V and do not exceed "
-        f"{limit / RPM:.0f} rpm. Raise the voltage slowly"
+        f"the motor speed: about {speed / RPM:.0f} rpm unloaded at {voltage:g} V, at most {limit / RPM:.0f} rpm. "
+        "Raise the voltage slowly"
     ),
     "overvoltage": "the supply: {voltage:g} V is above the highest voltage in the table, {used:g} V",
     "held_motor": lambda current, **heat: (
         f"the heating: {current:.2g} A flow through a stationary, uncooled motor, and {heated_winding(**heat)}. "
-        "Switch off within seconds and let the motor cool between readings"
+        "Switch off within seconds and let the motor cool"
     ),
     "braked_motor": lambda **heat: (
-        f"the brake and the winding's temperature: {heated_winding(**heat)}. A few seconds are enough for a reading"
+        f"the brake and the winding's temperature: {heated_winding(**heat)}. A few seconds suffice"
     ),
     "hot_motor": lambda **heat: f"the winding's temperature: {heated_winding(**heat)}. Keep the runs short",
 }
@@ -319,13 +322,12 @@ VARY = {
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "duty": "the duty at one supply voltage",
     "configuration": "the configuration", "direction": "the direction of travel",
-    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to resolve one "
-                                                                    "revolution",
-    THE_SIDE: "nothing: compare the two sides in straight travel and in turns in both directions",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough for one revolution",
+    THE_SIDE: "nothing: compare both sides straight and in turns both ways",
     "position": "the position: cover the whole travel in both directions at one voltage",
     "": "nothing: its share is the same in every run",
 }  # fmt: skip
-WEIGH = "Weigh the robot, unladen and laden, and compare the readings with the mass in the robot file"
+WEIGH = "Weigh the robot, unladen and laden, and compare with the robot file"
 
 
 def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:
@@ -345,7 +347,7 @@ def effect_declarations(effect: type[Effect]) -> Iterator[str]:
         "only on the battery" * effect.needs_battery,
         "only in runs in both directions" * effect.needs_reverse,
         "only at a duty below 1" * effect.needs_duty,
-        "same direction in forward and backward travel" * effect.odd_in_travel,
+        "same direction both ways" * effect.odd_in_travel,
         f"only on {effect.movers}" * bool(effect.movers),
         f"proportional to `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
     ]

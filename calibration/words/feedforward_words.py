@@ -17,8 +17,8 @@ def feedforward_statement(found: Feedforward) -> str:
 def _limit(level: float, current: float | None) -> str:
     peak = "" if current is None else f" The current reaches {current:.3g} A."
     return (
-        f"A current limit was reached: above {level:.2g} V of accelerating voltage the acceleration no longer "
-        f"increases.{peak} Those windows are left out. Lower the voltage of the dynamic test, or raise the limit."
+        f"A current limit acts: above {level:.2g} V of accelerating voltage the acceleration no longer "
+        f"increases.{peak} Those windows are left out. Lower the dynamic test's voltage, or raise the limit."
     )
 
 
@@ -35,10 +35,9 @@ MEANT = dict(
 
 
 def _unit(ratio: float, near: float) -> str:
-    told = f"it is probably {MEANT[near]}" if near else "check the gear ratio and the wheel size in the conversion"
+    told = f"it is probably {MEANT[near]}" if near else "check gear ratio and wheel size in the conversion"
     return (
-        f"The velocity is {ratio:.4g} times the rate of the position: {told}. The constants are in the unit of the "
-        "position."
+        f"The velocity is {ratio:.4g} times the rate of the position: {told}. The constants use the position's unit."
     )
 
 
@@ -51,30 +50,34 @@ def _undetermined(share: float, missing: Sequence[str]) -> str:
 
 
 SAID: dict[str, str | Callable[..., str]] = {
-    "feedforward_sign": "A positive voltage gives a negative velocity: the motor or the encoder is inverted. The "
-    "sign of the voltage is changed here. Set the inversion in the robot's code.",
-    "feedforward_speed_sign": "Velocity and position have opposite signs. The sign of the velocity is changed "
-    "here. Invert one of the two in the robot's code.",
+    "feedforward_sign": (
+        "A positive voltage gives a negative velocity, so its sign is changed here. Set the inversion in the "
+        "robot's code."
+    ),
+    "feedforward_speed_sign": (
+        "Velocity and position have opposite signs, so that of the velocity is changed here. Invert one in the "
+        "robot's code."
+    ),
     "feedforward_unit": _unit,
     "feedforward_delay": lambda delay: (
-        f"The motion follows the voltage {1000 * delay:.0f} ms late. The constants are fitted with this delay."
+        f"The motion follows the voltage {1000 * delay:.0f} ms late, which the fit includes."
     ),
     "feedforward_filter": lambda lag: (
-        f"The velocity lags the position by {1000 * lag:.0f} ms because it is filtered. The constants are fitted "
-        "to the position. Use a shorter velocity filter before you use kP."
+        f"The velocity lags the position by {1000 * lag:.0f} ms because it is filtered, so the position is "
+        "fitted. Shorten the velocity filter before you use kP."
     ),
     "feedforward_limit": _limit,
     "feedforward_skid": lambda level: (
-        f"The wheels slip: above {level:.2g} V of accelerating voltage the velocity rises faster than below. Those "
-        "windows are left out. Lower the voltage of the dynamic test."
+        f"The wheels slip: above {level:.2g} V of accelerating voltage the velocity rises faster. Those windows "
+        "are left out. Lower the dynamic test's voltage."
     ),
     "feedforward_direction": lambda forward, backward: (
         f"kS differs by direction: {forward:.3g} V forward, {backward:.3g} V backward. A slope, a weight or a "
-        "binding gear can cause this. WPILib's kS is the mean of the two."
+        "binding gear can cause this. WPILib's kS is their mean."
     ),
     "feedforward_sag": lambda rest, low: (
-        f"The battery sagged from {rest:.3g} to {low:.3g} V. Unless the log contains the voltage at the motor, kA "
-        "and kV are too large. Use setVoltage, or a fresh battery."
+        f"The battery sagged from {rest:.3g} to {low:.3g} V. Without the voltage at the motor, kA and kV are too "
+        "large. Use setVoltage, or a fresh battery."
     ),
     "feedforward_missing": "Tests are missing: {tests}.",
     "feedforward_no_kA": _undetermined,

@@ -23,25 +23,24 @@ if TYPE_CHECKING:
 
 #: Meaning of a parameter far from its prior, by the kind of result.
 FAR = {
-    "loop": "{} has an implausible value, {:.1f} prior sds from its prior mean. It probably absorbs a missing effect",
-    "calibration": "{} is {:.1f} prior sds from its prior mean. The prior or the model is wrong",
-    "edge": "{} has a posterior mean {:.1f} prior sds from its prior mean, at the edge of the searched range. "
-    "Widen the prior and search again, or question the model",
+    "loop": "{} has an implausible value, {:.1f} prior sds from its mean. It probably absorbs a missing effect",
+    "calibration": "{} is {:.1f} prior sds from its mean. The prior or the model is wrong",
+    "edge": (
+        "{} is {:.1f} prior sds from its mean, at the edge of the searched range. Widen the prior, or question "
+        "the model"
+    ),
 }
 #: Origin of a prior that is neither from a field nor stated.
-PRIORS = {"product": "the prior of its product with the guide share in the other fidelities"}
+PRIORS = {"product": "the prior of its product with the guide share"}
 
 
 def sentence_on_wrong_noise(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
     if not channel:
-        return (
-            f"in every channel and under all conditions, the residuals are {factor:.2g} times the {source} noise. "
-            "Check the noise"
-        )
+        return f"in every channel, the residuals are {factor:.2g} times the {source} noise. Check the noise"
     return (
-        f"the residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise under "
-        "all conditions. Check the noise"
+        f"the residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise. "
+        "Check the noise"
     )
 
 
@@ -49,8 +48,8 @@ def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
     """Channels whose noise was estimated."""
     share_words = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
     return (
-        f"no noise was given, so it is estimated from the misfit: {share_words}. These values include model error, "
-        "so they cannot be used to test the model"
+        f"no noise was given, so it is estimated from the misfit: {share_words}. It includes model error, so it "
+        "cannot test the model"
     )
 
 
@@ -71,7 +70,7 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
 def sentence_on_combinations(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
     """Parameters that are not determined separately, with what is."""
     pair_words = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
-    return f"these runs determine only combinations of some parameters: {', '.join(pair_words)}"
+    return f"these runs determine only combinations: {', '.join(pair_words)}"
 
 
 def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
@@ -79,25 +78,25 @@ def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> st
     row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for the static "
-            "friction, but sliding does not explain all of their slip"
+            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for static "
+            "friction, but sliding does not explain all their slip"
         )
     if what == "jumps":
-        return f"{row_words}: the running gear of the calibrated robot leaves the ground at times"
+        return f"{row_words}: the calibrated robot leaves the ground at times"
     return f"{row_words}: the calibrated robot has the status {what}"
 
 
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
     """Agreement of searches from many starts."""
     if starts == 1:
-        return "one search was made, which did not converge" if open else "one search was made"
+        return "one search was made and did not converge" if open else "one search was made"
     if agree == starts:
-        return f"the searches from all {starts} starts end at the same optimum"
+        return f"all {starts} searches end at the same optimum"
     if open == starts:
-        return f"none of {starts} searches converged. The best result is shown"
+        return f"none of {starts} searches converged. The best is shown"
     parts = [f"{agree} of {starts} searches end at the best optimum"]
     if elsewhere:
-        parts.append(f"{elsewhere} at other optima (the objective of the next best is higher by {more:.3g})")
+        parts.append(f"{elsewhere} at other optima (the next best is higher by {more:.3g})")
     if open:
         parts.append(f"{open} did not converge")
     return ", ".join(parts)
@@ -107,7 +106,7 @@ def unsettled_search(names: Names) -> str:
     """A search that ended before it converged."""
     determined = f"These data do not determine {', '.join(names)}" if names else "These data determine all parameters"
     return (
-        "the search ended before it converged. The parameters are the best that it found, and their intervals are "
+        "the search ended before it converged. Its parameters are the best found, and their intervals are "
         f"unreliable. {determined}"
     )
 
@@ -117,9 +116,9 @@ def unsettled_search(names: Names) -> str:
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
     """Progress of a search."""
-    end = "The last generation improved the best member no further"
+    end = "The last generation improved no further"
     if not settled:
-        end = "The last generation still improved the best member, so continue with more --generations"
+        end = "The last generation still improved, so use more --generations"
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
 
 
@@ -139,7 +138,7 @@ def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
     return {
         "": "",
         "stated": "the residuals exceed the stated noise",
-        "repeats": "the residuals exceed the scatter of repeated runs",
+        "repeats": "the residuals exceed the scatter of repeats",
         "follow": f"{whose} depend on {test.variable}",
         "remember": f"{whose} show autocorrelation",
     }[test.what]
@@ -147,10 +146,9 @@ def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
 
 #: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
-    "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
-    "vary and are not used, before you use a parameter",
-    "not converged": "No verdict: the search did not converge, so there may be better parameters ({every})",
-    "worse": "Not adequate: the fitted robot has larger errors than the robot file as given ({every})",
+    "undescribed": "This model does not describe these runs: {large}. Check units, signs and unused columns first",
+    "not converged": "No verdict: the search did not converge ({every})",
+    "worse": "Not adequate: the fit has larger errors than the robot file as given ({every})",
 }
 
 
@@ -176,22 +174,20 @@ def adequacy_verdict(found: Adequacy) -> str:
     chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
     if found.adequate is None or found.p_value is None:
         return (
-            "Adequacy cannot be tested: the noise was estimated from the misfit, and "
-            f"{found.degrees_of_freedom:.4g} degrees of freedom are too few to show structure. State the noise "
-            "with --noise"
+            "Adequacy cannot be tested: the noise was estimated from the misfit, with only "
+            f"{found.degrees_of_freedom:.4g} degrees of freedom. State it with --noise"
         )
     p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
     if not found.adequate:
-        why = f"{chi2}, {p}" if found.noise_known else f"{p}, with the noise estimated from the residuals"
+        why = f"{chi2}, {p}" if found.noise_known else f"{p}, with estimated noise"
         return (
-            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing and the "
-            "parameters may absorb its effect. Run mmrjax loop to find it"
+            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing, which "
+            "parameters may absorb. Run mmrjax loop to find it"
         )
     if found.noise_known:
         return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
     return (
-        f"Adequate as far as can be tested: the residuals show no structure ({p}). The noise was estimated from "
-        "them, so χ² cannot test the fit"
+        f"Adequate as far as can be tested: the residuals show no structure ({p}). The noise was estimated from them"
     )
 
 
@@ -217,7 +213,7 @@ def calibration_answer(found: CalibrationResult) -> str:
             rows[c.label] = int(is_compared.sum())
             channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not channel_errors:
-        return f"{_VERDICTS[found.adequacy.adequate]}. No row has a prediction both before and after the fit."
+        return f"{_VERDICTS[found.adequacy.adequate]}. No row has predictions before and after the fit."
     same_rows = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same_rows else f" ({rows[label]} rows)") for label, text in channel_errors)
     row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same_rows else "the same rows"
@@ -273,8 +269,8 @@ def residual_cluster(c: ResidualCluster) -> str:
     level_words = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in mean_levels)
     dots = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
-        f"{subject} differ between the levels of {c.column}{range_}{signs} (simulated minus measured, by level: "
-        f"{level_words}{dots}, {p}), {role}. Give each level its own configuration, or find what differs between them"
+        f"{subject} differ between the levels of {c.column}{range_}{signs} (simulated minus measured: "
+        f"{level_words}{dots}, {p}), {role}. Give each level its own configuration, or find what differs"
     )
 
 
@@ -284,51 +280,49 @@ SAID: dict[str, str | Callable[..., str]] = {
     "only_together": sentence_on_combinations,
     "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
     "noise_off": sentence_on_wrong_noise,
-    "not_profiled": "no profiles were computed, so intervals come from the linearized model. They are too symmetric "
-    "where the model is nonlinear",
-    "no_covariance": "the posterior has no finite covariance. The values can be used, but not the intervals",
-    "no_grip": "every run slides, so static friction and the slip below its limit are known only from their priors",
+    "not_profiled": "intervals come from the linearized model, which makes them too symmetric (--profiles)",
+    "no_covariance": "the posterior has no finite covariance. Use the values, but not the intervals",
+    "no_grip": "every run slides, so only priors determine static friction and slip below its limit",
     "estimated_noise": estimated_noise,
     "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample "
-        f"after each step of the command ({rows} of {total} rows). Without these rows, the rms error falls to "
-        f"{100 * (1 - share) ** 0.5:.0f} % of its value. The readings may be offset in time from the command. "
-        'To fit the offset, set [rig] delay = "0 ± 0.02" [s] (it may be negative)'
+        f"after each step of the command ({rows} of {total} rows). Without them, the rms error falls to "
+        f"{100 * (1 - share) ** 0.5:.0f} %. Readings and command may be offset in time. To fit this, set [rig] "
+        'delay = "0 ± 0.02" [s]'
     ),
     "freed_delay": lambda channel, share: (
-        f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the "
-        "first sample after each step of the command. The fit therefore includes rig.delay. To leave it out, set "
-        "[rig] delay = '0 ± 0'"
+        f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in "
+        "the first sample after each step of the command, so rig.delay is fitted. To leave it out, set [rig] "
+        "delay = '0 ± 0'"
     ),
     "shifted": lambda channel, share, shift: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is explained by readings "
-        f"that are {abs(1e3 * shift):.2g} ms {'late' if shift > 0 else 'early'}. To fit this delay, set [rig] delay "
-        "= "
+        f"{abs(1e3 * shift):.2g} ms {'late' if shift > 0 else 'early'}. To fit this delay, set [rig] delay = "
         f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s]'
     ),
     "product_alone": lambda friction, share, free: (
-        f"the readings depend only on the product {friction} x {share}. Its two factors are known only from their "
-        "priors"
+        f"the readings depend only on the product {friction} x {share}. Only priors determine its factors"
         if free
-        else f"{share} is fitted with {friction} fixed, because the readings depend only on their product"
+        else f"{share} is fitted with {friction} fixed, because readings depend only on their product"
     ),
-    "prior_of_product": "{name} has the prior {mean:.3g} ± {sd:.2g}, which the other fidelities use for its product "
-    "with the guide share. In the track model the guides carry {share:.0%} of the weight",
+    "prior_of_product": (
+        "{name} has the prior {mean:.3g} ± {sd:.2g}, which other fidelities use for its product with the guide "
+        "share. In the track model the guides carry {share:.0%} of the weight"
+    ),
     "no_prediction": lambda kind, rows, total: (
-        f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because the "
-        "robot fitted to the other blocks slides in them. The errors exclude these rows"
+        f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because "
+        "the robot fitted to the other blocks slides. The errors exclude them"
     ),
     "block_not_converged": "the search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
-    "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Readings at more closely spaced conditions "
-    "would show which part is right",
+    "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Closer conditions would show which is right",
     "generations": search_generations,
     "ended_at_edge": lambda edge: (
-        "the search ended at the edge of the allowed range: its best member has "
+        "the search ended at the edge of its range: the best member has "
         + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
     ),
 }

@@ -54,13 +54,11 @@ def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
     text = _verdict(said)
     if said.aside:
         share = 100 * said.aside / said.of
-        text = f"{said.aside} of {said.of} rows ({share:.0f} %) are outliers and are set aside. {text}"
+        text = f"{said.aside} of {said.of} rows ({share:.0f} %) are set aside as outliers. {text}"
     if said.noise:
         text = f"{text} But {'. '.join(map(describe, said.noise))}"
     if said.cluster is not None:
-        text = (
-            f"{text} {cluster_sentence(said.cluster).capitalize()}. This is a finding, so all of these rows are kept."
-        )
+        text = f"{text} {cluster_sentence(said.cluster).capitalize()}. This is a finding, so these rows are kept."
     return text
 
 
@@ -99,7 +97,7 @@ def _evidence(said: loop_notes.VerdictSummary) -> str:
     remaining = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms" for m in said.missed
     ]
-    unseen = f", but on unseen runs this model still misses {', '.join(remaining)}" * bool(remaining)
+    unseen = f", but on unseen runs it still misses {', '.join(remaining)}" * bool(remaining)
     return f"family-wise p {p_value(said.p)}{unseen}"
 
 
@@ -119,9 +117,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
         if n and c[n:]
     )
     return {
-        "none": f"Yes, as far as these runs can show{noises}: the residuals are consistent with noise.",
+        "none": f"Yes, as far as these runs show{noises}: the residuals are consistent with noise.",
         "undescribed": f"No verdict{noises}: this model does not describe these runs.",
-        "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
+        "open": f"Perhaps. The answers{noises} differ: they depend on the noise.",
         "named": f"No: {_are_missing(laws)}{noises}.",
         "class": f"No: {_are_missing(laws)}{noises}.",
         "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
@@ -159,15 +157,13 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
     ]
-    check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
+    check = [f"unused columns that vary ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
-    check += ["units, signs and sides of the columns"]
+    check += ["units, signs and sides of columns"]
     if not place_words:
-        return (
-            "This model does not describe these runs: it lacks backlash. No effect is named until backlash is added."
-        )
+        return "This model does not describe these runs: it lacks backlash. Add backlash first."
     return (
-        f"This model does not describe these runs: even after the refit, it misses {', '.join(place_words)}. No "
+        f"This model does not describe these runs: after the refit, it misses {', '.join(place_words)}. No "
         f"effect is named. Check first: {', and '.join(check)}."
     )
 
@@ -177,25 +173,34 @@ def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
     names = " or ".join(map(with_article, found.families))
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
-        f"{names}{within}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit beyond "
-        f"noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected reading{errors}, and is "
-        f"found again in {100 * found.again:.0f} % of the fits with one block left out"
+        f"{names}{within}, established as a mechanism. It explains {100 * found.share:.0f} % of the misfit "
+        f"beyond noise, raises the log likelihood of held-out runs by {found.gain:.2g} per affected "
+        f"reading{errors}, and is found again in {100 * found.again:.0f} % of the fits without one block"
     )
+
+
+def _changed_constant(constant: str, run: int | None) -> str:
+    """`a different motor.inertia in run 3`."""
+    if "." in constant:
+        return f"a different {constant} in run {run}"
+    return f"a constant error in the {bases.place_in_words(constant)} of run {run}"
 
 
 #: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the misfit beyond noise",
     "gain": "it changes the log likelihood of held-out runs by {0.gain:+.2g} ± {0.se:.2g} per reading",
-    "again": "it is found again in only {again:.0f} % of the fits with one block left out",
+    "again": "it is found again in only {again:.0f} % of the fits without one block",
     "many": "any of {many} variables or equations may be its cause",
+    "run": "{changed} explains as much",
 }
 
 
 def no_mechanism(found: loop_notes.Mechanism) -> str:
     """Reasons against the best mechanism."""
     numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": found.candidates}
-    why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
+    changed = _changed_constant(found.changed, found.run)
+    why = [NO_MECHANISM[name].format(found, **numbers, changed=changed) for name in found.fails]
     return f"the best candidate is a {found.families[0]}, but {' and '.join(why)}"
 
 
@@ -296,7 +301,7 @@ def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:5]
     if not beyond:
-        return [f"{first}. No effect explains more than chance would"]
+        return [f"{first}. No effect explains more than chance"]
     if brief:
         return [f"{first}. Strongest alone: {', '.join(e.name for e in beyond)}"]
     lines = [
@@ -318,27 +323,24 @@ def regression_verdict(found: EffectRanking) -> str:
     lacks = lacks if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
     numbers = f". Parameters [SI]: {numbers}" if numbers else ""
-    return f"regression only, not confirmed by simulation: {lacks}{numbers}"
+    return f"regression only, not confirmed: {lacks}{numbers}"
 
 
 #: Remark beside a regression that sees nothing, where the simulation does.
-DISAGREES = (
-    "simulation disagrees: the refitted model leaves more error than chance would, so something is "
-    "missing. Trust the simulation"
-)
+DISAGREES = "simulation disagrees and decides: the refit leaves more error than chance, so something is missing"
 
 
 def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
     """Findings of a search before its verdict is known."""
     return (
         f"so far, simulation confirms {' and '.join(with_article(f) for f in dict.fromkeys(families))} "
-        f"({' and '.join(effects)}). Further tests are still to come"
+        f"({' and '.join(effects)}). Tests follow"
     )
 
 
 def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> str:
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
-    also = f" (or {', '.join(others)}, which these data cannot distinguish from it)" if others else ""
+    also = f" (or {', '.join(others)}, which these data cannot distinguish)" if others else ""
     family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
         f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
@@ -439,7 +441,7 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     ]
     reached, total = max((int(e["rows"]) for e in stated_errors.values()), default=0), len(found.runs)
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
-    few = f" (with the robot file as given, only {reached} rows can be simulated)" * (reached < total)
+    few = f" (of the robot file as given, {reached} rows can be simulated)" * (reached < total)
     rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
     return (
         *filter(None, [changes.rstrip()]),
@@ -520,12 +522,12 @@ NO_FORMULA = "no single term explains 90 % of the curve"
 #: Reasons for or against names.
 REASONS = {
     "": "",
-    "implausible": "every effect that explains the discrepancy has an implausible size",
+    "implausible": "every effect that explains it has an implausible size",
     "larger": "{effects} would explain more, but only at an implausible size",
     "better curve": "a {curves} explains the data better than {effects}",
     "curve alone": "a single {curves} leaves no significant misfit",
     "none by itself": "{lost}",
-    "beside": "each effect, added to the fit of the others, explains more than chance would: {strengths}",
+    "beside": "each effect, added to the others, explains more than chance: {strengths}",
 }
 
 
@@ -554,17 +556,10 @@ def _score_words(test: loop_notes.NameTest) -> str:
     """Score of an effect, with the threshold of chance and the score without its strongest row."""
     less = ""
     if test.changed:
-        less = f", {_changed_constant(test)} explains {test.root_changed:.1f} σ"
+        less = f", {_changed_constant(test.changed, test.row)} explains {test.root_changed:.1f} σ"
     elif test.row is not None:
         less = f", and {test.root_without:.1f} σ remain without row {test.row}"
     return f"{test.effect} scores {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ{less})"
-
-
-def _changed_constant(test: loop_notes.NameTest) -> str:
-    """`a different motor.inertia in run 3`."""
-    if "." in test.changed:
-        return f"a different {test.changed} in run {test.row}"
-    return f"a constant error in the {bases.place_in_words(test.changed)} of run {test.row}"
 
 
 #: Evidence against a single effect: short, and in words.
@@ -573,13 +568,13 @@ DOUBTS = {
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("row {0.row}", "depends on row {0.row} alone"),
     "run": ("run {0.row}", "explains no more than {changed} ({0.root_changed:.1f} σ)"),
-    "blocks": ("blocks", "is chosen again in only {again:.0f} % of the fits with one block left out"),
+    "blocks": ("blocks", "is chosen again in only {again:.0f} % of the fits without one block"),
     "larger": ("size", "explains less than {larger} at an implausible size"),
     "remains": ("equation", "leaves an error in its own equation"),
     "form": ("its form", "changes in size{spread} over {over_variable} ({0.varies:.1f} σ)"),
     "noise": (
         "noise",
-        "is only {0.offset:.1%} of the readings of an instrument whose noise is not stated (--noise)",
+        "is only {0.offset:.1%} of readings whose noise is not stated (--noise)",
     ),
 }
 
@@ -592,7 +587,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     doubts = {
         "beside": curve_words and f" next to smooth curves ({curve_words})",
         "larger": " and ".join(test.larger),
-        "changed": _changed_constant(test),
+        "changed": _changed_constant(test.changed, test.row),
     }
     doubts |= {"over_variable": bases.variable_in_words(test.over)}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
@@ -741,18 +736,18 @@ def track_model_answer(found: TrackModelResult) -> str:
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
-    on = "" if found.settled else ". The search has not converged: repeat it with more --generations"
+    on = "" if found.settled else ". The search has not converged: use more --generations"
     slip = f"rms slip error of the {found.rows} rows on tracks {before:.2g} → {after:.2g} percentage points"
     if not found.gear_explains_discrepancy:
         why = f". Outside their priors: {', '.join(found.outside)}" if found.outside else ""
         return (
-            f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "
-            f"explains this error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
+            f"Track model, {track_model_question(found.asked)}: no running gear within its priors explains this "
+            f"error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     constants_count = len(found.constants) - len(found.known_from_rows)
     undetermined = f"These rows do not determine {constants_count} of {len(found.constants)} constants"
     return (
-        f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains this error "
+        f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains it "
         f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}. {undetermined}{on}"
     )
 
@@ -778,7 +773,7 @@ def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
     freedom = min(s.freedom for s in noise)
     return (
         f"the noise of {', '.join(s.channel.name for s in noise)} is not given: {', '.join(parts)} are estimated "
-        f"from the scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom). Set yours with --noise"
+        f"along {' and '.join(along)} ({freedom:.1f} degrees of freedom). Set yours with --noise"
     )
 
 
@@ -792,30 +787,31 @@ def copied_rows(rows: tuple[int, ...]) -> str:
 def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
     """Rows that do not count."""
     reasons = {
-        "unusable": "are not used, because the fitted model slides or fails in them",
-        "outliers": "are outliers that no effect explains. They are left out",
+        "unusable": "are not used, because the fit slides or fails there",
+        "outliers": "are outliers that no effect explains, and are left out",
     }
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
 
 def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
     """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is a tenth of a run or more."""
-    why = "the equations are searched up to a tenth of a run. Check the clocks of the columns"
+    why = "a longer delay is not searched. Check the clocks of the columns"
     return (
-        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {'later' if delay > 0 else 'earlier'} "
-        f"than its column states, and {why if ends else 'the rig file gives no delay'}. To start the fit from this "
-        f'delay, set [rig] delay = "{delay:.3g} ± {sd:.2g}"'
+        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms "
+        f"{'later' if delay > 0 else 'earlier'} than its column states, and "
+        f'{why if ends else "the rig file gives no delay"}. To start from it, set [rig] delay = "{delay:.3g} ± '
+        f'{sd:.2g}"'
     )
 
 
 #: Reason why a log does not show the states of its equations → sentence part, and what to log.
 UNSHOWN = {
-    "motion": "no channel reads a speed or an angle. For an answer from its equations, log one",
-    "sign": "an instrument shows only a magnitude. For an answer from its equations, log the sign",
+    "motion": "no channel reads a speed or an angle. For a fast answer, log one",
+    "sign": "an instrument shows only a magnitude. For a fast answer, log the sign",
     "slack": "motor and load move apart",
     "turn": "the robot turns",
-    "goal": "a controller gives the voltage. For an answer from its equations, log the duty",
-    "follower": "no channel follows the imposed speed. For an answer, log the current",
+    "goal": "a controller gives the voltage. For a fast answer, log the duty",
+    "follower": "no channel follows the imposed speed. For a fast answer, log the current",
 }
 
 
@@ -827,16 +823,13 @@ def sentence_on_single_run(
 ) -> str:
     """Sentence on an effect that depends on one row, or that one different run explains as well."""
     if test.changed:
-        return (
-            f"{_changed_constant(test)} explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ. Check "
-            "what was different in that run, or repeat it"
-        )
+        explained = f"explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ"
+        different = _changed_constant(test.changed, test.row)
+        return f"{different} {explained}. Check what was different in that run, or repeat it"
     place_words = _conditions(conditions)
     row = f"row {test.row}{f' ({place_words})' * bool(place_words)}"
     others = (
-        f"add runs at {axis} {' and '.join(f'{x:g}' for x in beside)}"
-        if beside
-        else "add runs at conditions on either side of it"
+        f"add runs at {axis} {' and '.join(f'{x:g}' for x in beside)}" if beside else "add runs on either side of it"
     )
     return (
         f"{test.effect} depends on row {test.row} alone ({test.root:.1f} σ with it, "
@@ -849,8 +842,8 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     subject = "the curve" if curve else "what was found"
     how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{subject} predicts held-out runs {how} the refit (log likelihood {gain:+.2f} ± {se:.2f} per reading), so "
-        "robot.toml contains the refit"
+        f"{subject} predicts held-out runs {how} the refit (log likelihood {gain:+.2f} ± {se:.2f} per reading), "
+        "so robot.toml is the refit"
     )
 
 
@@ -858,29 +851,32 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
 SAID: dict[str, str | Callable[..., str]] = {
     "assumed_noise": "the noise of {channels} is not given, so {usual} is assumed. Set yours with --noise",
     "noise_from_series": noise_from_series,
-    "refit_worse": "{channel}: the refit made its error larger ({stated:.0%} of the measured rms with the robot file "
-    "as given, {refit:.0%} after the refit). The {word} noise gives some of its readings too much weight. State the "
-    "instrument's noise with --noise",
+    "refit_worse": (
+        "{channel}: the refit made its error larger ({stated:.0%} → {refit:.0%} of the measured rms), because "
+        "the {word} noise weights some readings too much. State it with --noise"
+    ),
     "copies": copied_rows,
     "kept_out": sentence_on_unused_rows,
-    "phases_differ": "the phase of the wave differs between runs, so robot.toml contains the mean phase. The wave "
-    "explains {free:.0f} σ² with a free phase in each run, and {held:.0f} σ² with a common phase. Start every run "
-    "with the shaft at the same angle",
+    "phases_differ": (
+        "the phase of the wave differs between runs, so robot.toml has the mean. The wave explains {free:.0f} "
+        "σ² with a phase for each run, {held:.0f} σ² with one. Start every run at the same shaft angle"
+    ),
     "still_lacks": lambda place, variable: (
         f"the {bases.place_in_words(place)} still has an unexplained error, which varies with the "
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
-    "unshown": lambda source, why: f"{source}: effects are simulated, which takes minutes, because {UNSHOWN[why]}",
-    "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted. The thresholds use only these",
+    "unshown": lambda source, why: f"{source}: effects are simulated, in minutes, because {UNSHOWN[why]}",
+    "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted",
     "outstanding": lambda factors, word: (
         f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "
-        f"{word} noise. To test it, run the same command without --within"
+        f"{word} noise. The same command without --within tests it"
     ),
-    "too_few_replicates": "{settled} bootstrap tables are too few for some kinds of evidence. Use 500 or more "
-    "(--replicates)",
+    "too_few_replicates": "{settled} bootstrap tables are too few for some evidence. Use --replicates 500",
     "rests_on": sentence_on_single_run,
-    "contradicted": "the equations promised to explain {promised:.0%} of the misfit, a simulation explains "
-    "{gained:.0%}, so the claim is one level lower",
+    "contradicted": (
+        "a simulation explains {gained:.0%} of the misfit, not {promised:.0%} as the equations do, so the claim "
+        "is one level lower"
+    ),
     "unwritten": unwritten_reason,
 }

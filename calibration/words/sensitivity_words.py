@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 #: Meaning of each method's result for an input.
 METHODS = {
     "local": "exact derivatives at the robot's own values",
-    "sobol": "shares of the variance, each input alone and together with others",
+    "sobol": "shares of the variance, of each input alone and with others",
     "morris": "screening by elementary effects",
 }
 
@@ -103,9 +103,9 @@ SAID: dict[str, str | Callable[..., str]] = {
     "sampling": lambda method, points: f"{METHODS[method]}, over {points} operating points",
     "points_left_out": points_left_out,
     "sample_left_out": lambda points, share, outputs: (
-        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since these robots do "
-        f"not travel there ({', '.join(outputs)}). The indices describe the others"
+        f"at {points} operating points up to {100 * share:.1f} % of the sample does not travel and is left out "
+        f"({', '.join(outputs)})"
     ),
-    "inert": "these inputs are not sampled, because every output has zero derivative with respect to them: {inputs}",
-    "tied": "these inputs are scaled with another input, whose share includes theirs: {inputs}",
+    "inert": "these inputs are not sampled, because no output depends on them: {inputs}",
+    "tied": "these inputs scale with another, whose share includes theirs: {inputs}",
 }

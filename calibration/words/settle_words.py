@@ -12,22 +12,22 @@ from mmrjax.errors import count_noun
 OF_LEVELS = ("changes", "short", "settling", "accelerates")
 #: Finding and advice for each of `settling.REASONS`.
 WHY = {
-    "changes": ("the imposed quantity changes all the time", "hold it at each level for a while"),
+    "changes": ("the imposed quantity always changes", "hold it at each level for a while"),
     "short": ("the level is held too briefly", "hold it longer, or set a smaller --shortest"),
     "settling": ("still changes at the end of its level", "hold the level longer, or set a larger --drift"),
     "accelerates": ("still accelerates at the end of its level", "hold the level longer, or set a larger --drift"),
-    "idle": ("nothing drives the motors", "nothing, as settled runs need a driven motor"),
-    "rest": ("the drive does not move", "nothing, as friction holds the drive. A fit to the log uses these samples"),
+    "idle": ("nothing drives the motors", "nothing, settled runs need a driven motor"),
+    "rest": ("the drive does not move", "nothing, friction holds the drive"),
     "stuck": (
-        "shows the same number for a long time, so it is saturated or frozen",
+        "shows one number for a long time: saturated or frozen",
         "repair the instrument or change its range",
     ),
     "glitches": (
         "has many readings far from the others",
-        "repair the instrument, or log its mean if it delivers pulses",
+        "repair the instrument, or log a mean of pulses",
     ),
-    "unread": ("no channel has enough readings", "log more readings, or remove the rows without them"),
-    "undriven": ("the driver brakes or coasts", "nothing, as a fit to the log uses these samples"),
+    "unread": ("no channel has enough readings", "log more readings, or remove these rows"),
+    "undriven": ("the driver brakes or coasts", "nothing, a fit to the log uses them"),
 }
 
 
@@ -49,7 +49,7 @@ def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[t
         stretches_of_reason = [s for s in omitted if s.why == why]
         longest = max(stretches_of_reason, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        cure = "nothing, as a fit to the log uses these samples" if few and why in OF_LEVELS else WHY[why][1]
+        cure = "nothing, a fit to the log uses them" if few and why in OF_LEVELS else WHY[why][1]
         causes.append(
             (
                 left_out_reason(longest),
@@ -76,9 +76,9 @@ def settle_statement(found: Settled) -> str:
 def levels_and_samples(found: Settled) -> str:
     """Division of samples into levels, and the samples of a level that are used."""
     return (
-        f"Neighbouring samples belong to one level if the imposed quantity differs by less than "
-        f"{50 * found.drift:g} % or by less than its noise. The first samples of a level are left out until every "
-        f"channel stays within {100 * found.drift:g} % of its value at the end, or within its noise."
+        f"Neighbouring samples are one level if the imposed quantity differs by less than {50 * found.drift:g} % "
+        f"or its noise. Its first samples are left out until every channel stays within {100 * found.drift:g} % "
+        "of its last value, or its noise."
     )
 
 
@@ -92,51 +92,37 @@ def sentence_on_few_settled_runs(found: Settled, fewest: int, loop: str) -> str:
     if len(found.kept) >= fewest:
         return ""
     if found.runs.turns:  # over time a turn is simulated, and not fitted
-        return (
-            f"The loop needs {fewest} settled runs: hold more levels of the left and right command, or hold each "
-            "longer."
-        )
-    return (
-        f"The loop needs {fewest} settled runs, so run it on the log as it is: {loop}. With calibrate instead of "
-        "loop, only the parameters are fitted."
-    )
-
-
-def glitch_sentences(found: Settled) -> list[str]:
-    """Sentences on the readings that means leave out because they are far from the others, one for each channel."""
-    sentences = []
-    for channel in (s.channel for s in found.signals):
-        glitch_stretches = [s for s in found.kept if channel.name in s.glitches]
-        if glitch_stretches:
-            counts = [s.glitches[channel.name] for s in glitch_stretches]
-            worst = glitch_stretches[counts.index(max(counts))]
-            sentences.append(
-                f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
-                f"{count_noun(len(glitch_stretches), 'settled run')} left out of the mean, because they are far from "
-                f"the readings next to them. Most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
-                f"({100 * max(counts) / len(worst.rows):.2g} %). Check the instrument, or log a mean if it "
-                "delivers pulses"
-            )
-    return sentences
+        return f"The loop needs {fewest} settled runs: hold more levels, or each longer."
+    return f"The loop needs {fewest} settled runs, so run it on the log as it is: {loop}."
 
 
 def settle_remarks(found: Settled) -> list[str]:
     """Sentences on what should be looked at."""
     remarks = []
     if found.gaps:
-        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}. No segment spans such a gap")
-    remarks += glitch_sentences(found)
+        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}")
+    for channel in (s.channel for s in found.signals):
+        glitch_stretches = [s for s in found.kept if channel.name in s.glitches]
+        if glitch_stretches:
+            counts = [s.glitches[channel.name] for s in glitch_stretches]
+            worst = glitch_stretches[counts.index(max(counts))]
+            remarks.append(
+                f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
+                f"{count_noun(len(glitch_stretches), 'settled run')} left out of the mean, far from their "
+                f"neighbours. Most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
+                f"({100 * max(counts) / len(worst.rows):.2g} %). Check the instrument, or log a mean of pulses"
+            )
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:
             remarks.append(
                 f"{channel.column} is the rate of {angles[channel.name]}. Add {channel.name} to channels in the "
-                "rig's file, or these runs will lack its reading"
+                "rig's file to get it"
             )
     wide = {name: x for name, x in found.scatter.items() if x > 0}
     for signal in (s for s in found.signals if s.channel.name in wide):
         remarks.append(
             f"{signal.channel.column}: repeated levels differ by {wide[signal.channel.name]:.2g} "
-            f"{signal.channel.unit} more than their noise. The standard deviations of the runs include this scatter"
+            f"{signal.channel.unit} more than their noise, which the sds include"
         )
     return remarks

@@ -7,10 +7,10 @@ from mmrjax.errors import count_noun
 STEPS = {
     # the loop
     "base": "fitting the base model",
-    "sds": "the stated sds do not fit the residuals: refitting with sds from the residuals",
-    "bootstrap": "bootstrap of {} tables: the misfit that a complete model would leave",
+    "sds": "the stated sds do not fit the residuals: refitting with theirs",
+    "bootstrap": "bootstrap of {} tables: the misfit of a complete model",
     "effects": "something is missing: fitting every candidate effect",
-    "more effects": "{}: not everything is explained, fitting further effects",
+    "more effects": "{}: fitting further effects",
     "alone": "outliers found: fitting again without them",
     "mechanism": "mechanisms that explain most of the misfit",
     "alike": "effects that explain as much as {}",
@@ -21,7 +21,7 @@ STEPS = {
     "errors": "errors on held-out data",
     "next": "the next experiment",
     "others": "the verdicts at other noise levels",
-    "gear stated": "track model: fitting friction, with the running gear as stated",
+    "gear stated": "track model: fitting friction alone",
     "gear free": "track model: fitting the running gear",
     # a sensitivity study
     "points": "derivatives at every operating point",
@@ -29,15 +29,15 @@ STEPS = {
     # requirements and sizing
     "requirement": "requirement {} of {}: {}",
     "changes": "changes that would meet missed requirement {} of {}: {}",
-    "designs": "1 of 4, random designs for every combination of parts",
+    "designs": "1 of 4, random designs of every combination",
     "descents": "2 of 4, {} searches by gradients",
-    "whole": "3 of 4, catalogue ratios and whole numbers of cells",
+    "whole": "3 of 4, makers' ratios and whole cells",
     "refined": "4 of 4, the best {} designs, with ratio and number of cells continuous",
     # a calibration
     "optimum": "optimum found, now {}",
-    "steady": "fitting the steady model first, to start from its optimum",
-    "delay": "the error lies in the first sample after each step: fitting again with a delay",
-    "derivatives": "population search finished, comparing derivatives with finite differences at the best member",
+    "steady": "fitting the steady model, to start from its optimum",
+    "delay": "the error follows each step: fitting again with a delay",
+    "derivatives": "population search finished, checking derivatives at the best member",
     "search": "  step {}: objective {:.4f}, {:.1f} min",
     "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
     "start": "start {} of {}: objective {:.4f} after {} steps, {:.1f} min",

@@ -10,22 +10,22 @@ from calibration.data import Names
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
     "battery.": "runs on the on-board battery (Source Mode 1)",
-    "motor.inductance": "a time history of the start-up current, sampled every 0.1 ms",
-    "motor.inertia": "a time history of the start",
-    ".inertia": "a time history of the start",
-    "motor.resistance_thermal": "long runs at high current with the effect winding_heating present",
-    "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
-    ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
-    ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
-    ".guide_share": "the fidelities steady and drive (the track model computes it, so fit guide_friction there)",
+    "motor.inductance": "a history of the starting current, sampled every 0.1 ms",
+    "motor.inertia": "a history of the start",
+    ".inertia": "a history of the start",
+    "motor.resistance_thermal": "long runs at high current with the effect winding_heating",
+    "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating",
+    ".friction.dynamic": "a history in which the movers spin faster than V_d",
+    ".friction.speed_dynamic": "a history in which the movers spin faster than V_s",
+    ".guide_share": "the fidelities steady and drive (in track, fit guide_friction)",
     ".mass": "a scale, or runs whose table does not state total_mass_kg",
 }
 #: Losses that data do not distinguish without variation of a condition.
 ALIKE = {
-    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses have the same effect",
-    "slope": "without slopes, rolling resistance and Coulomb losses have the same effect",
-    "voltage": "at one voltage, losses that grow with speed and constant losses have the same effect",
-    "speed": "at one speed, losses that grow with speed and constant losses have the same effect",
+    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses are indistinguishable",
+    "slope": "without slopes, rolling resistance and Coulomb losses are indistinguishable",
+    "voltage": "at one voltage, constant losses and losses that grow with speed are indistinguishable",
+    "speed": "at one speed, constant losses and losses that grow with speed are indistinguishable",
 }
 
 
@@ -51,18 +51,18 @@ def differing_repeats(
     (first, second), (one, other) = rows, values
     reading = (
         f"{source} rows {first} and {second}, {column}: the same conditions gave {one:g} and {other:g}, {apart} "
-        f"apart{f' (and {more} more pairs like this)' * bool(more)}"
+        f"apart{f' (and {more} more such pairs)' * bool(more)}"
     )
     if unused:
         many = len(unused) > 1
         name = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
         return (
             f"{reading}. {', '.join(unused)} {'vary' if many else 'varies'} between these rows and "
-            f"{'are' if many else 'is'} not used as a condition. Therefore {name}, or, for a load, give each level "
-            "its own configuration"
+            f"{'are' if many else 'is'} not used. Therefore {name}, or, for a load, give each level its own "
+            "configuration"
         )
     wrong = f"{reading}. Remove the wrong row"
-    return f"{wrong}, or find what changed between these rows and has no column in the table" if more else wrong
+    return f"{wrong}, or find what changed between these rows and has no column" if more else wrong
 
 
 def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
@@ -85,9 +85,7 @@ def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> s
     )
     name = f"{', '.join(unused)} {vary} and {are} not used. Name {them} under [columns] if {if_conditions}, or "
     record = f"{'r' if unused else 'R'}ecord runs at several values of {column} or at several loads"
-    return (
-        f"{source}: these {rows} runs differ only by noise, so they determine nothing. {name * bool(unused)}{record}"
-    )
+    return f"{source}: these {rows} runs differ only by noise. {name * bool(unused)}{record}"
 
 
 def copied_channel(source: str, column: str, other: str, intercept: float, slope: float, tied: bool) -> str:
@@ -96,18 +94,16 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     factor = abs(slope) if intercept else slope
     sentence = f"{source}, {column}: equals {start}{factor:.4g} times {other} in every row, to the last digit"
     if tied:
-        return (
-            f"{sentence}. If it is computed rather than measured, remove it: the noise of {other} would count twice"
-        )
-    return f"{sentence}, so it is computed, not measured. Measure it, or remove it from the channels and the table"
+        return f"{sentence}. If it is computed, remove it: the noise of {other} would count twice"
+    return f"{sentence}, so it is computed. Measure it, or remove it from the channels"
 
 
 def sentence_on_short_histories(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
     at_speed = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
-        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}, before the speed is steady. "
-        "So the resistance to travel is known only from its priors. Record until the speed is steady"
+        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}, before the speed is steady, "
+        "so only priors determine the resistance to travel. Record longer"
     )
 
 
@@ -119,9 +115,9 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
     """A part that is not the nominal robot's while friction of it is."""
     changes = ", ".join(f"{name} {own_value:g} instead of {nominal:g}" for name, own_value, nominal in changed)
     return (
-        f"the {part} differs from that of the nominal robot ({changes}), but {', '.join(kept)} still "
-        f"{'has' if len(kept) == 1 else 'have'} the nominal robot's prior. Set your values in the robot's file or "
-        "with --prior"
+        f"the {part} differs from the nominal robot's ({changes}), but {', '.join(kept)} still "
+        f"{'has' if len(kept) == 1 else 'have'} the nominal robot's prior. Set yours in the robot's file or with "
+        "--prior"
     )
 
 
@@ -130,7 +126,7 @@ def sentence_on_implausible_readings(
 ) -> str:
     """Readings that no robot like this one shows."""
     ratio, size = (factor, "large") if factor > 1 else (1 / factor, "small")
-    subject = f"{column}: readings are about {float(f'{ratio:.2g}'):g} times too {size} for this robot"
+    subject = f"{column}: about {float(f'{ratio:.2g}'):g} times too {size} for this robot"
     alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{subject}; are they in {' or '.join(units)}? expected {unit}{alike}"
@@ -140,58 +136,69 @@ def sentence_on_implausible_readings(
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "unmeasured": lambda name: (
-        f"{name} keeps its prior value, because these data do not determine it. To measure it, use "
-        f"{would_measure(name)}"
+        f"{name} keeps its prior value, because these data do not determine it. It needs {would_measure(name)}"
     ),
-    "constant": lambda column, value, alike: (
-        f"{column} is {value:g} in every row: {ALIKE[alike]}, so only their priors distinguish them"
-    ),
+    "constant": lambda column, value, alike: f"{column} is {value:g} in every row: {ALIKE[alike]}",
     "repeats": differing_repeats,
-    "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much "
-    "as the {source} noise predicts, so its sd is multiplied by {factor:.2g}. Check the repeats, "
-    "or state the noise with --noise",
+    "larger_noise": (
+        "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much as the "
+        "{source} noise predicts, so its sd is multiplied by this. Check the repeats, or set --noise"
+    ),
     "unused": unused_columns,
-    "no_load_gives": "{source}, {theirs}: the friction and the constant torque of the load leave {share:.0%} of its "
-    "variance unexplained. If a brake sets this torque, it is a condition. Then set [columns] load_torque_Nm "
-    '= "{theirs}" in the robot\'s file, and remove output_torque from its channels',
+    "no_load_gives": (
+        "{source}, {theirs}: the load's friction and constant torque leave {share:.0%} of its variance "
+        'unexplained. If a brake sets it, set [columns] load_torque_Nm = "{theirs}" in the robot\'s file, and '
+        "remove output_torque from its channels"
+    ),
     "nothing_varies": nothing_varies,
     "copied": copied_channel,
-    "turned": "{source}, {theirs}: differs by {off:.2g} (rms) from the values that follow from the robot file, "
-    "but only by {turned:.2g} with the opposite sign. If the instrument's sign is reversed, set [columns] "
-    '{column} = {{column = "{theirs}", factor = -1}}',
-    "stiff_supply": "{column} is {value:g} in every row, so the supply is treated as stiff. If the voltage was not "
-    "measured, remove the column",
+    "turned": (
+        "{source}, {theirs}: differs by {off:.2g} (rms) from the robot file's values, but by {turned:.2g} with "
+        'the opposite sign. If its sign is reversed, set [columns] {column} = {{column = "{theirs}", factor = '
+        "-1}}"
+    ),
+    "stiff_supply": (
+        "{column} is {value:g} in every row, so the supply is treated as stiff. If it was not measured, remove "
+        "the column"
+    ),
     "lost_motion": lambda source, column, reversals, width, unit, angle, stiffness: (
         f"{source}, {column}: "
         + (
             f"the output lags the motor by {width:.2g} {unit} rms in proportion to its acceleration, as with a "
-            "compliant "
-            f'coupling, perhaps with backlash. Set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
+            f'compliant coupling. Set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
             if stiffness
-            else f"at each of {reversals} reversals about {width:.2g} {unit} of motion is lost. Friction, inertia "
-            f'and delay do not explain this, but backlash or a compliant coupling does. Set backlash = "{angle:.2g} '
-            '± 30 %" (rad'
+            else (
+                f"at each of {reversals} reversals about {width:.2g} {unit} of motion is lost, as by backlash or "
+                f'a compliant coupling. Set backlash = "{angle:.2g} ± 30 %" (rad'
+            )
         )
         + " at the output) in the load's table of the robot file"
     ),
     "ends_early": sentence_on_short_histories,
     "never_grips": lambda runs, share: (
-        f"{_runs(runs, 'slides', 'slide')} to the end: the robot then travels at {share:.0%} of the speed of its "
-        "tracks or wheels. Such runs do not measure the static friction of the ground"
+        f"{_runs(runs, 'slides', 'slide')} to the end, at {share:.0%} of the speed of the tracks or wheels. Such "
+        "runs do not measure static friction"
     ),
-    "thinned": "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time, and the imposed "
-    "quantity of all rows. Change the number with --rows, or use settle, which takes all rows",
-    "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers "
-    "refer to the rows used. Set how many are used with --rows",
+    "thinned": (
+        "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time. Change this with "
+        "--rows, or use settle, which takes all"
+    ),
+    "thinned_table": (
+        "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers refer to "
+        "them. Change this with --rows"
+    ),
     "coarse_steps": lambda lasts, step: (
-        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Ripple of a shaft with a period below "
-        "about ten steps is not resolved. Use shorter runs to look for it"
+        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Ripple with a period below ten "
+        "steps needs shorter runs"
     ),
-    "stops_on_slope": "run {runs}: the motors are not driven on a slope. Time histories smooth the friction at rest, "
-    "so a robot that should stand still creeps at a few mm/s. Leave out rows at rest if their readings are more "
-    "exact than that",
+    "stops_on_slope": (
+        "run {runs}: the motors are not driven on a slope. Time histories smooth friction at rest, so the robot "
+        "creeps at a few mm/s. Leave out rows at rest if readings are more exact"
+    ),
     "inherited_priors": inherited_priors,
     "off_by": sentence_on_implausible_readings,
-    "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot; are "
-    "the slopes in {unit}? expected degrees",
+    "slopes_in": (
+        "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot; are slopes in "
+        "{unit}? expected degrees"
+    ),
 }

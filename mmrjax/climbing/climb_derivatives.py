@@ -42,20 +42,20 @@ BESIDE = 8
 #: Outputs of a climb: unit and words. For a robot that gets over, they are computed up to the crest, where its centre
 #: of mass passes the obstacle, because its fall afterwards is a different question. Margins are shares.
 OUTPUTS: dict[str, tuple[str, str]] = {
-    "margin_success": ("-", "smoothed smallest of the four margins: above 0 if it gets over, else below"),
+    "margin_success": ("-", "smoothed smallest of the four margins, above 0 if it gets over"),
     "margin_reach": (
         "-",
-        "final distance of its centre of mass past the obstacle, over half the wheelbase; 1 if over",
+        "distance of its centre of mass past the obstacle, over half the wheelbase, 1 if over",
     ),
     "margin_upright": ("-", "margin to the tipping pitch, of that pitch"),
     "margin_grip": ("-", "unused share of the ground's friction limit"),
     "margin_torque": ("-", "unused share of the traction motors' stall torque"),
     "crest_time_s": ("s", "time to the crest, or to the verdict"),
     "crest_energy_J": ("J", "energy of all motors until then"),
-    "crest_current_rms_A": ("A", "root mean square of the current of each traction motor until then"),
+    "crest_current_rms_A": ("A", "rms current of each traction motor until then"),
     "crest_current_most_A": ("A", "largest current of each traction motor until then"),
-    "crest_front_current_most_A": ("A", "largest current of the front levers' motor until then"),
-    "crest_rear_current_most_A": ("A", "largest current of the rear levers' motor until then"),
+    "crest_front_current_most_A": ("A", "largest current of the front levers' motor"),
+    "crest_rear_current_most_A": ("A", "largest current of the rear levers' motor"),
 }
 
 

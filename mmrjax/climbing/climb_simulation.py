@@ -353,18 +353,6 @@ def _with_lever_current(run: ClimbSystem, motion: ClimbMotion) -> ClimbSystem:
     return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
 
 
-def demanded_lever_rates(run: ClimbSystem, motion: ClimbMotion, time: Scalar) -> Pair:
-    """Demanded angular speeds of the levers after a step [rad/s].
-
-    They move the levers to the angles of the sequence, at most at the levers' largest rate. A lever that has reached
-    its angle stands still.
-    """
-    rate = run.robot.running_gear.levers.rate
-    toward = (_convert_lever_angles(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
-    speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
-    return jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
-
-
 def _drive_action(
     run: ClimbSystem, motion: ClimbMotion, time: Scalar, source: Scalar, free: Array, yields: Array
 ) -> LeverStep:
@@ -373,7 +361,12 @@ def _drive_action(
     lever_voltage = jnp.abs(source) if sequence.supply is None else sequence.supply
     high = jnp.stack([lever_voltage, lever_voltage])
     low = -high
-    aims = demanded_lever_rates(run, motion, time)
+    # The levers move to the angles of the sequence, at most at their largest rate. One that has reached its angle
+    # stands still.
+    rate = run.robot.running_gear.levers.rate
+    toward = (_convert_lever_angles(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
+    speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
+    aims = jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
     if sequence.begins is not None:
         aims = jnp.zeros_like(aims)
         front, rear = sequence.asked(motion.q[0], time)
@@ -476,6 +469,7 @@ def advance_climb(
     total = jnp.sum(touching.force)
     adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
+    is_loaded, ahead = touching.force > 0, touching.place - centre
     record = ClimbRecord(
         time=time,
         motion=motion,
@@ -493,17 +487,9 @@ def advance_climb(
         grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(adhesion_force, 1e-9),
         carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
-        base=_distances_to_outermost_contacts(centre, touching),
+        base=jnp.stack([jnp.max(jnp.where(is_loaded, way, -jnp.inf)) for way in (-ahead, ahead)]),
     )
     return after, spent, record
-
-
-def _distances_to_outermost_contacts(centre_of_mass: Scalar, at: Footing) -> Pair:
-    """Distances from the centre of mass to the outermost contacts behind and ahead [m], measured along level
-    ground.
-    """
-    is_loaded, ahead = at.force > 0, at.place - centre_of_mass
-    return jnp.stack([jnp.max(jnp.where(is_loaded, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
 def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Footing) -> Scalar:

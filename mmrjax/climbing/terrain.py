@@ -130,12 +130,12 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
     if x.ndim != 1 or x.shape != z.shape or len(x) < 2:
         raise ValueError(f"terrain: got x of shape {x.shape} and z of {z.shape}; expected two points or more")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
-        raise ValueError("terrain: got a point that is not a number; expected x and z in metres")
+        raise ValueError("terrain: got a point that is not a number; expected metres")
     if (points_of_falls := np.flatnonzero(np.diff(x) < 0)).size:
         k = int(points_of_falls[0])
         raise ValueError(
-            f"terrain: x falls from {x[k]:g} to {x[k + 1]:g} m at point {k + 2}; expected ground that goes forward, "
-            "x equal or larger from point to point (no overhangs)"
+            f"terrain: x falls from {x[k]:g} to {x[k + 1]:g} m at point {k + 2}; expected ground without "
+            "overhangs, x never falling"
         )
     keep = np.concatenate([[True], (np.diff(x) != 0) | (np.diff(z) != 0)])
     x, z = x[keep], z[keep]

@@ -24,8 +24,8 @@ from mmrjax.compile.programs import has_tracer
 
 #: Reason for refusing a fit inside a trace in single precision, with the remedy.
 SINGLE = (
-    "called inside a JAX transformation in single precision, which is too coarse for a fit. Call it outside of "
-    'jax.jit, or set jax.config.update("jax_enable_x64", True)'
+    "called inside a JAX transformation in single precision, too coarse for a fit. Call it outside, or set "
+    'jax.config.update("jax_enable_x64", True)'
 )
 
 P = ParamSpec("P")

@@ -98,9 +98,7 @@ class FidelityFacts:
                 continue
             if name not in values:
                 option_names = ", ".join(values) or "none"
-                raise ValueError(
-                    f"{name}: got {value!r}; this fidelity has no such option; its options: {option_names}"
-                )
+                raise ValueError(f"{name}: got {value!r}; this fidelity has the options: {option_names}")
             values[name] = float(value)
         for option in self.options:
             value = values[option.name]
@@ -121,7 +119,7 @@ _STEP = Option("step", "s", 1e-4, 0.01, "integration step")
 TABLE: dict[str, FidelityFacts] = {
     "steady": FidelityFacts(
         "mmrjax.fidelities.steady",
-        "the operating point as a root of the balances, with implicit derivatives",
+        "the operating point, a root of the balances with implicit derivatives",
         chunk=(262_144, 4_194_304),
         starts=64,
         profiles=True,
@@ -138,7 +136,7 @@ TABLE: dict[str, FidelityFacts] = {
     ),
     "track": FidelityFacts(
         "mmrjax.fidelities.track",
-        "half a robot as multibody dynamics in MuJoCo MJX, with individual contacts",
+        "half a robot in MuJoCo MJX, with individual contacts",
         chunk=(512, 16_384),
         options=(_duration_option(1.5, 3600.0), _STEP),
         rollout=True,

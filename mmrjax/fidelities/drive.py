@@ -406,8 +406,8 @@ def _standstill_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     if not rows:
         return []
     return [
-        f"rows {rows}: computed from a rolling start. From standstill, the calibrated robot does not settle there "
-        f"within {TIME_SETTLED:g} s, because it starts by sliding at μ_d"
+        f"rows {rows}: computed from a rolling start. From standstill, the robot does not settle within "
+        f"{TIME_SETTLED:g} s, sliding at μ_d"
     ]
 
 

@@ -69,9 +69,7 @@ def run_batch(
     """Simulates a batch of any shape."""
     runs = math.prod(conditions.shape)
     if history and runs > HISTORIES:
-        raise UsageError(
-            f"history: got {runs} runs; time histories can be kept for at most {HISTORIES}; set history=False"
-        )
+        raise UsageError(f"history: got {runs} runs; expected at most {HISTORIES}; set history=False")
     simulate = fidelity.histories if history else fidelity.run
     assert simulate is not None
     if has_tracer((robot, conditions)):

@@ -28,7 +28,7 @@ from mmrjax.model.robot import NO_BRAKE, Robot, turn_error
 from mmrjax.model.signals import CODES
 
 #: Warning about runs without data of each side, for a robot with unequal sides.
-STRAIGHT = "the robot's sides differ, but the runs state nothing for each side: they travel straight, as if steered"
+STRAIGHT = "the robot's sides differ, but these runs travel straight, as if steered"
 #: Error message for reverse mode through a fidelity that does not support it.
 FORWARD_ALONE = (
     "derivatives are forward (jax.jacfwd, jax.jvp). For jax.grad use model steady, or mmrjax.step for runs over time"
@@ -96,8 +96,7 @@ def simulate(
     _check_turning(robot, conditions, profile)
     if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
         raise UsageError(
-            "held: a clamp needs settled runs of a shaft at an imposed voltage or current; use model='steady' with "
-            "such a rig, or omit held"
+            "held: a clamp needs a shaft at an imposed voltage or current and model='steady'; use both, or omit held"
         )
     braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
     if braked and robot.has_ground:
@@ -172,7 +171,9 @@ def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]
         raise UsageError(f"model: got {model} with a profile; expected {mission_batch.MODEL}, which follows profiles")
     for name, value in options.items():
         if value is not None:
-            raise UsageError(f"{name}: got {value!r} with a profile; its last row ends the mission; leave {name} out")
+            raise UsageError(
+                f"{name}: got {value!r} with a profile, whose last row ends the mission; leave {name} out"
+            )
 
 
 def _simulate_missions(

@@ -413,14 +413,13 @@ def _check_run(robot: Robot, conditions: Conditions, options: Mapping[str, float
     if conditions.turns and np.any(np.asarray(conditions.slope_deg) != 0):
         steepest = np.asarray(conditions.slope_deg).flat[int(np.argmax(np.abs(np.asarray(conditions.slope_deg))))]
         raise ValueError(
-            f"got a slope of {steepest:g} deg for a robot that turns: its heading changes there continuously, so it "
-            "has no steady state; follow it over time: --model drive"
+            f"got a slope of {steepest:g} deg for a robot that turns, so it has no steady state; use --model drive"
         )
     for k, (name, load) in enumerate(robot.configurations.items()):
         if np.any(np.asarray(load.torque_gravity) > 0) and np.any(np.asarray(conditions.configuration) == k):
             raise ValueError(
-                f"{name} has a torque of gravity that depends on its angle (torque_gravity above 0), so it has no "
-                "steady state; follow it over time: --model drive, and tables with a column time_s"
+                f"{name} has a gravity torque that depends on its angle, so it has no steady state; use --model "
+                "drive, and tables with time_s"
             )
 
 

@@ -95,7 +95,12 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
     """
     robot, conditions = as_floats((robot, _commanded_conditions(robot, command, conditions)))
     y = _unknowns_of_state(robot, state)
-    return drive.state_of_unknowns(robot, _unknowns_after_step(robot, conditions, y, _step_length(robot, dt)))
+    rate = 0.0 if robot.controller is None else robot.controller.rate
+    if _shape_of_numbers(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
+        raise UsageError(f"dt: got {_text_of_value(dt)}; expected a number of seconds above 0")
+    if rate and not has_tracer(dt) and abs((parts := 1 / rate / float(dt)) - round(parts)) > 1e-6 * parts:
+        raise UsageError(f"dt: got {float(dt):g}; expected a whole part of the controller's period, {1 / rate:g} s")
+    return drive.state_of_unknowns(robot, _unknowns_after_step(robot, conditions, y, jnp.asarray(dt, float)))
 
 
 @compiled
@@ -170,16 +175,6 @@ def _shape_of_numbers(value: Any) -> tuple[int, ...] | None:
 def _text_of_value(value: Any) -> str:
     """A number or a word as written, of anything else its type."""
     return f"{value!r:.40}" if isinstance(value, str | float | int) else type(value).__name__
-
-
-def _step_length(robot: Robot, dt: Scalar) -> Scalar:
-    """The length of a step, checked unless it is a tracer."""
-    rate = 0.0 if robot.controller is None else robot.controller.rate
-    if _shape_of_numbers(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
-        raise UsageError(f"dt: got {_text_of_value(dt)}; expected a number of seconds above 0")
-    if rate and not has_tracer(dt) and abs((parts := 1 / rate / float(dt)) - round(parts)) > 1e-6 * parts:
-        raise UsageError(f"dt: got {float(dt):g}; expected a whole part of the controller's period, {1 / rate:g} s")
-    return jnp.asarray(dt, float)
 
 
 def _unknowns_of_state(robot: Robot, state: State) -> Unknowns:

@@ -213,14 +213,14 @@ def check_track_runs(
             imposed motor speed, movers without inertia, parts with more mass or inertia than the robot.
     """
     if not robot.has_ground:
-        raise ValueError("the robot's load is a shaft, which has no running gear; use steady or drive")
+        raise ValueError("a shaft has no running gear; use steady or drive")
     if robot.rig.imposed != "voltage":
         quantity = robot.rig.imposed.removeprefix("motor_")
         raise ValueError(
-            f"the motors' {quantity} is imposed, but this model drives them by their voltage; use steady or drive"
+            f"the motors' {quantity} is imposed, but this model imposes the voltage; use steady or drive"
         )
     if conditions.motor_speed is not None or (conditions.turns and conditions.of_sides().motor_speed is not None):
-        raise ValueError("motor_speed: got an imposed speed; this model drives the motors by their voltage")
+        raise ValueError("motor_speed: got an imposed speed; this model imposes the voltage")
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected the sample time, {sample:g} s, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
@@ -230,8 +230,8 @@ def check_track_runs(
     for name, chassis in robot.configurations.items():
         if not np.all(np.asarray(chassis.inertia) > 0):
             raise ValueError(
-                f"{name}.inertia: got 0; this model needs the inertia of all parts that turn with the movers of one "
-                "side [kg·m^2]"
+                f"{name}.inertia: got 0; expected the inertia of all parts that turn with the movers of one side "
+                "[kg·m^2]"
             )
     masses.check_parts(robot)
     check_track_step(robot, conditions, step, sample)
@@ -349,8 +349,8 @@ def _stiffness_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     if not rows:
         return []
     return [
-        f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
-        f"{limits.min():.2g} s. Do not trust its readings there: contacts or belt are too stiff"
+        f"rows {rows}: the step of {STEP:g} s is above the largest stable one, {limits.min():.2g} s. Do not "
+        "trust these readings: contacts or belt are too stiff"
     ]
 
 

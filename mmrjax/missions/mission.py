@@ -239,7 +239,20 @@ def mission(
         fresh = carry._replace(peaks=no_peaks, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
         c = integrate_segment(law, robot, conditions, segment, fresh, tolerance, most_steps)
-        segment_end = _segment_end(law, robot, conditions, segment, carry, c, beginning)
+        signals, _, _, demand = law.instant(robot, conditions, segment, c.y, c.stands)
+        status, missed = _segment_status(law, robot, conditions, segment, signals, demand, c.stands)
+        status = jnp.where(c.ended, _early_end_status(c), status)
+        slips = law.exceeded(robot, signals)["slips"] & ~c.stands
+        flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
+        rise = law.stored(robot, signals) - law.stored(robot, beginning)
+        drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
+        energy_before, energy_after = (robot.battery.energy(_charge_taken(law, x.y)) for x in (carry, c))
+        energy_supplied = jnp.where(conditions.battery > 0.5, energy_after - energy_before, drawn - returned)
+        ran = ~carry.ended
+        time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
+        segment_end = _SegmentEnd(
+            time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept
+        )
         carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | segment_end.flags)
         return carry, segment_end
 
@@ -286,30 +299,6 @@ def _initial_carry(
         flags=zero, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=zero, rejected=zero, failed=false,
         kept=zero, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
-
-
-def _segment_end(
-    law: MotionLaw,
-    robot: Robot,
-    conditions: Conditions,
-    segment: Profile,
-    before: IntegrationState,
-    c: IntegrationState,
-    beginning: Any,
-) -> _SegmentEnd:
-    """Data of a segment at its end `c`, given the state `before` it and its first instant."""
-    signals, _, _, demand = law.instant(robot, conditions, segment, c.y, c.stands)
-    status, missed = _segment_status(law, robot, conditions, segment, signals, demand, c.stands)
-    status = jnp.where(c.ended, _early_end_status(c), status)
-    slips = law.exceeded(robot, signals)["slips"] & ~c.stands
-    flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
-    rise = law.stored(robot, signals) - law.stored(robot, beginning)
-    drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
-    energy_before, energy_after = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
-    energy_supplied = jnp.where(conditions.battery > 0.5, energy_after - energy_before, drawn - returned)
-    ran = ~before.ended
-    time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
-    return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept)
 
 
 def _assemble_mission(

@@ -310,57 +310,11 @@ def integrate_segment(
         return (c.y[law.CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
 
     def take_step(c: IntegrationState) -> IntegrationState:
-        tried = leg.tried(c)
-        return leg.after(c, tried.h, tried.good, leg.shorten_to_event(c, tried))
+        return leg.after(c, *leg.step_to_event(c))
 
     c = jax.lax.while_loop(is_running, take_step, leg.begin(carry))
     failed = c.failed | ((c.y[law.CLOCK] < nearly) & ~c.ended)
     return c._replace(failed=failed, ended=c.ended | failed)
-
-
-class _TriedStep(NamedTuple):
-    """A step before it is accepted or rejected.
-
-    Attributes:
-        y, q: unknowns and integrals at its end.
-        h: length of the step [s].
-        last: True if it ends the segment, or if the cut-off time of the cells ends with it.
-        good: True if its error is within the tolerance.
-        grown: length of the next step that its error permits [s].
-    """
-
-    y: Array
-    q: Array
-    h: Array
-    last: Array
-    good: Array
-    grown: Array
-
-
-class _StepToEvent(NamedTuple):
-    """A step that may end early, at an event.
-
-    Attributes:
-        y, q, stands, below, low: as in `IntegrationState`, at its end.
-        which: index of the event, -1 for none.
-        cut_off: True if the cells stayed below their cut-off.
-        after: event functions at the end of the tried step.
-        taken: True if the step is accepted.
-        event: True if it ends at an event.
-        step: length of the next step [s].
-    """
-
-    y: Array
-    q: Array
-    stands: Array
-    below: Array
-    low: Array
-    which: Array
-    cut_off: Array
-    after: Array
-    taken: Array
-    event: Array
-    step: Array
 
 
 class _SegmentIntegrator(NamedTuple):
@@ -393,8 +347,14 @@ class _SegmentIntegrator(NamedTuple):
         )  # fmt: skip
         return begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
 
-    def tried(self, c: IntegrationState) -> _TriedStep:
-        """A step of the planned length, limited by the end of the segment and the cut-off time of the cells."""
+    def tried(self, c: IntegrationState) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """A step of the planned length, limited by the end of the segment and the cut-off time of the cells.
+
+        Returns:
+            Unknowns and integrals at its end, its length [s], True if it ends the segment or if the cut-off time of
+            the cells ends with it, True if its error is within the tolerance, and the length of the next step that
+            its error permits [s].
+        """
         law, robot, otherwise, segment, *_ = self
 
         def rates(y: Array) -> tuple[Array, Array]:
@@ -413,12 +373,17 @@ class _SegmentIntegrator(NamedTuple):
         size = law.norm(error_across_kink(u[-1], c.y, y, kink) / scale)
         size = jax.lax.stop_gradient(jnp.where(jnp.isfinite(size), size, 1e6))
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
-        return _TriedStep(y, q, h, last, size <= 1, grown)
+        return y, q, h, last, size <= 1, grown
 
-    def shorten_to_event(self, c: IntegrationState, tried: _TriedStep) -> _StepToEvent:
-        """The step, shortened to its first event if it contains one."""
+    def step_to_event(self, c: IntegrationState) -> tuple[IntegrationState, Array, Array, Array]:
+        """The next step, shortened to its first event if it contains one.
+
+        Returns:
+            The state at its end, without its peaks, flags and recorded steps. The length of the tried step [s], the
+            index of the event, -1 for none, and True if it ends at an event.
+        """
         law, robot, otherwise, segment, *_ = self
-        y, q, h, last, good, grown = tried
+        y, q, h, last, good, grown = self.tried(c)
         after = event_functions(law, robot, otherwise, segment, y, c.stands, c.below)
         happened = after > 0
         between = happened & (c.events < 0)
@@ -441,12 +406,20 @@ class _SegmentIntegrator(NamedTuple):
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, self.longest)
-        return _StepToEvent(y, q, stands, below, low, event_index, cut_off, after, is_accepted, event, step)
+        landed = c._replace(
+            y=y, q=q, step=step, stands=stands, below=below, low=low, cut_off=cut_off,
+            events=jnp.where(is_accepted, after, c.events), accepted=c.accepted + is_accepted,
+            rejected=c.rejected + ~is_accepted, failed=c.failed | (~good & (h <= SHORTEST)),
+        )  # fmt: skip
+        return landed, h, event_index, event
 
-    def after(self, c: IntegrationState, h: Array, good: Array, landed: _StepToEvent) -> IntegrationState:
-        """State after a step of length h [s], with its contributions to peaks, flags and recorded steps."""
+    def after(
+        self, c: IntegrationState, landed: IntegrationState, h: Array, which: Array, event: Array
+    ) -> IntegrationState:
+        """State after a step as from `step_to_event`, with its peaks, flags and recorded steps."""
         law, robot, otherwise, segment, *_ = self
-        y, stands, below, is_accepted, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
+        y, stands, below, cut_off = landed.y, landed.stands, landed.below, landed.cut_off
+        is_accepted = landed.accepted > c.accepted
         signals, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
         # Current and heat may peak within the step. Speeds are different: at the end of a long step their slopes
         # belong to the stiff part of the solution, and a cubic would oscillate.
@@ -462,21 +435,17 @@ class _SegmentIntegrator(NamedTuple):
         exceedance = law.exceeded(robot, signals)
         exceedance.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
         flags = flag_mask({**exceedance, "cut_off": cut_off}) | flag_mask({"too_hot": is_too_hot})
-        failed = c.failed | (~good & (h <= SHORTEST))
-        has_ended = c.ended | cut_off | (landed.which == EMPTY) | failed
+        has_ended = c.ended | cut_off | (which == EMPTY) | landed.failed
         now = (robot, otherwise, segment, y, stands, below)
-        unchanged = jnp.where(is_accepted, landed.after, c.events)
-        events_now = compute_if_needed(landed.event, functools.partial(event_functions, law), now, unchanged)
+        events_now = compute_if_needed(event, functools.partial(event_functions, law), now, landed.events)
         buffer_count, buffer = c.kept, c.buffer
         if buffer is not None:
             slot = jnp.where(is_accepted, buffer_count, buffer[0].shape[0])  # beyond the end: dropped
-            row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), landed.which))
+            row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), which))
             buffer = tuple(b.at[slot].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
-        return IntegrationState(
-            y=y, q=landed.q, step=landed.step, stands=stands, ended=has_ended, below=below, low=landed.low,
-            cut_off=cut_off, peaks=peaks, flags=c.flags | flags,
-            events=events_now, accepted=c.accepted + is_accepted, rejected=c.rejected + ~is_accepted, failed=failed,
-            kept=buffer_count + is_accepted, buffer=buffer, slope=dy,
+        return landed._replace(
+            ended=has_ended, peaks=peaks, flags=c.flags | flags, events=events_now, kept=buffer_count + is_accepted,
+            buffer=buffer, slope=dy,
         )  # fmt: skip
 
 

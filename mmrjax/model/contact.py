@@ -9,7 +9,7 @@ from mmrjax.model.params import Scalar, parameter
 from mmrjax.numerics.trigonometry import sine_third
 
 _SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with the adhesion of Table 5"
-_PACKAGE = "10 V_s, the ratio of the defaults of the multibody package of ref. [48]; the paper prints none"
+_PACKAGE = "10 V_s, as in the multibody package of ref. [48]; the paper prints none"
 
 
 def cubic_step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:

@@ -47,11 +47,11 @@ class Driver(eqx.Module):
         "no limit on the bench: above any current", relative_sd=0.1,
     )  # fmt: skip
     gain: Scalar = parameter(
-        4.0, "-", "proportional gain of the speed controller, in multiples of the speed constant C_E", (0.0, 1e3),
+        4.0, "-", "proportional gain of the speed controller over the speed constant C_E", (0.0, 1e3),
         "assumed; the paper has no controller", relative_sd=0.1,
     )  # fmt: skip
     time_reset: Scalar = parameter(
-        0.05, "s", "reset time of the speed controller: time in which its integral repeats the proportional action",
+        0.05, "s", "reset time of the speed controller",
         (1e-3, 1e3), "assumed; the paper has no controller", relative_sd=0.1,
     )  # fmt: skip
     returns_current: bool = eqx.field(default=True, static=True)

@@ -171,7 +171,7 @@ def check_parts(robot: Robot) -> None:
             parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
             raise ValueError(
                 f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
-                "the mass of its pulleys, wheels, tracks and levers (running_gear.pulley_mass and others)"
+                "the mass of its pulleys, wheels, tracks and levers (running_gear)"
             )
         total_field = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
         declared_total = np.asarray(getattr(robot.running_gear, total_field))
@@ -179,5 +179,5 @@ def check_parts(robot: Robot) -> None:
         if np.any((declared_total > 0) & (declared_total <= least)):
             raise ValueError(
                 f"running_gear.{total_field}: got {np.min(declared_total):.3g} kg·m^2; expected 0, or more than "
-                f"{np.max(least):.3g} kg·m^2, the inertia of the parts of {name} without the body's own"
+                f"{np.max(least):.3g} kg·m^2, that of the parts of {name} without the body's own"
             )

@@ -54,7 +54,7 @@ class Motor(eqx.Module):
         relative_sd=0.2,
     )  # fmt: skip
     time_constant_housing: Scalar = parameter(
-        593.0, "s", "thermal time constant of the motor: its housing's capacity times the resistance to ambient",
+        593.0, "s", "thermal time constant of the housing to ambient",
         (1.0, 1e5), _SHEET, relative_sd=0.2,
     )  # fmt: skip
     temperature_ambient: Scalar = parameter(

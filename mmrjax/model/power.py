@@ -122,7 +122,7 @@ def curve_remark(battery: Battery) -> str | None:
         return None
     share = -float(battery.slope) / (2 * float(battery.curvature)) / battery.capacity_curve
     return (
-        f"with this curvature and slope a cell's voltage rises again once {100 * share:.3g} % of its capacity is "
+        f"with this curvature and slope a cell's voltage rises after {100 * share:.3g} % of its capacity is "
         f"taken (capacity_curve: {battery.capacity_curve:g} C)"
     )
 

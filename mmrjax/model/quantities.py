@@ -322,7 +322,7 @@ PAYLOAD, SLOPE, CHARGE, AMBIENT = AXES
 SINKS: dict[str, str] = {
     "battery": "heat in the battery's cells",
     "other": "other consumers on the battery",
-    "driver": "driver and wiring: open bridge, diode, and drops on the way to the motors",
+    "driver": "driver and wiring: open bridge, diode, and drops",
     "winding": "heat in windings, leads and brushes",
     "motor": "friction of the motors",
     "gearbox": "losses of the gearboxes",
@@ -404,7 +404,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             _TORQUES, heading="load torque [N·m]", shown="{:.4g}", in_tables=True, acts=SHAFT, in_profiles=True,
         ),
         Condition(
-            "held", "", "1 where a clamp holds the output at rest and carries its torque", (0.0, 1.0), heading="held",
+            "held", "", "1 where a clamp holds the output", (0.0, 1.0), heading="held",
             in_tables=True, imposed=("voltage", "motor_current"), acts=SHAFT,
         ),
         Condition("battery", "", "on-board battery instead of the external supply", (0.0, 1.0)),
@@ -412,7 +412,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
         Condition("adhesion", "", "adhesion relative to that in the robot's file", _RATIO),
         Condition("order", "", "place in the sequence of runs", (0.0, 1e9), in_tables=True),
         Condition(
-            "duty", "", "share of the supply's voltage that the driver gives the motors", _SHARE, percent=True,
+            "duty", "", "share of the supply's voltage at the motors", _SHARE, percent=True,
             in_tables=True, imposed=_BY_VOLTAGE, in_profiles=True,
         ),
         Condition("open", "", "1 if the motors' circuit is open", _SHARE),
@@ -460,7 +460,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
     "channel": (
         Channel(
             "total_current", "A", "total current", (-2000.0, 2000.0), 100.0, 0.02, word="current", resolution=3,
-            rests_on=CURRENT, where="drawn from the supply by all motors; with a duty, that share of their current",
+            rests_on=CURRENT, where="drawn from the supply by all motors; with a duty, its share of their current",
         ),
         _SPEED,
         Channel("speed", "mm/s", "speed", _SPEEDS, 5_000.0, in_profiles=True, zero_at_rest=True),
@@ -585,7 +585,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
     ),
     "turn": (
         Quantity(
-            "turning_radius", "mm", "radius of the circle of the centre of mass, positive to the left; inf: straight",
+            "turning_radius", "mm", "radius of the circle, positive to the left; inf: straight",
         ),
         Quantity("centre_x", "mm", "instantaneous centre of rotation ahead of the centre of mass"),
         Quantity("centre_y", "mm", "instantaneous centre of rotation to the left of the centre of mass"),

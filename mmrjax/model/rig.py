@@ -116,7 +116,7 @@ class Rig(eqx.Module):
     """
 
     delay: Scalar = parameter(
-        0.0, "s", "dead time between a value in the imposed quantity's column and its action", (-10.0, 10.0),
+        0.0, "s", "dead time of the imposed quantity", (-10.0, 10.0),
         "stated by the owner of the rig", sd=0.02, scanned=0.0,
     )  # fmt: skip
     begins: RunStarts | None = None

@@ -229,17 +229,17 @@ class Robot(eqx.Module):
 
 
 #: Reason why a vehicle has no brake torque on its output.
-NO_BRAKE = "the robot is a vehicle; the torque of a brake acts only on a shaft"
+NO_BRAKE = "the robot is a vehicle; a brake acts only on a shaft"
 
 
 def turn_error(robot: Robot, names: Iterable[str]) -> str | None:
     """Reason why a robot with independently driven sides cannot be computed in these configurations, else None."""
     if not robot.has_ground:
-        return "the robot's load is a shaft, which does not turn over the ground"
+        return "the robot's load is a shaft, which cannot turn on the ground"
     if float(robot.sides) < 2:
         return f"got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
     if robot.rig.imposed == "motor_current":
-        return "the robot's file imposes the motors' current, which is not available for each side"
+        return "the robot's file imposes the motors' current, not available for each side"
     lacking = [
         f"{name}.turning.{key} [{unit}]"
         for name in names

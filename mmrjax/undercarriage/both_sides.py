@@ -171,9 +171,12 @@ def generalized_forces(
     """Generalized forces on q [N, N·m]."""
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     y, several = SIDES * _width(run), run.robot.sides / 2
-    lateral, yaw = balances.lateral_and_yaw_effects(run.robot, _with_lateral_moment(run, signals, at, pulled))
-    forward, normal, moment, rear = pulled.generalized.T
     assert pulled.aside is not None
+    moment_lateral = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
+    lateral, yaw = balances.lateral_and_yaw_effects(
+        run.robot, dataclasses.replace(signals, moment_lateral=moment_lateral)
+    )
+    forward, normal, moment, rear = pulled.generalized.T
     ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral
     turn = several * (jnp.sum(pulled.aside * at.lever_x) - y @ forward) - yaw
     roll_moment = several * (y @ normal - jnp.sum(pulled.aside * at.lever_z))
@@ -181,13 +184,6 @@ def generalized_forces(
     shafts = several * jnp.asarray(signals.torque_net), several * rear
     pulleys = [x[k] for k in range(2) for x in shafts]
     return jnp.stack([*body, several * jnp.sum(moment), roll_moment, *pulleys])
-
-
-def _with_lateral_moment(run: HalfRobotSystem, signals: Signals, at: ContactState, pulled: ContactPull) -> Signals:
-    """Signals with the moment of the lateral forces about the centre of mass."""
-    assert pulled.aside is not None
-    moment = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
-    return dataclasses.replace(signals, moment_lateral=moment)
 
 
 def damping_matrix(

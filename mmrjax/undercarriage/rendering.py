@@ -63,8 +63,39 @@ class RunScene(NamedTuple):
     weight: float
 
     def sheet(self, k: int) -> Any:
-        """Figure of sample `k`."""
-        return figure_of_sample(self, k)
+        """Figure of sample `k`: the robot above, current and speeds of the whole run below."""
+        from matplotlib.figure import Figure
+        from matplotlib.lines import Line2D
+
+        sheet = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
+        upper, current, speed = sheet.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
+        draw_sample(upper, self, k)
+        span, rise = 0.31, 0.31 * np.sin(abs(self.slope))
+        upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
+        upper.axis("off")
+        upper.set_title(
+            f"{self.name}, slope {np.degrees(self.slope):.0f}°, t = {self.time[k]:.3f} s, x = {self.q[k, 0]:.3f} m, "
+            f"V = {self.speed[k]:.2f} m/s",
+            fontsize=11,
+        )
+        legend_entries = [entry for entry in _LEGEND if not (self.wheeled and "guide" in entry[0])]
+        handles = [Line2D([], [], color=colour, lw=2.5, label=label) for label, colour in legend_entries]
+        upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(legend_entries))
+        foot = -0.14 - rise * 0.5
+        upper.plot([span - 0.02 - 50 * FORCE, span - 0.02], [foot] * 2, color=_INK, lw=2)
+        upper.text(span - 0.02 - 25 * FORCE, foot + 0.004, "50 N", fontsize=8, va="bottom", ha="center")
+        current.plot(self.time, self.total_current, color=_NORMAL, lw=0.9)
+        top = 1.3 * np.percentile(self.total_current, 98)
+        current.set(ylabel="I, A", ylim=(0.0, max(top, 0.1)), xlim=(self.time[0], self.time[-1]), xticklabels=[])
+        speed.plot(self.time, self.theoretical, color="#888888", lw=0.9, label="theoretical")
+        speed.plot(self.time, self.speed, color=_TRACTION, lw=1.2, label="robot")
+        speed.set(xlabel="time, s", ylabel="V, m/s", xlim=(self.time[0], self.time[-1]))
+        speed.legend(fontsize=8, frameon=False, loc="lower right")
+        for axes in (current, speed):
+            axes.axvline(self.time[k], color=_INK, lw=0.8)
+            axes.grid(alpha=0.25)
+            axes.spines[["top", "right"]].set_visible(False)
+        return sheet
 
 
 def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> RunScene:
@@ -75,7 +106,7 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
     """
     gear = robot.running_gear
     if not np.isfinite(np.asarray(run.q)).all():
-        raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
+        raise ValueError("run: its coordinates are not finite; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
@@ -200,42 +231,6 @@ _LEGEND = (
     ("load on the lower guide", _GUIDE),
     ("weight", _WEIGHT),
 )
-
-
-def figure_of_sample(view: RunScene, k: int) -> Any:
-    """Figure of sample `k`: the robot above, current and speeds of the whole run below."""
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-
-    sheet = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
-    upper, current, speed = sheet.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
-    draw_sample(upper, view, k)
-    span, rise = 0.31, 0.31 * np.sin(abs(view.slope))
-    upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
-    upper.axis("off")
-    upper.set_title(
-        f"{view.name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, x = {view.q[k, 0]:.3f} m, "
-        f"V = {view.speed[k]:.2f} m/s",
-        fontsize=11,
-    )
-    legend_entries = [entry for entry in _LEGEND if not (view.wheeled and "guide" in entry[0])]
-    handles = [Line2D([], [], color=colour, lw=2.5, label=label) for label, colour in legend_entries]
-    upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(legend_entries))
-    foot = -0.14 - rise * 0.5
-    upper.plot([span - 0.02 - 50 * FORCE, span - 0.02], [foot] * 2, color=_INK, lw=2)
-    upper.text(span - 0.02 - 25 * FORCE, foot + 0.004, "50 N", fontsize=8, va="bottom", ha="center")
-    current.plot(view.time, view.total_current, color=_NORMAL, lw=0.9)
-    top = 1.3 * np.percentile(view.total_current, 98)
-    current.set(ylabel="I, A", ylim=(0.0, max(top, 0.1)), xlim=(view.time[0], view.time[-1]), xticklabels=[])
-    speed.plot(view.time, view.theoretical, color="#888888", lw=0.9, label="theoretical")
-    speed.plot(view.time, view.speed, color=_TRACTION, lw=1.2, label="robot")
-    speed.set(xlabel="time, s", ylabel="V, m/s", xlim=(view.time[0], view.time[-1]))
-    speed.legend(fontsize=8, frameon=False, loc="lower right")
-    for axes in (current, speed):
-        axes.axvline(view.time[k], color=_INK, lw=0.8)
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
-    return sheet
 
 
 def check_picture(file: File, time: float, length: float) -> None:

@@ -58,11 +58,11 @@ class Levers(eqx.Module):
         "no limit on the bench: above any current", relative_sd=0.1,
     )  # fmt: skip
     share_coulomb: Scalar = parameter(
-        0.4, "-", "share of a side's static loss torque of the tracks that each of its two levers' tracks has",
+        0.4, "-", "share of a side's static loss torque in the track of each lever",
         (0.0, 0.5), "Table 3: (350 - 70) / 2 of 350 mN·m", sd=0.05,
     )  # fmt: skip
     share_viscous: Scalar = parameter(
-        13 / 32, "-", "share of a side's pseudo-viscous loss of the tracks that each of its two levers' tracks has",
+        13 / 32, "-", "share of a side's pseudo-viscous loss in the track of each lever",
         (0.0, 0.5), "Table 3: (16 - 3) / 2 of 16 mN·m·s", sd=0.05,
     )  # fmt: skip
 
@@ -93,7 +93,7 @@ class RunningGear(eqx.Module):
     """
 
     wheelbase: Scalar = parameter(
-        0.300, "m", "distance of the axles L_b, also the length of a straight run of the belt", (0.05, 3.0),
+        0.300, "m", "distance of the axles L_b and length of a straight run of the belt", (0.05, 3.0),
         "Table 6", relative_sd=0.005,
     )  # fmt: skip
     grouser_height: Scalar = parameter(
@@ -102,7 +102,7 @@ class RunningGear(eqx.Module):
         relative_sd=0.1,
     )  # fmt: skip
     grouser_length: Scalar = parameter(
-        5e-3, "m", "length of a grouser's rigid base along the belt; the grouser turns into the arc over this length",
+        5e-3, "m", "length of a grouser's rigid base along the belt",
         (5e-4, 0.03), "one tooth pitch: the rigid link that carries a grouser, Section 3.2.4", relative_sd=0.3,
     )  # fmt: skip
     guide_recess: Scalar = parameter(
@@ -163,13 +163,12 @@ class RunningGear(eqx.Module):
         0.0, "m", "centre of the payload ahead of the middle of the wheelbase", (-0.5, 0.5), "Fig. 19", sd=0.02
     )
     body_gyration: Scalar = parameter(
-        0.1075, "m", "radius of gyration in pitch of the body: without payload, levers, pulleys, wheels and tracks",
+        0.1075, "m", "radius of gyration in pitch of the body alone",
         (1e-3, 3.0), "Table 7: sqrt(1.19e5 kg·mm² / 10.3 kg)", relative_sd=0.05,
     )  # fmt: skip
     inertia_tracked: Scalar = parameter(
         0.0, "kg·m^2",
-        "moment of inertia in pitch on tracks, levers folded, no payload, if known as a whole; replaces "
-        "body_gyration; 0: it follows from the parts",
+        "moment of inertia in pitch on tracks, levers folded, no payload; 0: body_gyration and parts",
         (0.0, 20.0),
         "not stated: the sum of the parts (Table 7's 0.251 is that of the robot with its levers outstretched)",
         sd=5e-3,
@@ -206,7 +205,7 @@ class RunningGear(eqx.Module):
     )  # fmt: skip
     additional_pulley_mass: Scalar = parameter(
         104e-3, "kg",
-        "mass of the additional pulley on the axle, which drives the lever's track or carries the wheel", (0.0, 10.0),
+        "mass of the axle's pulley for the lever's track or the wheel", (0.0, 10.0),
         "Table 7: two a side, as 13.1 and 11.5 kg need", relative_sd=0.05,
     )  # fmt: skip
     wheel_mass: Scalar = parameter(86e-3, "kg", "mass of one wheel, 4W2T", (0.0, 10.0), "Table 7", relative_sd=0.05)

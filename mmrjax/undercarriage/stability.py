@@ -115,16 +115,15 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
             )
             name = name if run_value is None else of_run
             raise ValueError(
-                f"{name}: got {stands:.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the "
-                "ground; expected a posture on the main tracks, with both tips above the ground"
+                f"{name}: got {stands:.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the ground; "
+                "expected both tips above the ground"
             )
     limits = largest_step(robot, conditions)
     worst = int(np.argmin(limits))
     if step > limits[worst]:
         raise ValueError(
-            f"step: got {step:g} s; contacts, belt or friction are too stiff for it; the largest stable step is "
-            f"{limits[worst]:.2g} s (run {worst + 1} of {len(limits)}); take {_whole(sample, limits[worst]):g} s, a "
-            "softer contact or a larger V_s"
+            f"step: got {step:g} s; the largest stable step is {limits[worst]:.2g} s (run {worst + 1} of "
+            f"{len(limits)}); take {_whole(sample, limits[worst]):g} s, a softer contact or a larger V_s"
         )
 
 

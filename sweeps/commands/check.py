@@ -13,7 +13,6 @@ from calibration.described import report_in_words
 from calibration.sizing import sheet
 from mmrjax.derived.requirements import OF_HEAT
 from mmrjax.model.quantities import CHARGE, HEAT
-from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message, step_reporter
@@ -36,13 +35,19 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     robot = file.robot
     imposed.check_on_ground(robot, "check")
     sheet.reject_impossible(robot, demands)
-    _check_charge(robot, demands)
+    for r in demands.each:
+        depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
+        if depends and r.envelope.battery and not capabilities.has_battery(robot):
+            raise BadConfiguration(
+                f"{demands.source}, {r.name}: the robot's file has no battery; add [battery] to it, or set "
+                "supply_voltage_V in [envelope]"
+            )
     lacking = robot.unknown(HEAT)
     for r in demands.each:
         if lacking and r.name in OF_HEAT:
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: depends on the winding temperature, for which the robot's file "
-                f"lacks {', '.join(lacking)}; add them, or remove the requirement"
+                f"{demands.source}, {r.name}: needs the winding temperature, for which the robot's file lacks "
+                f"{', '.join(lacking)}; add them, or remove the requirement"
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as report:
@@ -57,17 +62,6 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         return finish_run_folder(
             folder, config, manifest, robot=result.robot, note="the robot of this check", solved=solved, page=document
         )
-
-
-def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
-    """Rejects a requirement that needs a battery if the robot file states none."""
-    for r in asked.each:
-        depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
-        if depends and r.envelope.battery and not capabilities.has_battery(robot):
-            raise BadConfiguration(
-                f"{asked.source}, {r.name}: the robot's file has no battery; add [battery] to it, or set "
-                "supply_voltage_V in [envelope]"
-            )
 
 
 def _write_folder(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:

@@ -277,8 +277,8 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Lev
         sequence = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
         if sequence.begins is None and lever_options[1:] != (None, None):
             raise BadConfiguration(
-                f"--levers-front, --levers-rear: {config.sequence.name} already gives all angles; give these "
-                "options only with a sequence of voltages (front_V, rear_V)"
+                f"--levers-front, --levers-rear: {config.sequence.name} gives all angles; use these options only "
+                "with front_V, rear_V"
             )
     if config.levers_voltage_V is not None:
         sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))

@@ -86,8 +86,8 @@ def _compare_histories(
     options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
     for option in (name for name, is_given in options.items() if is_given):
         raise BadConfiguration(
-            f"{option}: {Path(runs.source).name} contains time histories, which are simulated sample by sample "
-            "with their own masses and times; remove this option"
+            f"{option}: {Path(runs.source).name} contains time histories with their own masses and times; remove "
+            "this option"
         )
     model = None if config.model == fidelities.NAMES[0] else config.model
     ready = preparation.prepare_input(runs, file.robot)

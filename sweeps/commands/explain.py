@@ -54,7 +54,7 @@ def explain_name(name: str | None, files: Names) -> int:
     if name is None:
         for kind, those in names.items():
             print_output(_wrapped(kind, ", ".join(those)))
-        print_output("mmrjax explain NAME says what one means.")
+        print_output("mmrjax explain NAME explains one.")
         return 0
     explained = False
     for kind, about in EXPLAINED.items():
@@ -130,7 +130,7 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
 
 def _histories_sentence(effect: type[Effect]) -> str:
     if effect.transient:
-        return ". It is visible only in time histories, not in settled runs"
+        return ". Only time histories show it"
     return f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
 
 
@@ -192,7 +192,7 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
     if c.other_units:
         yield "other units", ", ".join(c.other_units)
-    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, which is assumed if you give no noise"
+    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, assumed without a stated noise"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
     sensor_effects = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if sensor_effects:
@@ -220,19 +220,17 @@ def _operating_condition_lines(name: str, library: Library) -> Iterator[Line]:
 def _output_lines(name: str, library: Library) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
         yield "is", f"{o.label} [{o.unit_shown}]"
-        if (meaning := _attribute_description(Result, o.name)) and o in outputs.FURTHER:
-            yield "equation", meaning
+        # The description is in the docstring of the class.
+        text = " ".join((inspect.getdoc(Result) or "").partition("Attributes:")[2].split())
+        match = re.search(
+            rf"(?:^|[.\]] |, |; )(?:\w+, )*{o.name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text
+        )
+        if match is not None and o in outputs.FURTHER:
+            yield "equation", match[1].rstrip(".")
         source_words = (
             "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
         )
         yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else source_words}"
-
-
-def _attribute_description(kind: type, name: str) -> str:
-    """Description of an attribute, from the docstring of its class."""
-    text = " ".join((inspect.getdoc(kind) or "").partition("Attributes:")[2].split())
-    match = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
-    return "" if match is None else match[1].rstrip(".")
 
 
 def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
@@ -276,9 +274,7 @@ EXPLAINED: dict[str, Explain] = {
     "verdict of a climb": _explain_by_table(
         {name: meaning for name, (_, meaning) in VERDICTS.items()}, "verdict of result.json of mmrjax climb"
     ),
-    "flag": _explain_by_table(
-        words.FLAGS, "column flags of runs.csv, counts in result.json. A run may have several flags"
-    ),
+    "flag": _explain_by_table(words.FLAGS, "column flags of runs.csv, counts in result.json"),
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,

@@ -89,9 +89,7 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
         )
     unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
     if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
-        raise BadConfiguration(
-            f"--unit: got {unit}, but the log is read from {pair[0]}; expected a unit of that position"
-        )
+        raise BadConfiguration(f"--unit: got {unit}, but the log has {pair[0]}; expected a unit of that position")
     size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
     if not runs.sampled:
         raise BadData(f"{runs.source}: no time; expected a column time_s")

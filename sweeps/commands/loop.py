@@ -100,7 +100,15 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         def keep(name: str, make: Callable[[], T]) -> T:
             result = stages[name] = folder.stage(name, make)
             if name == "ranking":
-                _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
+                # The ranking by regression is the first answer.
+                ranking: EffectRanking = stages[name]
+                first_line, *lines = loop_words.ranking_lines(ranking, brief=not beside.verbose)
+                timed(first_line)
+                for line in lines:
+                    print_message(line)
+                answer = loop_words.regression_verdict(ranking)
+                content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(ranking)}
+                folder.write_json(store.SCREENING_FILE, content)
             if name == "verdict":
                 timed(f"{loop_words.verdict_line(stages[name])}. Next: held-out errors and other noise levels")
             return result
@@ -129,7 +137,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
-            print_output("The track model was not run: no error remains in the slip, track or ground balance.")
+            print_output("No error remains in the slip, track or ground balance for the track model.")
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
@@ -170,29 +178,18 @@ def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, handler_before)
 
 
-def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
-    """Prints the ranking by regression, the first answer, and writes it to the run folder."""
-    first_line, *lines = loop_words.ranking_lines(found, brief=brief)
-    timed(first_line)
-    for line in lines:
-        print_message(line)
-    answer = loop_words.regression_verdict(found)
-    content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
-    folder.write_json(store.SCREENING_FILE, content)
-
-
 def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
     """Reports which stages are stored. Without a verdict, writes the robot of the base fit if available."""
     if not stages:
         return
     stored_stages = [name for name in stages if folder.keeps(name)]
     if not stored_stages:
-        print_message(f"{', '.join(stages)} could not be saved. The same command starts from the beginning")
+        print_message(f"{', '.join(stages)} could not be saved. The same command starts anew")
         return
     print_message(f"kept: {', '.join(stored_stages)}. To continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        print_message(f"{loop_words.verdict_line(traced)}. Held-out errors and other noise levels are still missing")
+        print_message(f"{loop_words.verdict_line(traced)}. Held-out errors and other noise levels are missing")
         return
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):

@@ -68,8 +68,7 @@ class Chain:
         for k, name in enumerate(names):
             if model.jnt_type[k] != int(library.mjtJoint.mjJNT_HINGE) or not name:
                 raise BadConfiguration(
-                    f"--model: {source.name}, joint {name or k + 1} slides, is free or has no name; expected only "
-                    "named hinges, whose measured angles give the whole motion"
+                    f"--model: {source.name}, joint {name or k + 1} is no named hinge; expected only named hinges"
                 )
             if driven.count(k) > 1:
                 raise BadConfiguration(
@@ -148,8 +147,7 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
         if column is None or clock is None:
             lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
             raise BadData(
-                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the "
-                "model, because every joint's torque depends on the whole motion"
+                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the model"
             )
         check_units(joint, [Column(ANGLE, c, units[c]) if c in units else None for c in joint.header])
         time = column_numbers(clock)
@@ -240,8 +238,8 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
     if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
         raise BadConfiguration(
             f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" '
-            'and channels = ["motor_current"]: the model\'s torque is valid only for the measured motion; '
-            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench writes a template"
+            f'and channels = ["motor_current"]; mmrjax rig new {joint}.toml --from {config.model} --joint '
+            f"{joint} --kind bench writes a template"
         )
     return one, robot
 

@@ -48,22 +48,18 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     file = load_robot(config)
     robot = file.robot
     if robot.rig.imposed != "voltage":
-        imposed_words = imposed.SAID[robot.rig.imposed].words
+        imposed_words = imposed.IMPOSED_WORDS[robot.rig.imposed].words
         raise BadConfiguration(
-            f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the motor voltage; "
-            'simulate a table of runs, or set imposed = "voltage" in the robot\'s file'
+            f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the voltage; "
+            'simulate a table, or set imposed = "voltage" in the robot\'s file'
         )
     if robot.loose:
         raise BadConfiguration(
-            "--profile: profiles do not simulate backlash or an elastic joint; set them to 0, or simulate over "
-            "time with --model drive"
+            "--profile: profiles have no backlash or elastic joint; set them to 0, or use --model drive"
         )
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:
-            raise BadConfiguration(
-                f"--profile: {name} is an arm, whose gravity load varies with its angle; profiles do not cover "
-                "this. Simulate it over time with --model drive"
-            )
+            raise BadConfiguration(f"--profile: {name} is an arm, which profiles do not cover; use --model drive")
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
@@ -74,8 +70,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     imposed.check_acting(robot, ground, shaft)
     if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, so there is no travelling speed; give "
-            "motor_speed_rpm or duty"
+            f"{source.source}, speed_mm_s: a shaft has no travelling speed; give motor_speed_rpm or duty"
         )
     source.check_supply(config.battery)
     for column in source.stated:
@@ -87,9 +82,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         if beside.runs is not None and runs.has(column):
             print_message(f"{runs.source}, {column}: not used, because {source.source} gives it")
     if "current_other" in source.values and not config.battery:
-        print_message(
-            f"{source.source}, current_other_A: not used, because other consumers are supplied by the battery"
-        )
+        print_message(f"{source.source}, current_other_A: not used, because the battery supplies other consumers")
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
@@ -99,9 +92,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
         folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, mission_batch_result.course))
         if not mission_batch_result.whole:
-            print_message(
-                "history.csv ends before the mission, because the mission took more steps than can be saved"
-            )
+            print_message("history.csv ends before the mission, which took more steps than can be saved")
         result = run.SimulationResult(
             "simulate", config.model, robot, runs, mission_batch_result.table, mission_batch_result.to_json()
         )
@@ -146,7 +137,7 @@ def _check_battery_charge(robot: Robot, config: configuration.Simulate) -> None:
     if config.battery and config.discharge_mAh >= capacity:
         raise BadConfiguration(
             f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
-            "mission begins"
+            "mission"
         )
 
 
@@ -160,7 +151,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
     if len(too_low):
         raise BadConfiguration(
             f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[too_low[0]]:.4g} V, below its "
-            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
+            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission"
         )
 
 

@@ -63,8 +63,8 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected above 0 and up to 100, forward")
     if len(config.voltages_V) < FEWEST:
         raise BadConfiguration(
-            f"--voltages: got {count_noun(len(config.voltages_V), 'value')}; expected at least {FEWEST}, so that "
-            "peaks over speed can be found"
+            f"--voltages: got {count_noun(len(config.voltages_V), 'value')}; expected at least {FEWEST}, to find "
+            "peaks over speed"
         )
     if config.options["duration"] < SHORTEST:
         raise BadConfiguration(

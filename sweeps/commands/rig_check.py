@@ -103,7 +103,7 @@ class RigCheck:
         notes = []
         if self.robot.rig.inherits:
             notes.append(
-                'values missing in the file come from its base, a packaged robot. Set base = "none" to prevent this'
+                'values missing in the file come from its base, a packaged robot. base = "none" prevents this'
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
@@ -113,12 +113,11 @@ class RigCheck:
         if self.unmarked:
             lines = ", ".join(map(str, self.unmarked))
             count = count_noun(len(self.unmarked), "line")
-            notes.append(f"{count} with a number equal to the template's example: {lines}. Check that it is yours")
+            notes.append(f"{count} with the template's example: {lines}. Check that it is yours")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(
-                "with a duty, total_current is the supply current: duty times the motor current. A sensor in the "
-                "motor leads measures motor_current"
+                "with a duty, total_current is that of the supply. A sensor in the motor leads measures motor_current"
             )
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
@@ -130,14 +129,9 @@ class RigCheck:
             notes.append(f"no ± is given, so the default ± is used: {_few(loose)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
-            notes.append(
-                "motor.temperature_limit is given, but the winding temperature cannot be computed without "
-                f"{lacking}: add {lacking}, or the limit is not checked"
-            )
+            notes.append(f"motor.temperature_limit cannot be checked without {lacking}: add {lacking}")
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
-            notes.append(
-                "motor.voltage_limit is not given: experiments are proposed up to the highest voltage in the table"
-            )
+            notes.append("motor.voltage_limit is not given: experiments go up to the table's highest voltage")
         return notes
 
     def channels(self) -> list[Json]:
@@ -194,22 +188,21 @@ class RigCheck:
             return []
         names_by_column = {c.column: c.name for c in channels.EVERY}
         notes = [
-            f"{name}: not one of the rig's channels. To use it, add {names_by_column[name]} to channels in the rig's "
-            "file"
+            f"{name}: not a channel of the rig. To use it, add {names_by_column[name]} to channels in the rig's file"
             for name in self.runs.unknown
             if name in names_by_column
         ]
         others = [name for name in self.runs.unknown if name not in names_by_column]
         without = (
-            f"{', '.join(others)}: not used by the model. Residuals are tested for differences between their values. "
-            "To use one, name it under [columns] in the rig's file"
+            f"{', '.join(others)}: not used by the model, only to group residuals. To use one, name it under "
+            "[columns]"
         )
         return [*notes, *([without] if others else [])]
 
     def statement(self) -> str:
         """Sentence on the parameters that the table can determine."""
         if self.foresight is None:
-            return "No data given: add a table to see which parameters it can determine."
+            return "Add a table to see which parameters it determines."
         pairs = self.foresight.together
         prior_bound = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
@@ -263,7 +256,7 @@ class RigCheck:
 def _noise_source_words(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     words_by_source = {
-        "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
+        "columns": "of the table", "series": "estimated along series of rows",
         "assumed": f"assumed, {100 * channel.sd_share:g} %, since there is no column {channel.sd_column}",
     }  # fmt: skip
     return words_by_source.get(word, word)
@@ -358,23 +351,6 @@ def check_document(found: RigCheck) -> Document:
     sds = ("" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact" for o in found.origins)
     numbers = [(o.name, o.value, sd, o.unit, o.why) for o, sd in zip(found.origins, sds, strict=True)]
     follows = [(fact.what, fact.value, "LOOK" if fact.odd else "ok") for fact in found.facts]
-    return Document(
-        found.file,
-        f"{found.file}: {found.statement()}",
-        (
-            Note(" ".join(found.understood()), terminal=True),
-            Table("channels", columns("channel", "column", "sign", "step |", "sd"), blocks, "channels"),
-            Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
-            Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
-            *remarks(found.remarks()),
-            *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
-        ),
-        brief=_brief(found),
-    )
-
-
-def _brief(found: RigCheck) -> Names:
-    """Lines printed below the answer: the rig, columns of the table, and what to check."""
     table: Names = ()
     if found.runs is not None:
         used = [
@@ -387,7 +363,19 @@ def _brief(found: RigCheck) -> Names:
     notes = found.remarks()
     check = f"Check: {as_paragraph(notes[:FEW])}" if notes else "Nothing to check."
     further_remarks = f" and {count_noun(len(notes) - FEW, 'further remark')}" * (len(notes) > FEW)
-    return " ".join(found.understood()), *table, f"{check} --verbose prints all tables{further_remarks}."
+    return Document(
+        found.file,
+        f"{found.file}: {found.statement()}",
+        (
+            Note(" ".join(found.understood()), terminal=True),
+            Table("channels", columns("channel", "column", "sign", "step |", "sd"), blocks, "channels"),
+            Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
+            Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
+            *remarks(found.remarks()),
+            *(_data_blocks(found, found.runs, found.foresight) if found.runs and found.foresight else ()),
+        ),
+        brief=(" ".join(found.understood()), *table, f"{check} --verbose prints all tables{further_remarks}."),
+    )
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:
@@ -416,8 +404,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     ]
     if others:
         notes_of_data.append(
-            f"with the numbers of the file, some rows have no steady state ({', '.join(others)}). These are not "
-            "counted"
+            f"with the file's numbers, some rows have no steady state ({', '.join(others)}), and do not count"
         )
     determined = [
         (p.name, p.value, p.prior_sd, p.unit, p.share, found.determined(p))
@@ -437,7 +424,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
         *remarks(notes_of_data),
         Table(
             "determined", heads, determined,
-            "parameters that these data can determine (posterior sd over prior sd, at the values in the file)",
+            "parameters that these data determine (posterior sd over prior sd)",
         ),
         Note(f"not determined: above {identifiability.HELD:g}", terminal=True),
         *remarks(alike),

@@ -98,7 +98,7 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         "motor.friction_viscous": StatedNumber(
             0.0,
             "N·m·s",
-            "the no-load current does not separate Coulomb and viscous friction; ± as if half of it were viscous",
+            "Coulomb and viscous friction are not separated, ± as if half were viscous",
             f"{0.5 * constant**2 * idle / back_emf:.2g}",
         ),
     }
@@ -116,7 +116,7 @@ def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
     """
     voltage, speed, idle, torque, stall, resistance = map(sheet.get, NUMBERS)
     if idle is None:
-        raise BadConfiguration("--no-load-current: missing; without it the motor friction cannot be computed")
+        raise BadConfiguration("--no-load-current: missing; the motor friction needs it")
     missing = [name for name in NUMBERS if name not in sheet]
     if speed is None and torque is None:
         raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
@@ -136,9 +136,7 @@ def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
         if voltage is not None:  # U D² = M_s ω_0 (D + I_0)
             return (power + math.sqrt(power**2 + 4 * voltage * power * idle)) / (2 * voltage)
     lacking = ", ".join(f"--{name}" for name in missing)
-    raise BadConfiguration(
-        f"--from-sheet: missing {lacking}; the others do not determine resistance and torque constant; give one more"
-    )
+    raise BadConfiguration(f"--from-sheet: missing {lacking}; resistance and torque constant need one more")
 
 
 def _largest_difference(pairs: list[tuple[float, str]]) -> float:
@@ -155,6 +153,6 @@ def _reject_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) ->
     ]
     if faults:
         raise BadConfiguration(
-            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * LARGEST:.0f} %; data must "
-            "be for the motor shaft at one voltage"
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * LARGEST:.0f} %; give "
+            "data of the motor shaft at one voltage"
         )

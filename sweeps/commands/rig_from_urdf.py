@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
 from mmrjax.errors import list_some
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
@@ -77,10 +77,7 @@ class _UrdfRobot:
     def _link(self, joint: Element, end: str, name: str) -> str:
         element = joint.find(end)
         link = "" if element is None else element.get("link", "")
-        if link not in self.links:
-            raise BadConfiguration(f"{self.file}, joint {name}, <{end}>: got {link or 'no link'}; "
-                                   f"{allowed_words(link, self.links)}")  # fmt: skip
-        return link
+        return stated_word(link, self.links, f"{self.file}, joint {name}, <{end}>", f"got {link or 'no link'}")
 
     def chosen(self, joint: str | None) -> str:
         """Name of a joint that turns.

@@ -105,7 +105,7 @@ class JointNumbers:
             put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
         elif self.armature is not None:
             inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
-            by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", "no ratio found, so the load inertia includes it")
+            by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", "no ratio found: the load inertia includes it")
         put("load.inertia", "kg·m^2", "inertia", inertia)
         return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
 
@@ -128,7 +128,7 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict
         ("loss_coulomb", "N·m", torque * limit),
         ("loss_viscous", "N·m·s", torque * constant * ratio),
     ):
-        name, reason = f"{losses}.{key}", f"not in the model; ± is {100 * UNSTATED:g} % of the stall torque"
+        name, reason = f"{losses}.{key}", f"not in the model, ± is {100 * UNSTATED:g} % of the stall torque"
         if name in freed and freed[name].value != 0:
             continue
         if width > 0:

@@ -78,9 +78,7 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
     if source is not None:
         numbers = free_unstated_losses(kind, numbers)
     origin = f"kind {kind}, filled from {' and '.join(origins)}"
-    return fill_rig_template(
-        kind, numbers, f"{origin}; comments name the source of each number, and each ± is a guess."
-    )
+    return fill_rig_template(kind, numbers, f"{origin}. Comments name sources, and each ± is a guess.")
 
 
 def write_new_rig(

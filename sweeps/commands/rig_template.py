@@ -66,24 +66,21 @@ def fill_rig_template(kind: str, numbers: Mapping[str, StatedNumber], heading: s
     load = lines[load_line - 1].strip("[]")
     for name, number in numbers.items():
         table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
-        _put_line(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
+        line = f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}"
+        if table and f"[{table}]" not in lines:
+            lines += ["", f"[{table}]"]
+        start = lines.index(f"[{table}]") + 1 if table else 0
+        end = next((k for k in range(start, len(lines)) if HEADER.match(lines[k])), len(lines))
+        key_lines = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
+        if key_lines:
+            lines[key_lines[0]] = line
+            continue
+        while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
+            end -= 1  # comments below belong to the next table
+        lines.insert(end, line)
     return "\n".join([f"# {_one_line(heading)}", *lines]) + "\n"
 
 
 def _one_line(text: str) -> str:
     """Text on one line, because line breaks in names of a model would end a comment."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
-
-
-def _put_line(lines: list[str], table: str, key: str, line: str) -> None:
-    if table and f"[{table}]" not in lines:
-        lines += ["", f"[{table}]"]
-    start = lines.index(f"[{table}]") + 1 if table else 0
-    end = next((k for k in range(start, len(lines)) if HEADER.match(lines[k])), len(lines))
-    key_lines = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
-    if key_lines:
-        lines[key_lines[0]] = line
-        return
-    while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
-        end -= 1  # comments below belong to the next table
-    lines.insert(end, line)

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from calibration.data import Json, Names
+from calibration.data import Json
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -61,7 +61,18 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     file = load_robot(config)
     if config.method not in METHODS:
         raise BadConfiguration(f"--method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
-    ranges = _varied_ranges(config.vary)
+    ranges: dict[str, tuple[float, float]] = {}
+    for text in config.vary:
+        name, _, ends = text.partition("=")
+        low, _, high = ends.partition(":")
+        if name in ranges:
+            raise BadConfiguration(f"--vary {name}: given twice; give it once")
+        try:
+            ranges[name] = float(low), float(high)
+        except ValueError:
+            raise BadConfiguration(
+                f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
+            ) from None
     freed = [name for name in ranges if name in OF_TURNS]
     robot = showing_turns(file.robot, freed)
     outputs = chosen_outputs(config.outputs, robot, bool(freed))
@@ -102,30 +113,13 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         )
 
 
-def _varied_ranges(vary: Names) -> dict[str, tuple[float, float]]:
-    """Range of each varied condition, from options `name=low:high`."""
-    ranges: dict[str, tuple[float, float]] = {}
-    for text in vary:
-        name, _, ends = text.partition("=")
-        low, _, high = ends.partition(":")
-        if name in ranges:
-            raise BadConfiguration(f"--vary {name}: given twice; give it once")
-        try:
-            ranges[name] = float(low), float(high)
-        except ValueError:
-            raise BadConfiguration(
-                f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
-            ) from None
-    return ranges
-
-
 def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
     """Grid of operating points. For a condition with --vary it contains one value, the middle of the range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
-        raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
+        raise BadConfiguration("sensitivity: this robot imposes the motor current; use simulate or sweep")
     usual_axes: dict[str, tuple[float, ...]] = {}
     if layout.uses_paper_conditions:
         usual_axes = CORNERS if config.method in ("sobol", "morris") else WHOLE
@@ -140,9 +134,7 @@ def _operating_points(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration(
-            "--vary voltage: has no effect on battery power, where the state of charge sets the voltage"
-        )
+        raise BadConfiguration("--vary voltage: has no effect on a battery, whose charge sets it")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
@@ -170,10 +162,7 @@ def _uncertain_inputs(
     robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
-            raise BadConfiguration(
-                "--posterior: cannot be combined with --parameters, since both choose the "
-                "uncertain inputs; give one of them"
-            )
+            raise BadConfiguration("--posterior: cannot be combined with --parameters; give one of them")
         return uncertain_inputs.inputs_from_posterior(robot, posterior_beside_robot(file), ranges)
     names = config.parameters or uncertain_inputs.default_input_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)

@@ -238,9 +238,8 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
         if np.isinf(table["winding_settled_C"][k]):
             current = float(motor_currents(robot, table)[k])
             remarks.append(
-                f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A per motor, because the "
-                "resistance rises faster than heat is removed. The permissible current is "
-                f"{float(robot.current_continuous):.2f} A"
+                f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A per motor. The "
+                f"permissible current is {float(robot.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
             when, distance = float(table["time_end_s"][k]), float(table["displacement_m"][k])

@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.parts import packaged_motors
 from calibration.described import report_in_words
 from calibration.sizing import sheet
@@ -35,9 +35,7 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
     imposed.check_on_ground(robot, "size")
     objectives = config.pareto or (config.objective,)
     for name in objectives:
-        if name not in OBJECTIVES:
-            option = "--pareto" if config.pareto else "--objective"
-            raise BadConfiguration(f"{option}: got {name}; {allowed_words(name, OBJECTIVES)}")
+        stated_word(name, OBJECTIVES, "--pareto" if config.pareto else "--objective")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
     motor_names = [m.name for m in packaged_motors()]

@@ -27,7 +27,7 @@ from sweeps.points import axes, grid, run, scale, uncertainty
 from sweeps.points.job import prepare_job, showing_turns, store_layout
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of_configuration
-from sweeps.points.zarr_store import STORE, Done, Identity, Layout, SweepStore, job_identity
+from sweeps.points.zarr_store import STORE, Done, Identity, StoreLayout, SweepStore, job_identity
 from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
 from sweeps.report.run_tables import endings_table
@@ -59,8 +59,7 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = not options.of_store and (count <= TABLE or config.posterior is not None)
     if not options.of_store and not small:
-        print_message(f"{count:,} points: too many for runs.csv (limit {TABLE:,}), so results go to {STORE}. "
-             "Add --export csv to get a CSV as well")  # fmt: skip
+        print_message(f"{count:,} points: too many for runs.csv ({TABLE:,}), see {STORE} or add --export csv")
     for note in notes:
         print_message(note)
     if small:
@@ -130,7 +129,7 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
 # --- before ---------------------------------------------------------------------------------------------------------
 
 
-def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
+def dry_run(job: scale.Job, layout: StoreLayout, path: Path) -> None:
     """Reports points, chunks, bytes and expected time of a sweep. Nothing is written."""
     compiled = scale.Compiled(job)
     blocks, slow = job.blocks, job.task.slow
@@ -179,9 +178,8 @@ def _reject_without_space(size: int, share: float, path: Path) -> None:
     needed, free = math.ceil(size * share) + MARGIN, _free_bytes(path)
     if needed > free:
         raise BadConfiguration(
-            f"--out: the results would take {bytes_text(needed)} (uncompressed); {_existing_parent(path)} has "
-            f"{bytes_text(free)} "
-            'free; choose another disk, fewer points or outputs, or storage = "float32"'
+            f"--out: results need {bytes_text(needed)} (uncompressed); {_existing_parent(path)} has "
+            f'{bytes_text(free)} free; choose another disk, fewer points or outputs, or storage = "float32"'
         )
 
 
@@ -241,7 +239,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
         count = len(store.done())
         raise DiskFull(
             f"{store.partial}: {error.strerror} after {count} of {len(job.blocks)} chunks. Free some space, and "
-            "the same command resumes from there"
+            "the same command resumes"
         ) from error
 
 
@@ -276,8 +274,10 @@ def finish_sweep(
                 )
     done = store.done()
     if not store.finished:
-        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, "
-                     "or the same command without --shard, completes the sweep")  # fmt: skip
+        print_output(
+            f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, or the "
+            "command without --shard, completes the sweep"
+        )
         return DONE
     if options.export:
         from sweeps.points import export
@@ -291,10 +291,10 @@ def finish_sweep(
     return DONE if words.every_run_solved(counts) else SOLVER_FAILED
 
 
-def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
+def sweep_summary(layout: StoreLayout, job: scale.Job, done: Iterable[Done]) -> Json:
     """`result.json`."""
     done = list(done)
-    units = {v.name: v.attributes["units"] for v in layout.variables if "units" in v.attributes}
+    units = {name: a["units"] for name, (_, a) in layout.variables.items() if "units" in a}
     names = [name for name in job.outputs if name in units]
     ranges = {name: [d.ranges[name] for d in done if name in d.ranges] for name in names}
     return {

@@ -45,9 +45,10 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         BadConfiguration: runs are from a file, the robot cannot turn, or the turn has no steady state.
     """
     if beside.runs is not None:
-        raise BadConfiguration("--runs: got a file in addition to --left, --right or --heading; either put "
-                               "duty_left and duty_right columns in the file, or omit --runs and describe one "
-                               "run with options")  # fmt: skip
+        raise BadConfiguration(
+            "--runs: got a file in addition to --left, --right or --heading; put duty_left and duty_right into the "
+            "file, or omit --runs"
+        )
     file, beside_columns = load_robot(config), beside.stated
     robot = file.robot
     check_can_turn(robot, beside_columns.get("configuration") or robot.configurations.names[0])
@@ -184,7 +185,7 @@ def check_can_turn(robot: Robot, named: str) -> None:
     """
     imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
-        raise BadConfiguration("--left, --right: in the robot's file the motors are not driven by voltage")
+        raise BadConfiguration("--left, --right: the robot's file imposes no voltage")
 
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:

@@ -117,7 +117,7 @@ def compare_format(
         verdict = HELD if effect.name in held else DROPPED if share < LITTLE else APPROXIMATED
         approximation = held.get(effect.name) or approximated(effect.balance)
         if not np.isfinite(share) and effect.name not in held:
-            verdict, approximation = DROPPED, "it has no effect on these runs, and the format has no term for it"
+            verdict, approximation = DROPPED, "no effect on these runs, and the format lacks it"
         fates_found.append(EffectFate(effect.name, verdict, approximation, share))
     exported = _law_at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}

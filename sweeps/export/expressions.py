@@ -303,8 +303,8 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
         (result,) = _evaluate_jaxpr(closed.jaxpr, closed.consts, arguments)
     except NotImplementedError as error:
         raise BadConfiguration(
-            f"{what}: its equation uses {error or 'an operation'} of JAX, which cannot be written as a formula; "
-            "rewrite it with sums, products, powers and scalar functions, or export without it"
+            f"{what}: its equation uses {error or 'an operation'} of JAX; rewrite it with sums, products, powers "
+            "and scalar functions, or export without it"
         ) from error
     symbol: Any = result[()]
     return symbol

@@ -163,12 +163,12 @@ def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list
             how = f"tables have no state, so  {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
             changed.append(EffectFate(fate.name, DROPPED, how))
         elif fate.name == mujoco.CONTROLLER:
-            changed.append(EffectFate(fate.name, DROPPED, "the tables give the voltage that it would produce"))
+            changed.append(EffectFate(fate.name, DROPPED, "the tables give its voltage"))
         else:
             changed.append(
                 EffectFate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables"))
             )
-    how = "not in the tables: add armature · acceleration to the torque"
+    how = "add armature · acceleration to the torque"
     lines = EffectFate("steady states", HELD, "linear interpolation between points")
     return [*changed, EffectFate("rotor inertia", APPROXIMATED, how), lines]
 

@@ -31,7 +31,7 @@ FORMATS = {
     "onnx": "an ONNX model of one time step, for Isaac Lab, Unity or C++",
     "mjlab": "an actuator configuration for law_source, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
-    "randomization": "samples from the posterior, as parameters of MuJoCo and of the actuator",
+    "randomization": "samples from the posterior, for MuJoCo and the actuator",
 }
 #: Goal of a start in MuJoCo [rad], and its length [s].
 GOAL, START = 0.5, 0.5
@@ -110,8 +110,8 @@ def notes_for_file_head(runs: ComparisonRuns) -> list[str]:
     command = runs.command
     return [
         f"Seen: {count_noun(len(command), 'run')} of {runs.source}, {np.min(command):.4g} to "
-        f"{np.max(command):.4g} V, {np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Other "
-        "conditions were not tested. LAW.md lists the equations, the intervals and the approximations."
+        f"{np.max(command):.4g} V, {np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Nothing "
+        "else was tested. LAW.md lists equations, intervals and approximations."
     ]
 
 
@@ -149,9 +149,21 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
     texts = texts_of(drive)
     checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
     if follows_angle or (drive.loose and drive.controller is None):
-        checks |= _start_difference(
-            drive, texts, GOAL if follows_angle else volts, motor.ratio if follows_angle else 1.0
+        command = GOAL if follows_angle else volts
+        times = np.linspace(0.0, START, 26)
+        controller = drive.controller
+        conditions = (
+            Conditions(voltage=command)
+            if controller is None
+            else Conditions(voltage=controller.supply_voltage, goal=command)
         )
+        run = drive_batch(
+            drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
+        )
+        native = np.asarray(run.signals.angle)[0]
+        mujoco_angles = mujoco.angles_in_mujoco(texts, command * (motor.ratio if follows_angle else 1.0), times)
+        share = 100 * float(np.sqrt(np.mean((mujoco_angles - native) ** 2)) / np.sqrt(np.mean(native**2)))
+        checks |= {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(
@@ -180,24 +192,6 @@ def _check_in_mujoco(
         "speed, law against native [%]": apart(law.speed, native.speed),
         "speed, MuJoCo C against native [%]": apart(mujoco_results.speed, native.speed),
     }
-
-
-def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
-    """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
-    times = np.linspace(0.0, START, 26)
-    controller = drive.controller
-    conditions = (
-        Conditions(voltage=command)
-        if controller is None
-        else Conditions(voltage=controller.supply_voltage, goal=command)
-    )
-    run = drive_batch(
-        drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
-    )
-    native = np.asarray(run.signals.angle)[0]
-    mujoco_angles = mujoco.angles_in_mujoco(texts, command * ratio, times)
-    share = 100 * float(np.sqrt(np.mean((mujoco_angles - native) ** 2)) / np.sqrt(np.mean(native**2)))
-    return {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
 
 
 def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.data import Json, Names
 from sweeps.export.comparison import DROPPED, HELD, EffectFate
-from sweeps.export.joint import DriveJoint, memory_grows
+from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 from sweeps.export.mujoco import CONTROLLER, PLAY, fates_outside_joint
 from sweeps.export.situation import ComparisonRuns
@@ -71,7 +71,10 @@ def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any)
 def steady_params(joint: DriveJoint, constants: Sequence[LawConstant], amplitudes: Mapping[str, float]) -> Json:
     """Parameters of the actuator in steady travel, without terms that repeat with an angle, whose mean is 0."""
     params = {c.name: c.value for c in constants}
-    waves = {p.name: 0.0 for p in joint.parts if memory_grows(p)}
+    # The memory of a wave is its phase, which grows without limit.
+    waves = {
+        p.name: 0.0 for p in joint.parts if p.rate is not None and p.rate_slope.is_const and not p.rate_slope.value
+    }
     for name, value in {**amplitudes, **waves}.items():
         if f"effects.{name}.amplitude" in params:
             params[f"effects.{name}.amplitude"] = value

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from calibration.data import Names
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.robot_file import RobotFile
 from mmrjax.effects import Effect
 from mmrjax.model import balances, contact, params
@@ -197,26 +197,22 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     """
     robot = file.robot
     name = robot.configurations.names[0] if configuration is None else configuration
-    if name not in robot.configurations:
-        raise BadConfiguration(
-            f"--configuration: got {name}; the robot has no such configuration; "
-            f"{allowed_words(name, robot.configurations)}"
-        )
+    wrong = f"got {name}; the robot has no such configuration"
+    stated_word(name, robot.configurations, "--configuration", wrong)
     if robot.unlike:
         raise BadConfiguration(
-            f"{file.name}: {', '.join(robot.unlike)} makes the two sides differ, but an export describes one "
-            "drive on one joint; export a separate robot file for each side, without this effect"
+            f"{file.name}: {', '.join(robot.unlike)} makes the sides differ, but an export is one drive; export "
+            "a file for each side, without this effect"
         )
     if robot.controller is not None and not robot.controller.supply_voltage:
         raise BadConfiguration(
-            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it to convert duty "
-            "to voltage; add it [V]"
+            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it; add it [V]"
         )
     if robot.rig.imposed != "voltage" and robot.controller is None:
         imposed_words = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(
-            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal, the command of an "
-            f"exported drive. With an imposed {imposed_words}, the runs contain no information on the winding"
+            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal. With an imposed "
+            f"{imposed_words}, runs do not show the winding"
         )
     if lacking := [n for n in ("motor.resistance", "motor.torque_constant") if n in robot.rig.unknown]:
         raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing; the drive law needs it; add it")
@@ -322,7 +318,7 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
         ("gear_idle", "idle", "N·m", "M_i = M_rf0 sign ω + K_fr ω", "idle friction of the gearbox, at its input",
          "", lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction)),
         ("gear_efficiency", "efficiency", "-", "η_rm where power flows to the wheel, 1/η_b where it flows back",
-         "fraction of the torque that the gearbox transmits; `load`: torque at its input", "",
+         "transmitted share of torque, `load`: torque at its input", "",
          lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction)),
         ("output_friction", "track", "N·m", friction,
          "friction between the gearbox and the wheel's rim, at the wheel", "pull",
@@ -339,9 +335,11 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
         rate = None
         if effect.memory_size is not None:
             rate = lambda r, s, alone=alone: alone(r)[0].rate(r, s)  # noqa: E731
+        equation, *further = (inspect.getdoc(type(effect).plain or type(effect)) or effect.name).split("\n\n")
+        meaning = further[0] if further and not further[0].startswith("Source") else ""
         yield _trace_part(
-            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], *effect_docstring(effect),
-            variable.get(effect.balance, ""), value, rate, effect.name,
+            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], " ".join(equation.split()),
+            " ".join(meaning.split()), variable.get(effect.balance, ""), value, rate, effect.name,
         )  # fmt: skip
 
 
@@ -358,20 +356,6 @@ def _trace_part(
         slope = trace(rate, name, balance, f"memory.{name}")
         part = dataclasses.replace(part, rate=trace(rate, name, balance), rate_slope=slope)
     return part
-
-
-def effect_docstring(effect: Effect | type[Effect]) -> tuple[str, str]:
-    """Equation and meaning of an effect, from its docstring."""
-    kind = effect if isinstance(effect, type) else type(effect)
-    paragraphs = (inspect.getdoc(kind.plain or kind) or kind.name).split("\n\n")
-    head = " ".join(paragraphs[0].split())
-    second = " ".join(paragraphs[1].split()) if len(paragraphs) > 1 else ""
-    return head, "" if second.startswith("Source") else second
-
-
-def memory_grows(part: Part) -> bool:
-    """True if a part's memory grows without limit, as a phase does. Instead of a settled value it has the mean 0."""
-    return part.rate is not None and part.rate_slope.is_const and part.rate_slope.value == 0
 
 
 def channels_of(joint: DriveJoint) -> tuple[Any, ...]:

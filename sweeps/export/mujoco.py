@@ -30,7 +30,7 @@ FIRST = (3, 7, 0)
 #: Effects for which the format has a term, and the term.
 TERMS = {
     "series_resistance": "resistance",
-    "supply_sag": "resistance, for all motors together at equal currents",
+    "supply_sag": "resistance of all motors together",
     "armature_inductance": "inductance",
     "rotating_inertia": "armature of the joint",
     "thermal_drift": "thermal",
@@ -172,8 +172,8 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
         fates.append(
             EffectFate(
                 "gearbox losses proportional to the load", APPROXIMATED,
-                "resistance / η and current = act / η: exact while power flows to the load. While it flows back "
-                "(gravity, a heavy load that stops), the joint is braked less than in reality",
+                "resistance / η and current = act / η: exact while power flows to the load. While it flows "
+                "back, the joint is braked less than in reality",
             )
         )  # fmt: skip
     if robot.has_ground:
@@ -185,7 +185,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
             EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if joint.loose:
-        how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
+        how = "a joint for the motor's side, and a tendon with a range or a stiffness"
         fates.append(EffectFate(PLAY, HELD, how))
     if controller := joint.controller:
         fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki), controller.rate))
@@ -205,7 +205,7 @@ def _controller_fate(joint: DriveJoint, lag: float, ki: float, rate: float) -> E
         return EffectFate(CONTROLLER, DROPPED, how)
     limitations = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
     limitations += [f"it acts at each step, not at {rate:g} Hz"] * (rate > 0)
-    limitations += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
+    limitations += ["its integral stops at a value, not at the duty's limit"] * (ki > 0)
     limitations += ["it measures the angle on the motor's side of the backlash"] * joint.loose
     return EffectFate(
         CONTROLLER, APPROXIMATED if limitations else HELD, "; ".join(["gains and limit of voltage", *limitations])
@@ -216,10 +216,10 @@ def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     """Fates of effects that are not part of a joint."""
     place_by_effect = {
         "sensor": "an instrument error, not part of the drive",
-        "supply": "the battery; the command is a voltage, so reduce it accordingly",
-        "mass": "the mass of the robot. Set it in the simulator's model",
+        "supply": "the battery; reduce the command's voltage accordingly",
+        "mass": "the mass of the robot. Set it in the model",
     }
-    other = "a property of the ground, which the simulator's contact model must provide"
+    other = "a property of the ground. Set it in the model"
     return [EffectFate(e.name, DROPPED, place_by_effect.get(e.balance, other)) for e in joint.outside]
 
 
@@ -475,9 +475,7 @@ def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: floa
         "    </body>\n"
         "  </worldbody>\n"
         "  <actuator>\n"
-        + _comment_lines(
-            ["Torque that acts against forward rotation [N·m]: slope, rolling resistance, a brake."], "    "
-        )
+        + _comment_lines(["Torque against forward rotation [N·m]."], "    ")
         + f'    <motor name="load" joint="{at}" gear="-1"/>\n'
         "  </actuator>\n"
         "  <sensor>\n"

@@ -39,8 +39,8 @@ def draw_parameters(
     """
     if posterior is None:
         raise BadConfiguration(
-            f"--to randomization: no {FILE} next to {joint.file.source}, so the uncertainty of its parameters is "
-            "unknown; expected FOLDER/robot.toml, written by calibrate or loop"
+            f"--to randomization: no {FILE} next to {joint.file.source}; expected FOLDER/robot.toml of calibrate "
+            "or loop"
         )
     values = posterior.draw(draws, seed)
     own_names = {p.name for p in params.walk_parameters(joint.robot)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -142,11 +141,11 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     if data is None:
         if not Layout.of(robot).uses_paper_conditions and imposed.imposed_limit(robot) is None:
             raise BadConfiguration(
-                f"--data: not given, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
-                "points; give a table of runs, or add the limit"
+                f"--data: not given, and {joint.file.name} has no motor.voltage_limit; give a table of runs, or "
+                "add the limit"
             )
         runs = export_grid(joint)
-        source = "a grid of operating points in both directions, without readings"
+        source = "a grid in both directions, without readings"
     else:
         runs = _runs_of_joint(data, joint)
         source = runs.source
@@ -158,17 +157,16 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
     is_moving = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
     if not is_moving.any():
-        raise BadData(f"{source}: the model settles in none of these runs, so no comparison is possible")
+        raise BadData(f"{source}: the model settles in none of these runs")
     signals = jax.tree.map(lambda x: x[is_moving] if np.shape(x) else x, signals)
     moving_runs = runs.where(is_moving)
     radius = float(joint.load.radius)
     drive_signals = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
     command = robot.driver.voltage(*map(jnp.asarray, drive_signals))
-    measured = (
-        _measured_readings(moving_runs, channels)
-        if data is not None
-        else np.full((len(moving_runs), len(channels)), np.nan)
-    )
+    measured = np.full((len(moving_runs), len(channels)), np.nan)
+    if data is not None:
+        by_name = {c.name: moving_runs.measured()[:, k] for k, c in enumerate(moving_runs.channels)}
+        measured = np.stack([by_name.get(c.name, x) for c, x in zip(channels, measured.T, strict=True)], -1)
     return ComparisonRuns(
         joint, source, moving_runs, conditions, is_moving, signals, native[is_moving], measured, np.asarray(command),
         radius * np.asarray(signals.demand),
@@ -208,25 +206,14 @@ def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
     return np.clip(output_torque, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
-def _measured_readings(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
-    by_name = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
-    return np.stack([by_name.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
-
-
 def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     """Runs of a table in the joint's configuration. For a log, its settled segments."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
-        raise BadData(
-            f"{runs.source}: its runs drive the two sides independently, but an export describes one drive; "
-            "expected straight travel"
-        )
+        raise BadData(f"{runs.source}: its runs drive the sides differently; expected straight travel")
     if levers := [name for name in runs.axes if name.startswith("lever")]:
-        raise BadData(
-            f"{runs.source}, {levers[0]}: lever angles shift the load between drives, but an export describes one "
-            "drive; expected runs without lever columns"
-        )
+        raise BadData(f"{runs.source}, {levers[0]}: an export is one drive; expected runs without lever columns")
     if runs.sampled:
         from calibration.data import settling
 

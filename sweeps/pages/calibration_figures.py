@@ -61,7 +61,7 @@ def draw_parameter_intervals(found: CalibrationResult) -> Figure:
     axes.set(xlabel="shift from the prior [prior sds]")
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set_title("grey: not determined by these runs; band: the prior's 95 %")
+    axes.set_title("grey: not determined by these runs, band: the prior's 95 %")
     return fig
 
 
@@ -85,7 +85,7 @@ def draw_profile_likelihoods(found: CalibrationResult) -> Figure:
         axes.locator_params(axis="x", nbins=4)
     for row in grid:
         row[0].set_ylabel("rise [σ²]")
-    fig.supxlabel("black: the optimum; shaded: its 95 % interval; triangle: the prior's median", fontsize=8.5)
+    fig.supxlabel("black: the optimum, shaded: its 95 % interval, triangle: the prior's median", fontsize=8.5)
     return fig
 
 

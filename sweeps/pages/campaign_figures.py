@@ -27,7 +27,7 @@ from sweeps.pages.figure_style import (
     new_figure,
 )
 from sweeps.points.climbs import SIZE
-from sweeps.points.zarr_store import Layout
+from sweeps.points.zarr_store import StoreLayout
 
 #: Bins of a histogram. Most and fewest bins along a quantity, and points per bin required for more than the fewest.
 BARS, BINS = 40, 24
@@ -46,7 +46,7 @@ class VariedQuantity(NamedTuple):
     words: Names = ()
 
 
-def varied_names(values: np.ndarray, layout: Layout) -> dict[str, VariedQuantity]:
+def varied_names(values: np.ndarray, layout: StoreLayout) -> dict[str, VariedQuantity]:
     """Varied names of a store with their values at some points, shape (points, names)."""
     units = {n: layout.coordinates[n].get("units", "").removeprefix("1") for n in layout.design.names}
     return {
@@ -55,7 +55,7 @@ def varied_names(values: np.ndarray, layout: Layout) -> dict[str, VariedQuantity
     }
 
 
-def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: Layout) -> Figure:
+def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: StoreLayout) -> Figure:
     """Distribution of an output of a store, and its dependence on the varied quantities."""
     return draw_output_spread(output, label, varied_names(values, layout))
 
@@ -88,7 +88,9 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     return fig
 
 
-def draw_verdicts(codes: np.ndarray, names: Sequence[str], values: np.ndarray, layout: Layout, first: str) -> Figure:
+def draw_verdicts(
+    codes: np.ndarray, names: Sequence[str], values: np.ndarray, layout: StoreLayout, first: str
+) -> Figure:
     """Verdicts of climbs over an axis and the size of the obstacle. Other axes are at their first values.
 
     Args:

@@ -193,7 +193,7 @@ def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
         axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
         axes.set_title(title.format(gear.name))
         if gear.on_tracks:
-            add_corner_note(axes, "orange: load on the lower guide; above it: load on all grousers")
+            add_corner_note(axes, "orange: load on the lower guide, above it: load on all grousers")
         else:
             axes.set_xlim(0, 1.3e3 * SHOWN)
     return fig

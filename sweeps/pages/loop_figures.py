@@ -105,7 +105,7 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
     varied = own_column == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
     words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
     grouping = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
-    grid[-1, 0].set_xlabel(f"runs, in each group {grouping}; band: ±2σ of the instruments")
+    grid[-1, 0].set_xlabel(f"runs, in each group {grouping}, band: ±2σ of the instruments")
     return fig
 
 
@@ -149,7 +149,7 @@ def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Chan
         )  # fmt: skip
         grid[-1, column].set_xlabel("time [s]")
     words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
-    fig.suptitle(f"{words}; line: mean of {AVERAGED} samples; band: ±2σ of the instruments", fontsize=8.5)
+    fig.suptitle(f"{words}, line: mean of {AVERAGED} samples, band: ±2σ of the instruments", fontsize=8.5)
     return fig
 
 
@@ -228,8 +228,8 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({place_in_words(r.balance)})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: misfit that the effect alone explains, limited to a plausible size [σ]")
-    axes.set_title("blue: found; light blue: indistinguishable from a found effect in these data")
+    axes.set(xlabel="score: misfit that the effect alone explains at a plausible size [σ]")
+    axes.set_title("blue: found, light blue: indistinguishable from a found effect")
     return fig
 
 

@@ -102,14 +102,14 @@ def _parameter_section(file: RobotFile, nominal: Robot) -> Section:
     name_column, value = Column("parameter"), "{:.6g}"
     if not file.robot.rig.inherits:
         columns = (name_column, Column("value", form=value), *end, Column("source"))
-        text = "Its parameters (SI units). Losses and limits that are not in its file are left out."
+        text = "Its parameters (SI units), without losses and limits that its file lacks."
         rows, table = capabilities.rig_parameters(file), "own"
     else:
         columns = (name_column, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
         rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
     if not rows:
-        text = "Every parameter has its value from the nominal robot (Tables 1-7 of the paper and data sheets)."
+        text = "Every parameter is the nominal robot's (Tables 1-7 of the paper and data sheets)."
     return Section(
         "The robot", (Note(text), Table(table, columns, [(f"`{name}`", *rest) for name, *rest in rows])), "robot"
     )

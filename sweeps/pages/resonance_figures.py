@@ -49,17 +49,12 @@ def draw_resonance_map(found: ResonanceResult) -> Figure:
     return fig
 
 
-def _largest_frequency(found: ResonanceResult) -> float:
-    """Largest frequency drawn [Hz]."""
-    bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
-    lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
-    top = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
-    return 1.15 * max([top, *bands, 10.0])
-
-
 def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
-    table, parts, top = found.table, found.passing, _largest_frequency(found)
+    bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
+    lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
+    highest = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
+    table, parts, top = found.table, found.passing, 1.15 * max([highest, *bands, 10.0])
     fastest = float(np.nanmax(table["speed_mean_mm_s"]))
     place = np.inf
     for order in range(1, ORDERS + 1):

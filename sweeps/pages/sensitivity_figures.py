@@ -164,8 +164,8 @@ def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityRes
     inner = [
         f"{word} {_range_text(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1
     ]
-    within_words = f"; within each {' and '.join(inner)}" if inner else ""
-    ax.set_xlabel(f"{along}{within_words}; grey: no index there", fontsize=8.5)
+    within_words = f", within each {' and '.join(inner)}" if inner else ""
+    ax.set_xlabel(f"{along}{within_words}, grey: no index there", fontsize=8.5)
 
 
 def _range_text(values: np.ndarray) -> str:

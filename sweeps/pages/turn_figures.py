@@ -88,10 +88,10 @@ def path_arcs(
     return path_points.real, path_points.imag
 
 
-def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
-    """A path from above, with the robot at its start, at its end and in between."""
-    finite = np.isfinite(x)
-    x, y, yaw = x[finite], y[finite], yaw[finite]
+def draw_history_path(robot: Robot, row: Json, history: History) -> Figure:
+    """The path of a run over time from above, with the robot at its start, at its end and in between."""
+    finite = np.isfinite(np.asarray(history.reading["place_x"])[0])
+    x, y, yaw = (np.asarray(history.reading[c])[0][finite] for c in ("place_x", "place_y", "yaw"))
     fig, grid = new_figure(1, 1, 4.6)
     axes = grid[0, 0]
     ahead, aside = path_arcs(x, y, yaw)
@@ -100,11 +100,6 @@ def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.nda
         _draw_outline(axes, robot, row, x[k], y[k], yaw[k], color)
     _set_plan_axes(axes)
     return fig
-
-
-def draw_history_path(robot: Robot, row: Json, history: History) -> Figure:
-    """The path of a run over time from above."""
-    return draw_path(robot, row, *(np.asarray(history.reading[c])[0] for c in ("place_x", "place_y", "yaw")))
 
 
 def draw_turn_course(history: History) -> Figure:

@@ -10,24 +10,23 @@ VERDICTS = {("climb", "converged"): "have a verdict"}
 STATUSES: dict[str, tuple[str, str]] = {
     "converged": ("settled", "found a steady operating point"),
     "stalled": ("stands", "static friction holds the robot, or the motors cannot turn the load"),
-    "slides": ("slides", "traction demand above the adhesion limit μ_s N, so the tracks or wheels spin"),
+    "slides": ("slides", "traction demand above the adhesion limit μ_s N, so tracks or wheels spin"),
     "not_settled": (
         "not settled",
-        "the robot still accelerates at the end of the run (try a longer --duration), or the turn has no steady "
-        "state (use --model drive to simulate it over time)",
+        "still accelerates at the end (use a longer --duration), or the turn has no steady state (use --model drive)",
     ),
     "battery_empty": ("battery empty", "the battery's capacity is used up"),
     "failed": ("failed", "the solver found no solution. Please report the conditions"),
     "tips": (
         "tips over",
-        "the robot tips over: its centre of mass is outside its base of support, or its inertia carries it over",
+        "the centre of mass is outside the base of support, or inertia carries the robot over",
     ),
-    "reverses": ("reverses", "found a steady operating point, travelling backward"),
+    "reverses": ("reverses", "found a steady operating point backward"),
     "rolls_back": (
         "rolls back",
-        "gravity drives the robot downhill at a steady speed, against its motors or without voltage",
+        "gravity drives the robot downhill at a steady speed",
     ),
-    "cut_off": ("cut off", "the cells were below their cut-off voltage for longer than permitted"),
+    "cut_off": ("cut off", "the cells were below their cut-off voltage for too long"),
 }
 
 #: Files of a run folder other than its page.
@@ -37,34 +36,34 @@ FILES = {
     "actuator.py": "the drive law in JAX, without mmrjax",
     "actuator.jaxexport": "the same law for jax.export.deserialize",
     "actuator.onnx": "the drive law as an ONNX model",
-    "mjlab_actuator.py": "the drive law in PyTorch, with a configuration for mjlab",
+    "mjlab_actuator.py": "the drive law in PyTorch, for mjlab",
     "feed_forward.csv": "voltage, current and losses by speed and torque",
     "feed_forward.h": "the same tables for C",
     "draws.npz": "samples from the posterior, for NumPy",
     "LAW.md": "description of the drive law",
     "robot.toml": "the robot, for --robot of every command",
-    "runs.csv": "every run, one row each",
+    "runs.csv": "every run",
     "windows.csv": "windows of a log: voltage, velocity, acceleration",
     "feedforward.json": "feedforward constants, gains and remarks",
-    "rows.csv": "measured and simulated readings and residuals of every row",
-    "comparison.csv": "measured and simulated readings and errors of every row",
+    "rows.csv": "readings and residuals of every row",
+    "comparison.csv": "readings and errors of every row",
     "history.csv": "state and readings at every instant",
-    "reactions.csv": "loads inside the running gear at every instant",
-    "segments.csv": "energy, distance and peaks of every segment of the mission",
-    "requirements.csv": "every requirement, one row each",
+    "reactions.csv": "loads inside the running gear",
+    "segments.csv": "energy, distance and peaks of every segment",
+    "requirements.csv": "every requirement",
     "requirements.toml": "the requirements as given",
-    "posterior.nc": "posterior distribution of the fitted parameters, for --posterior",
+    "posterior.nc": "posterior of the fitted parameters, for --posterior",
     "points.csv": "outputs at every operating point",
     "turns.csv": "settled turns",
     "posture.csv": "posture: lever angles and contact loads",
-    "derivatives.csv": "every derivative, one row each",
-    "modes.csv": "natural frequencies of the chassis on its contacts",
+    "derivatives.csv": "every derivative",
+    "modes.csv": "natural frequencies of the chassis",
     "peaks.csv": "peaks of the ripple, with their speeds",
-    "indices.csv": "every sensitivity index, one row each",
+    "indices.csv": "every sensitivity index",
     "settled.csv": "the settled runs, for loop and calibrate",
-    "stretches.csv": "every stretch of the log, with the reason if it was left out",
-    "results.zarr/": "outputs of every point, as a Zarr store",
-    "identity.json": "settings of the store, needed to resume the sweep",
+    "stretches.csv": "every stretch of the log, and why it was left out",
+    "results.zarr/": "outputs of every point",
+    "identity.json": "settings of the store, to resume the sweep",
     "result.json": "everything on this page, for programs",
     "config.resolved.toml": "every option of the command",
     "manifest.json": "versions, machine, time, hashes",
@@ -75,13 +74,15 @@ FILES = {
 #: What `verdict` in result.json of the loop means, the least first; an alias after its word.
 LOOP_VERDICTS = {
     "none": "the residuals of the fitted model are consistent with noise",
-    "undescribed": "in one channel, the error of the refitted model or its estimated noise exceeds a quarter of the "
-    "measured rms. No set of effects halves this error on unseen runs and brings it below a quarter",
-    "place": "a term is missing in one equation, or in one of several that these data cannot distinguish",
+    "undescribed": (
+        "in one channel, the refit's error or estimated noise exceeds a quarter of the measured rms. No set of "
+        "effects halves it on unseen runs and brings it below a quarter"
+    ),
+    "place": "a term is missing in one equation, or in one of several that data cannot distinguish",
     "unnamed": "former word for place. Up to schema mmrjax.loop/3 it also meant mechanism",
-    "mechanism": "the equation of the missing term and the variable that it depends on are established",
-    "class": "at least one missing term is one of several effects that these data cannot distinguish",
-    "named": "one effect of the library is established for each missing term",
+    "mechanism": "the equation of the missing term and its variable are established",
+    "class": "a missing term is one of several effects that data cannot distinguish",
+    "named": "each missing term is one established effect",
 }
 
 #: Uses of the energy of a mission, short enough for labels of bars.
@@ -89,7 +90,7 @@ SINKS = {
     "battery": "battery cells", "other": "other consumers", "driver": "motor driver",
     "winding": "windings, brushes, leads", "motor": "motor friction", "gearbox": "gearboxes",
     "track": "tracks and guides", "sliding": "sliding over the ground", "rolling": "rolling resistance",
-    "lift": "lift (net of energy recovered downhill)",
+    "lift": "lift (net of recovery downhill)",
 }  # fmt: skip
 
 
@@ -100,46 +101,49 @@ def sink_labels(on_ground: bool) -> dict[str, str]:
 
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
-    "balance": "one equation of the model, such as the sum of torques at the driving wheel. Every effect enters one",
-    "effect": "a term that the model may lack. `mmrjax explain NAME` prints its equation and a bench test for it",
+    "balance": "one equation of the model, such as the sum of torques at the wheel. Every effect enters one",
+    "effect": "a term that the model may lack, see `mmrjax explain NAME`",
     "established": "not explained by chance, by a smooth curve, by one run or by one block of runs",
-    "tentative": "improves predictions and is in robot.toml, but failed one of the tests of established effects",
+    "tentative": "improves predictions and is in robot.toml, but failed a test of established effects",
     "class": "effects that these data cannot distinguish",
-    "mechanism": "the equation that lacks a term and the variable that the term depends on, but not its exact law. "
-    "The term explains at least half of the misfit beyond noise, predicts held-out runs, and is found again when "
-    "blocks of runs are left out",
+    "mechanism": (
+        "the equation that lacks a term, and its variable, but not its law. The term explains half of the "
+        "misfit beyond noise, predicts held-out runs, and is found again without any block of runs"
+    ),
     "place": "the equation that lacks a term, or several that these data cannot distinguish",
-    "misfit beyond noise": "χ² minus the part that noise explains, which is about one per reading",
-    "refit": "the same model with its parameters fitted to the runs, without new effects",
+    "misfit beyond noise": "χ² minus the part that noise explains, about one per reading",
+    "refit": "the same model fitted to the runs, without new effects",
     "seen": "errors on the runs that the fit used",
-    "held out": "errors on runs that were left out of the fit, one slope, voltage or configuration at a time",
-    "noise": "standard deviation of an instrument's readings, from --noise, `_sd` columns or an estimate",
+    "held out": "errors on runs left out of the fit, one slope, voltage or configuration at a time",
+    "noise": "standard deviation of readings, from --noise, `_sd` columns or an estimate",
     "rms error": "root mean square of simulated minus measured, in percent of the rms of the measured readings",
-    "σ": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
+    "σ": "standard deviation of an instrument: 19 of 20 readings are within 2 σ of the truth",
     "χ²": "sum of (simulated minus measured)² / σ² over all readings",
-    "prior": "value and standard deviation of a parameter from a bench or a data sheet",
-    "p": "probability that noise alone gives a result as extreme as this one",
-    "log likelihood": "logarithm of the probability density of the readings under the model. With 60 readings, a "
-    "gain of 0.1 per held-out reading is significant",
-    "reached": "runs in which the simulated robot reaches a steady state",
-    "voltage_limit": "largest voltage that the loop may propose for an experiment, from `[motor]` of the robot file",
+    "prior": "value and standard deviation of a parameter before the fit",
+    "p": "probability that noise alone gives as extreme a result",
+    "log likelihood": (
+        "logarithm of the probability density of the readings. With 60 readings, a gain of 0.1 per reading is "
+        "significant"
+    ),
+    "reached": "runs in which the simulation reaches a steady state",
+    "voltage_limit": "largest voltage of a proposed experiment, from `[motor]` of the robot file",
 }
 
 FLAGS = {
     "motor_overspeed": "the motor is above its permitted speed",
     "gearbox_overspeed": "the gearbox input is above its permitted speed",
-    "winding_hot": "the winding is too hot after long running at this current",
+    "winding_hot": "the winding gets too hot in long running at this current",
     "slips": "the tracks or wheels slide faster than V_s on average",
     "jumps": "the robot leaves the ground at times",
-    "overvoltage": "the cells are above their charge voltage, or the charging current is too high",
+    "overvoltage": "cells are above their charge voltage, or the charging current is too high",
     "cut_off": "a cell is below its cut-off voltage",
     "battery_overcurrent": "the current of a cell is above its limit",
     "current_limited": "the motor driver limits the current",
     "gearbox_overload": "the torque is above the continuous rating of the gearbox",
     "too_hot": "the winding is hotter than permitted",
-    "demand_missed": "the robot did not reach the commanded speed",
-    "voltage_rising": "a cell voltage rises during discharge, past the minimum of its curve",
-    "current_returned": "current flows back into the external supply",
+    "demand_missed": "the commanded speed was not reached",
+    "voltage_rising": "a cell voltage rises during discharge",
+    "current_returned": "current flows back into the supply",
 }
 
 
@@ -166,12 +170,7 @@ OUTCOMES = {
 
 
 #: Reason for a turn without a settled value.
-NO_TURN = "there is no settled turn. With --model drive, simulate computes the turn over time"
-
-
-def reason_without_value(outcome: str) -> str:
-    """Reason why a quantity has no value, in one line."""
-    return OUTCOMES.get(outcome) or status_meaning(outcome)
+NO_TURN = "there is no settled turn. Simulate it with --model drive"
 
 
 def short_status(status: str) -> str:

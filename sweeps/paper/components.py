@@ -232,5 +232,5 @@ def draw_idle_track(robots: dict[str, Robot]) -> Figure:
                 )
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26))
     axes.set_ylim(bottom=0)
-    add_corner_note(axes, f"dots: {displayed_robot_name(name)}; lines: straight fits")
+    add_corner_note(axes, f"dots: {displayed_robot_name(name)}, lines: straight fits")
     return fig

@@ -65,7 +65,7 @@ def current_over_slope(robot: Robot, rows: data.PaperRows, certainty: Sequence[S
     grid[0, 0].set_ylabel("total current [A]")
     modes = "     ".join(f"{m}: {u:g} V, {p:g} kg" for m, (u, p) in data.MODES.items())
     fig.supxlabel(
-        f"loading modes   {modes}\nsolid: own adhesion, × where the robot begins to slide; dashed: adhesion raised",
+        f"loading modes   {modes}\nsolid: own adhesion, × where the robot begins to slide, dashed: adhesion raised",
         fontsize=9,
     )
     return fig

@@ -15,11 +15,17 @@ from calibration.data import Json, Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import reason_without_levers
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number, stated_word
+from calibration.data.input_errors import (
+    SEEDS,
+    BadConfiguration,
+    stated_count,
+    stated_number,
+    stated_word,
+)
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
+from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.rig import IMPOSED
 from mmrjax.model.robot import Robot
 from sweeps.config_campaign import Campaign
@@ -99,7 +105,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     }
     samples = _sampled_design(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
-        raise BadConfiguration(f"{where}: no [axes] or [samples]; specify at least one quantity to vary")
+        raise BadConfiguration(f"{where}: no [axes] or [samples]; vary at least one quantity")
     design = Design(axes, samples)
     fixed, surface = _fixed_conditions(config.conditions, robot, f"{where}, conditions")
     fixed |= task.further({**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where)
@@ -108,8 +114,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
             raise BadConfiguration(f"{where}, {name}: given twice; give it once, under conditions, axes or samples")
     if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
         raise BadConfiguration(
-            f"{where}: voltage has no effect on battery power, where the state of charge sets it; remove voltage "
-            "or battery"
+            f"{where}: voltage has no effect on a battery, whose charge sets it; remove one of the two"
         )
     _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
@@ -151,22 +156,14 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
     imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
     if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
-            f"{where}, conditions.surface: got {surface}; each surface of a rig is a configuration "
+            f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations "
             f"({', '.join(robot.configurations)}); vary or set configuration"
         )
 
 
-def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
-    """Adhesion of each configuration on a surface, relative to that on the bench."""
-    return tuple(adhesion_ratio(surface, tracked) for tracked in robot.configurations.tracked)
-
-
 def _known_axis(name: str, robot: Robot, where: str) -> Axis:
     names = variation.variable_names(robot)
-    if name not in names:
-        raise BadConfiguration(
-            f"{where}: neither a parameter of the robot nor a condition; {allowed_words(name, names, 3)}"
-        )
+    stated_word(name, names, where, "neither a parameter of the robot nor a condition", 3)
     return variation.Variation(robot, (name,)).axes[name]
 
 
@@ -184,12 +181,8 @@ def _check_within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> No
 
 
 def _configuration(name: Any, robot: Robot, where: str) -> float:
-    if name not in robot.configurations.names:
-        raise BadConfiguration(
-            f"{where}: got {name!r}; the robot has no such configuration; "
-            f"{allowed_words(str(name), robot.configurations)}"
-        )
-    return float(robot.configurations.index(name))
+    wrong = f"got {name!r}; the robot has no such configuration"
+    return float(robot.configurations.index(stated_word(name, robot.configurations, where, wrong)))
 
 
 # --- grids ------------------------------------------------------------------------------------------------------
@@ -203,7 +196,19 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
         )
         values = np.array([_configuration(n, robot, where) for n in names])
     elif isinstance(stated, dict):
-        values = _range_values(stated, where)
+        _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
+        start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
+        number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
+        scale = stated.get("scale", "linear")
+        stated_word(scale, ("linear", "log"), f"{where}.scale", f"got {scale!r}")
+        if start > stop or (start == stop) != (number == 1):
+            raise BadConfiguration(
+                f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and 2 "
+                "values or more"
+            )
+        if scale == "log" and start <= 0:
+            raise BadConfiguration(f"{where}.start: got {start:g}; expected a number above 0 with scale log")
+        values = np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
     elif isinstance(stated, str):
         values = np.array(parse_axis(where, stated))
     else:
@@ -213,29 +218,12 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
     if len(values) > LONGEST:
         raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (except in [samples])")
     if len(np.unique(values)) < len(values):
-        raise BadConfiguration(f"{where}: got a value twice; expected different values")
+        raise BadConfiguration(f"{where}: got a value twice; give it once")
     _check_within(values, axis, where)
     return values
 
 
 _RANGE = ("start", "stop", "number", "scale")
-
-
-def _range_values(stated: Json, where: str) -> np.ndarray:
-    _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
-    start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
-    number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
-    scale = stated.get("scale", "linear")
-    if scale not in ("linear", "log"):
-        raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
-    if start > stop or (start == stop) != (number == 1):
-        raise BadConfiguration(
-            f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at "
-            "least 2 values, or a single value"
-        )
-    if scale == "log" and start <= 0:
-        raise BadConfiguration(f"{where}.start: got {start:g}; expected a number above 0 with scale log")
-    return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
 
 
 def _check_keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
@@ -257,9 +245,8 @@ def _fixed_conditions(stated: Json, robot: Robot, where: str) -> tuple[dict[str,
         place = f"{where}.{name}"
         stated_word(name, allowed, place, "no such condition")
         if name == SURFACE:
-            if not isinstance(value, str) or (value not in SURFACES and robot.rig.scales_adhesion):
-                raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")
-            surface = str(value)
+            is_label = isinstance(value, str) and not robot.rig.scales_adhesion
+            surface = value if is_label else stated_word(value, SURFACES, place, f"got {value!r}")
         elif name == CONFIGURATION:
             fixed[name] = _configuration(value, robot, place)
         else:
@@ -277,38 +264,30 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     if not stated:
         return None
     _check_keys(stated, _SAMPLES, ("design", "number"), where)
-    design = stated["design"]
-    if not isinstance(design, str) or design not in DESIGNS:
-        raise BadConfiguration(f"{where}.design: got {design!r}; {allowed_words(str(design), DESIGNS)}")
+    design = stated_word(stated["design"], DESIGNS, f"{where}.design", f"got {stated['design']!r}")
     number = stated_count(stated["number"], f"{where}.number", 1, 2**52)
-    seed = stated.get("seed", 0)
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
-        raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")
+    seed = stated_count(stated.get("seed", 0), f"{where}.seed", 0, SEEDS)
     overrides = stated.get("over", {})
     if not isinstance(overrides, dict):
         raise BadConfiguration(f"{where}.over: got {overrides!r}; expected a table of names and distributions")
     marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in overrides.items()}
     joint = None
     if "posterior" in stated:
-        joint = _posterior(stated["posterior"], robot, f"{where}.posterior", data)
+        from calibration.data import posterior_file
+
+        folder, place = stated["posterior"], f"{where}.posterior"
+        if not isinstance(folder, str):
+            raise BadConfiguration(f"{place}: got {folder!r}; expected a run folder of calibrate or loop")
+        path = Path(folder)
+        path = path / posterior_file.FILE if path.is_dir() else path
+        joint = posterior_file.read_posterior(path)
+        joint.check(robot, place)
+        data.append(str(path))
     if not marginals and joint is None:
         raise BadConfiguration(
             f"{where}: nothing to sample; give a table `over` of names and distributions, or `posterior`"
         )
     return Samples(design, number, seed, marginals, joint)
-
-
-def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Any:
-    from calibration.data import posterior_file
-
-    if not isinstance(stated, str):
-        raise BadConfiguration(f"{where}: got {stated!r}; expected a run folder of calibrate or loop")
-    path = Path(stated)
-    path = path / posterior_file.FILE if path.is_dir() else path
-    posterior = posterior_file.read_posterior(path)
-    posterior.check(robot, where)
-    data.append(str(path))
-    return posterior
 
 
 #: Keys of each distribution.
@@ -329,8 +308,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         raise BadConfiguration(f"{where}: cannot be sampled; put it under axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
     kind = table.get("distribution") if isinstance(table, dict) else None
-    if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
-        raise BadConfiguration(f"{where}.distribution: got {kind!r}; {allowed_words(str(kind), DISTRIBUTIONS)}")
+    kind = stated_word(kind, DISTRIBUTIONS, f"{where}.distribution", f"got {kind!r}")
     needed = DISTRIBUTIONS[kind]
     _check_keys(table, ("distribution", *needed), needed, where)
     numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}

@@ -45,7 +45,7 @@ VERDICT, LARGEST = "verdict", "largest_mm"
 OUTPUTS: dict[str, tuple[str, str]] = {
     VERDICT: (
         "",
-        "result of the climb. For a search, result for the smallest obstacle that the robot does not get over",
+        "result of the climb. For a search, that of the smallest obstacle not climbed",
     ),
     LARGEST: ("mm", "largest got over"),
     "time_s": ("s", "time to the verdict"),
@@ -116,7 +116,7 @@ def climb_refusal(robot: Robot) -> str | None:
     if not robot.has_ground:
         return "the robot's load is a shaft; a climb needs a vehicle"
     if robot.rig.imposed != "voltage":
-        return "in the robot's file the motors are not driven by voltage"
+        return "the robot's file imposes no voltage"
     try:
         masses.check_parts(robot)
     except ValueError as error:

@@ -100,8 +100,8 @@ class Pool:
                     raise LostWorkers(GONE) from error
                 if tried[chunk] > RETRIES:
                     raise LostWorkers(
-                        f"--scheduler: chunk {chunk} lost its worker {tried[chunk]} times, perhaps because of too "
-                        "little memory; with stable workers the same command resumes"
+                        f"--scheduler: chunk {chunk} lost its worker {tried[chunk]} times, perhaps for lack of "
+                        "memory; the same command resumes"
                     ) from error
                 under_way.add(submit(chunk))
                 continue
@@ -230,8 +230,8 @@ def _connect_client(address: str) -> Any:
         return clients[0]
     reason = (str(failed[0]).split("\n")[0] or type(failed[0]).__name__) if failed else "silence"
     raise BadConfiguration(
-        f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected the "
-        "address that dask scheduler prints, such as tcp://host:8786"
+        f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected one "
+        "such as tcp://host:8786"
     )
 
 

@@ -14,7 +14,7 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import channels, quantities
 from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.signals import FLAGS, STATUSES
-from sweeps.points.zarr_store import STORE, Layout
+from sweeps.points.zarr_store import STORE, StoreLayout
 
 #: Columns of conditions, as in tables of runs and options, and their unit in the unit of the store. Other quantities
 #: keep their names.
@@ -25,7 +25,7 @@ COLUMNS = {c.field: (c.column, 1.0) for c in quantities.SET if c.in_tables and c
 }
 
 
-def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
+def export_runs(kind: str, folder: Path, layout: StoreLayout) -> Path:
     """Writes `runs.csv` or `runs.parquet` into a finished run folder. Returns the path.
 
     One row for each point, in order. Numbers that are not finite become empty cells.
@@ -40,7 +40,7 @@ def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
     return path
 
 
-def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
+def chunk_tables(store: Path, layout: StoreLayout) -> Iterator[Any]:
     """Yields the points of each chunk as an Arrow table."""
     import pyarrow as pa
     import zarr
@@ -66,16 +66,16 @@ def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
             sampled: Any = group[name]
             column, unit = COLUMNS.get(name, (name, 1.0))
             tables[column] = pa.array(np.broadcast_to(sampled[box[-1]], shape).ravel() / unit)
-        for variable in layout.variables:
-            array: Any = group[variable.name]
+        for name, (dtype, _) in layout.variables.items():
+            array: Any = group[name]
             flat = array[box].ravel()
-            if variable.name == STATUS:
+            if name == STATUS:
                 tables[STATUS] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(STATUSES))
-            elif np.dtype(variable.dtype).kind != "f":
+            elif np.dtype(dtype).kind != "f":
                 names = [";".join(f for k, f in enumerate(FLAGS) if bits >> k & 1) for bits in range(1 << len(FLAGS))]
-                tables[variable.name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
+                tables[name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
             else:
-                tables[columns.get(variable.name, variable.name)] = pa.array(flat, from_pandas=True)
+                tables[columns.get(name, name)] = pa.array(flat, from_pandas=True)
         yield pa.table(tables)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.columns import LOAD, Layout
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.runs import Runs
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
 from mmrjax.model.robot import Robot
@@ -47,8 +47,17 @@ def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None
             or configuration is unknown.
     """
     layout = Layout.of(robot)
-    check_axes(config, robot)
     own_axis = AXIS[layout.imposed]
+    for key in AXIS.values():
+        if key != own_axis and getattr(config, key) is not None:
+            raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[key], OPTIONS[own_axis]))
+    ground, shaft = (
+        [OPTIONS[key] for key in keys if getattr(config, key) is not None] for keys in (ON_GROUND, ON_SHAFT)
+    )
+    imposed.check_acting(robot, ground, shaft)
+    surface = config.surface
+    if surface is not None and robot.rig.scales_adhesion:
+        stated_word(surface, SURFACES, OPTIONS["surface"], f"got {surface!r}")
     update: dict[str, object] = {"configurations": grid_configurations(config, robot)}
     if battery:
         imposed.check_battery(robot)
@@ -62,25 +71,6 @@ def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None
             "surface": config.surface or (BENCH if inherits else None),
         }
     return config.model_copy(update=update)
-
-
-def check_axes(config: GridPart, robot: Robot) -> None:
-    """Rejects axes that the robot does not have.
-
-    Raises:
-        BadConfiguration: there is such an axis, or a surface is not in Table 5 although the robot uses its surfaces.
-    """
-    layout = Layout.of(robot)
-    for key in AXIS.values():
-        if key != AXIS[layout.imposed] and getattr(config, key) is not None:
-            raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
-    ground, shaft = (
-        [OPTIONS[key] for key in keys if getattr(config, key) is not None] for keys in (ON_GROUND, ON_SHAFT)
-    )
-    imposed.check_acting(robot, ground, shaft)
-    surface = config.surface
-    if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
-        raise BadConfiguration(f"{OPTIONS['surface']}: got {surface!r}; {allowed_words(surface, SURFACES)}")
 
 
 def grid_axes(config: GridPart, robot: Robot, battery: bool) -> dict[str, tuple[object, ...]]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Json, profiles
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax import __version__, fidelities
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS, Variation
@@ -26,7 +26,7 @@ from sweeps.console import print_message
 from sweeps.points import axes, scale
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import Task, task_of_configuration
-from sweeps.points.zarr_store import ABSENT, Layout, Variable
+from sweeps.points.zarr_store import ABSENT, StoreLayout
 
 #: Number of points that the fidelity checks before the first one is simulated.
 ASKED = 48
@@ -51,8 +51,8 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
     if name_clashes:
         raise BadConfiguration(f"{where}, outputs: got {name_clashes[0]}, which is varied; expected outputs of a run")
     task = task_of_configuration(config, robot, profile is not None and profile.turns)
-    if unknown := [name for name in config.outputs if name not in task.attributes]:
-        raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {allowed_words(unknown[0], task.attributes, 3)}")
+    for name in config.outputs:
+        stated_word(name, task.attributes, f"{where}, outputs", most=3)
     rests = {**{o.name: o.rests_on for o in outputs.output_table(robot.channels)}, **capabilities.RESTS_ON}
     for name in config.outputs:
         if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
@@ -115,14 +115,14 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
             raise BadConfiguration(f"--model {task.model}: at {point_text}: {error}") from error
 
 
-def store_layout(config: Campaign, job: scale.Job) -> Layout:
+def store_layout(config: Campaign, job: scale.Job) -> StoreLayout:
     """Arrays in the store of a job, with units and long names."""
-    variables = [
-        Variable(name, scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
+    variables = {
+        name: (scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
         for name in job.outputs
-    ]
+    }
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
-    variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}))
+    variables[STATUS] = scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}
     planned = job.plan.axes
     coordinates = {
         n: _store_attributes({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()
@@ -131,8 +131,8 @@ def store_layout(config: Campaign, job: scale.Job) -> Layout:
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
     group_attributes = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
-    return Layout(
-        job.plan.design, job.blocks, tuple(variables), coordinates, labels, group_attributes, config.compression
+    return StoreLayout(
+        job.plan.design, job.blocks, variables, coordinates, labels, group_attributes, config.compression
     )
 
 

@@ -31,8 +31,9 @@ from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate_points, pick_outputs
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_tables import adhesion_ratio
 from mmrjax.model.robot import Robot
-from sweeps.points.axes import SweepPlan, adhesion_ratios
+from sweeps.points.axes import SweepPlan
 from sweeps.points.climbs import VERDICT
 from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import Task
@@ -115,10 +116,11 @@ class Compiled:
         self._variation, self._fixed = eqx.combine(jax.device_put(arrays, everywhere), static_parts)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
-        surface = None if job.plan.surface is None else adhesion_ratios(job.robot, job.plan.surface)
+        surface, tracked = job.plan.surface, job.robot.configurations.tracked
+        ratios = None if surface is None else tuple(adhesion_ratio(surface, x) for x in tracked)
         self._asked = _AskedOutputs(
             job.task.model, tuple(job.task.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs),
-            job.storage, surface,
+            job.storage, ratios,
         )  # fmt: skip
         # Long computations run in parts. Between parts they report progress and can be interrupted.
         is_split = len(devices) > 1 or self._variation.varies_robot

@@ -130,28 +130,14 @@ BLOCK, METADATA = 4096, 1024
 
 
 @dataclasses.dataclass(frozen=True)
-class Variable:
-    """An array of a store.
-
-    Attributes:
-        name: name of the array.
-        dtype: data type in NumPy's notation, such as `<f8`.
-        attributes: units, long_name and the like.
-    """
-
-    name: str
-    dtype: str
-    attributes: Json
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """Layout of a store.
+class StoreLayout:
+    """StoreLayout of a store.
 
     Attributes:
         design: the points.
         blocks: chunks of the sweep.
-        variables: outputs, with all dimensions of the design.
+        variables: data type of each output in NumPy's notation, such as `<f8`, and its attributes: units, long_name
+            and the like. Outputs have all dimensions of the design.
         coordinates: units and long names of the varied names.
         labels: words that replace the numbers of an axis.
         attributes: attributes of the group.
@@ -160,7 +146,7 @@ class Layout:
 
     design: Design
     blocks: Blocks
-    variables: tuple[Variable, ...]
+    variables: Mapping[str, tuple[str, Json]]
     coordinates: Mapping[str, Json]
     labels: Mapping[str, Names]
     attributes: Json
@@ -171,13 +157,15 @@ class Layout:
         """Uncompressed size of the store on disk [bytes]: files and folders in blocks, metadata and journal."""
         counts, points = self.blocks.counts, self.blocks.points
         folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
-        point_bytes = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
+        point_bytes = sum(_on_disk(np.dtype(v).itemsize * points) for v, _ in self.variables.values()) * len(
+            self.blocks
+        )
         outputs = point_bytes + BLOCK * folders * len(self.variables)
         names = () if self.design.samples is None else self.design.samples.names
         sample_size = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
         axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
         arrays = len(self.variables) + len(names) + len(self.design.axes)
-        widest = {v.name: (-1.2345678901234567e-300,) * 2 for v in self.variables}
+        widest = dict.fromkeys(self.variables, (-1.2345678901234567e-300,) * 2)
         checks = dict.fromkeys([*widest, *names], 2**32 - 1)
         line = _line(Done(len(self.blocks), (points,) * len(STATUSES), widest, checks))
         return outputs + sample_size + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
@@ -205,7 +193,7 @@ class SweepStore(Folder):
 
     further = (LOCK, ASIDE, "runs.csv", "runs.parquet")
 
-    def __init__(self, path: Path, identity: Identity, layout: Layout, *, force: bool = False) -> None:
+    def __init__(self, path: Path, identity: Identity, layout: StoreLayout, *, force: bool = False) -> None:
         """Creates a store, or continues one with the same identity.
 
         Raises:
@@ -368,7 +356,7 @@ class SweepStore(Folder):
             records = self._records().get(damaged_chunk, [])
             damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
-            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to repeat the sweep")
+            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to start again")
 
     # --- chunks -----------------------------------------------------------------------------------
 
@@ -445,7 +433,7 @@ class SweepStore(Folder):
     def _files(self, chunk: int) -> dict[str, Path]:
         """Files of a chunk, by array. Those of samples belong to chunks at the beginning of all other axes."""
         place, samples = self.layout.blocks.place(chunk), self.layout.design.samples
-        files = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
+        files = {v: Path(v, "c", *map(str, place)) for v in self.layout.variables}
         if samples is not None and not any(place[:-1]):
             files |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
         return files
@@ -461,16 +449,16 @@ class SweepStore(Folder):
         box = layout.blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
         checks = {}
-        for variable in layout.variables:
-            values = np.asarray(arrays[variable.name], variable.dtype).reshape(shape)
-            checks[variable.name] = self._chunk(
-                files[variable.name], values, layout.blocks.size, fill_value(variable)
-            )
+        for name, (dtype, _) in layout.variables.items():
+            values = np.asarray(arrays[name], dtype).reshape(shape)
+            checks[name] = self._chunk(files[name], values, layout.blocks.size, fill_value(dtype))
         samples = layout.design.samples
         if samples is not None and drawn is not None:
             for name, values in zip(samples.names, drawn, strict=True):
                 checks[name] = self._chunk(files[name], values, layout.blocks.size[-1:], math.nan)
-        ranges = {v.name: r for v in layout.variables if (r := _range(arrays, v))}
+        ranges = {
+            name: r for name, (dtype, _) in layout.variables.items() if (r := _range(arrays[name], dtype)) is not None
+        }
         record = Done(chunk, _counts(arrays[STATUS]), ranges, checks)
         assert self._journal is not None
         self._journal.write(_line(record))
@@ -569,7 +557,7 @@ def _compressed(content: Any) -> bytes:
 ZSTD: Json = {"level": 1, "checksum": False}
 
 
-def create_store(path: Path, layout: Layout) -> None:
+def create_store(path: Path, layout: StoreLayout) -> None:
     """Metadata of every array of a store, and the values of its axes."""
     import zarr
     from zarr.codecs import ZstdCodec
@@ -579,10 +567,10 @@ def create_store(path: Path, layout: Layout) -> None:
     design, blocks = layout.design, layout.blocks
     sampled_names = design.samples.names if design.samples is not None else ()
     further = {"coordinates": " ".join(sampled_names)} if sampled_names else {}
-    for v in layout.variables:
+    for name, (dtype, attributes) in layout.variables.items():
         group.create_array(
-            v.name, shape=design.shape, chunks=blocks.size, dtype=v.dtype, fill_value=fill_value(v),
-            compressors=compressors, dimension_names=design.dimensions, attributes={**v.attributes, **further},
+            name, shape=design.shape, chunks=blocks.size, dtype=dtype, fill_value=fill_value(dtype),
+            compressors=compressors, dimension_names=design.dimensions, attributes={**attributes, **further},
         )  # fmt: skip
     for name, values in design.axes.items():
         words = layout.labels.get(name)
@@ -606,19 +594,18 @@ def _on_disk(size: int) -> int:
     return -(-size // BLOCK) * BLOCK
 
 
-def fill_value(variable: Variable) -> Any:
+def fill_value(dtype: str) -> Any:
     """Value of points that have not been simulated."""
-    return math.nan if np.dtype(variable.dtype).kind == "f" else ABSENT
+    return math.nan if np.dtype(dtype).kind == "f" else ABSENT
 
 
 def _counts(status: np.ndarray) -> tuple[int, ...]:
     return tuple(np.bincount(np.asarray(status, np.intp), minlength=len(STATUSES)).tolist())
 
 
-def _range(arrays: Columns, variable: Variable) -> tuple[float, float] | None:
-    if np.dtype(variable.dtype).kind != "f":
+def _range(values: np.ndarray, dtype: str) -> tuple[float, float] | None:
+    if np.dtype(dtype).kind != "f":
         return None
-    values = arrays[variable.name]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="All-NaN")
         low, high = float(np.nanmin(values)), float(np.nanmax(values))

@@ -115,7 +115,7 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
         for figure in fit_tables.frequency_response(runs, panels, LINES):
             yield Section("Frequency response", (figure,))
-    unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
+    unit = "the channel's unit, band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (
         catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),

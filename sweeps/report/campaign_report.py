@@ -17,7 +17,7 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import signals
 from sweeps.pages import words
 from sweeps.points.climbs import LARGEST, SIZE, VERDICT
-from sweeps.points.zarr_store import STORE, Layout
+from sweeps.points.zarr_store import STORE, StoreLayout
 from sweeps.report import catalogue, run_tables
 from sweeps.report.climb_report import VERDICTS
 from sweeps.report.document import Block, Column, Document, Figure, Note, Section, Table
@@ -26,7 +26,7 @@ from sweeps.report.document import Block, Column, Document, Figure, Note, Sectio
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
 
 
-def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path) -> Document:
+def campaign_document(file: RobotFile, layout: StoreLayout, result: Json, store: Path) -> Document:
     """Report of a complete store.
 
     Args:
@@ -47,12 +47,12 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
     )
 
 
-def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
+def _sections(store: Path, layout: StoreLayout, extremes: Json) -> Iterable[Section]:
     values, points = sample_points(store, layout)
     yield Section("What varies", (_varied_rows(layout, values),), "varied")
     if VERDICT in points:
         codes, design = points[VERDICT].astype(int), layout.design
-        meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
+        meanings = layout.variables[VERDICT][1]["flag_meanings"].split()
         rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
         others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
         figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
@@ -69,13 +69,14 @@ def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
     yield Section("What came out", tuple(_outputs(values, points, layout, extremes)), "outputs")
 
 
-def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json) -> Iterable[Block]:
+def _outputs(values: np.ndarray, found: Columns, layout: StoreLayout, extremes: Json) -> Iterable[Block]:
     """Section on the outputs, with extremes and quantiles. The first ones are drawn."""
     settled = np.isin(found[STATUS], signals.DONE)
     rows, figures = list[tuple[Any, ...]](), list[Figure]()
-    for variable in (v for v in layout.variables if "units" in v.attributes):
-        name, label = variable.name, variable.attributes["long_name"]
-        unit = variable.attributes["units"].removeprefix("1")
+    for name, (_, attributes) in layout.variables.items():
+        if "units" not in attributes:
+            continue
+        label, unit = attributes["long_name"], attributes["units"].removeprefix("1")
         usable = settled & np.isfinite(found[name])
         numbers = found[name][usable].astype(float)
         quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else [None] * 3
@@ -92,7 +93,7 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
     yield from figures
 
 
-def _largest_obstacle(values: np.ndarray, found: Columns, layout: Layout) -> str:
+def _largest_obstacle(values: np.ndarray, found: Columns, layout: StoreLayout) -> str:
     """Largest obstacle climbed and its first point, in words."""
     names = layout.design.names
     sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
@@ -107,7 +108,7 @@ def _largest_obstacle(values: np.ndarray, found: Columns, layout: Layout) -> str
     return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
 
 
-def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
+def sample_points(store: Path, layout: StoreLayout) -> tuple[np.ndarray, Columns]:
     """Random selection of the points, always the same.
 
     Returns:
@@ -120,17 +121,17 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
     points_per_chunk = -(-THINNED // len(chunks))
     values: list[np.ndarray] = []
-    values_by_name: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
+    values_by_name: dict[str, list[np.ndarray]] = {name: [] for name in layout.variables}
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
         rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
         values.append(layout.design.values_in_slices(box)[rows])
-        for variable in layout.variables:
-            values_by_name[variable.name].append(group[variable.name][box].ravel()[rows])
+        for name, parts in values_by_name.items():
+            parts.append(group[name][box].ravel()[rows])
     return np.concatenate(values), {name: np.concatenate(parts) for name, parts in values_by_name.items()}
 
 
-def _varied_rows(layout: Layout, values: np.ndarray) -> Table:
+def _varied_rows(layout: StoreLayout, values: np.ndarray) -> Table:
     """Varied names in words, one row for each."""
     rows = []
     for k, name in enumerate(layout.design.names):

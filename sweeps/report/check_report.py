@@ -100,7 +100,7 @@ def reached_value_text(outcome: RequirementOutcome) -> str:
     if outcome.value is not None:
         return f"{three_digits(outcome.value)} {quantity.unit}"
     no_turn = quantity.group == "turn" and outcome.status == STATUSES[NOT_SETTLED]
-    return words.NO_TURN if no_turn else words.reason_without_value(outcome.status)
+    return words.NO_TURN if no_turn else words.OUTCOMES.get(outcome.status) or words.status_meaning(outcome.status)
 
 
 def shortfall_text(outcome: RequirementOutcome) -> str:

@@ -22,13 +22,13 @@ from sweeps.report.document import Block, Document, Note, Section, Table
 
 #: Verdicts in words.
 VERDICTS: dict[str, tuple[str, str]] = {
-    "over": ("gets over", "the rear axle is at least a wheel's radius past the obstacle"),
+    "over": ("gets over", "the rear axle is a wheel's radius past the obstacle"),
     "tips": ("tips over", "the robot pitched by more than 100 deg"),
-    "stalls": ("stalls", "the robot and its tracks stop: the motors cannot turn the tracks"),
-    "slides": ("slides", "the robot stops while its tracks slip: the ground has too little grip"),
-    "hangs": ("hangs", "the robot stops with its body on an edge, or has fallen into a gap"),
-    "unfinished": ("is under way", "the robot was still moving when the time ended. Use a longer --duration"),
-    "failed": ("failed", "the simulation broke down, or the levers would start below the ground"),
+    "stalls": ("stalls", "the tracks stop: the motors cannot turn them"),
+    "slides": ("slides", "the robot stops while its tracks slip: too little grip"),
+    "hangs": ("hangs", "the body rests on an edge, or fell into a gap"),
+    "unfinished": ("is under way", "the robot was still moving at the end. Use a longer --duration"),
+    "failed": ("failed", "the simulation broke down, or levers would start below the ground"),
 }
 
 

@@ -118,8 +118,8 @@ def _summary(channel: Channel, table: Columns) -> Json:
 
 
 _FITS = {
-    "these": "This robot was fitted to these rows, so the errors are not predictions.",
-    "others": "This robot was fitted to other rows, so the errors are those of a prediction.",
+    "these": "This robot was fitted to these rows: errors are not predictions.",
+    "others": "This robot was fitted to other rows: errors are predictions.",
     "": "",
 }
 
@@ -200,7 +200,7 @@ def comparison_answer(found: Comparison) -> str:
     error_summary, total = found.summary["all"], len(found.table["status"])
     channel_errors = [(c, error_summary[c.name]) for c in found.channels if error_summary[c.name]["rows"]]
     if not channel_errors:
-        return "No row has both a simulated and a measured value."
+        return "No row has a simulated and a measured value."
     errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in channel_errors)
     rows, worst = max(e["rows"] for _, e in channel_errors), max(e["max_percent"] for _, e in channel_errors)
     extent_words = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")

@@ -147,7 +147,7 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
         )
     returned_Wh, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
     returned = f"{returned_Wh:.3g} Wh returned to the source." if returned_Wh > 1e-6 * first["energy_drawn_Wh"] else (
-        f"{_NO_RETURN}. Driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
+        f"{_NO_RETURN}. Driven motors first supply other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
     energy = catalogue.figure(

@@ -27,7 +27,7 @@ from mmrjax.undercarriage.ripple_peaks import (
     strongest_resonances,
 )
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Cell, Document, Section, Table, remarks
+from sweeps.report.document import Cell, Document, Section, remarks
 
 SAID = 3  # most ranges to avoid in a sentence
 
@@ -143,7 +143,7 @@ class ResonanceResult:
         """Sentences on speeds to avoid, the most important first."""
         low, high = self.speeds
         if not np.isfinite(low):
-            return [f"No run of {self.configuration} travels, so there is no ripple (status gives the reason)."]
+            return [f"No run of {self.configuration} travels (see status)."]
         parts = []
         mode_resonances, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
         if mode_resonances:
@@ -153,8 +153,8 @@ class ResonanceResult:
             peaks = {s.label: float(np.nanmax(self.table[f"{n}_ripple_percent"])) for n, s in SIGNALS.items()}
             largest = ", ".join(f"{label} {ripple_percent(peak)}" for label, peak in peaks.items())
             parts.append(
-                f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: no ripple peak is at a "
-                f"natural frequency (largest ripple: {largest})."
+                f"No speed to avoid between {span_text(low, high)} mm/s: no ripple peak is at a natural "
+                f"frequency (largest ripple: {largest})."
             )
         if bare:
             also = "Ripple also peaks" if mode_resonances else "Ripple peaks"
@@ -176,7 +176,7 @@ class ResonanceResult:
             )
         if self.passing.name == "teeth":
             parts.append(
-                f"This configuration has no grousers on the ground. The belt's teeth cause its ripple, one every "
+                "Without grousers on the ground, the belt's teeth cause the ripple, one every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
         return parts
@@ -249,7 +249,7 @@ def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], what: s
         meets = f"{members[0].mode} at {span_text(first, last, 1)} Hz meets " if members[0].mode else ""
         order = f"{members[0].order} × {what}" if members[0].order else f"{span_text(first, last, 1)} Hz"
         how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
-        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
+        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}, ripple up to: {how})")
     others_text = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
     return "; ".join(texts) + others_text
 
@@ -260,7 +260,7 @@ def span_text(low: float, high: float, unit: float = MM) -> str:
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"
 
 
-_FEW = "travels, but fewer than {} {} passed while ripple was measured. Use a longer --duration"
+_FEW = "travels, but fewer than {} {} passed. Use a longer --duration"
 #: Most peaks that are not folded.
 UNFOLDED = 30
 
@@ -273,7 +273,16 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
     values = passing.name, 1000 * passing.travel
     figure = catalogue.figure("resonance.map", found, finding=found.statement(), words=values)
     endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
-    peaks, end_note = _peaks(found), catalogue.note("resonance.ended", 100 * TAIL)
+    peak_rows = [
+        (
+            Cell(SIGNALS[p.signal].label, "bad" if p in found.strong else ""), p.payload,
+            p.speed / MM, f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none",
+            p.frequency, p.mode or "none",
+        )
+        for p in found.peaks
+    ]  # fmt: skip
+    peaks = catalogue.table("resonance.peaks_found", peak_rows)
+    end_note = catalogue.note("resonance.ended", 100 * TAIL)
     folded = count_noun(len(peaks.rows), "peak") if len(peaks.rows) > UNFOLDED else ""
     rows = []
     for payload, modes in found.modes.items():
@@ -304,16 +313,3 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
             Section("How the runs ended", (end_note, endings), "ended"),
         ),
     )
-
-
-def _peaks(found: ResonanceResult) -> Table:
-    strong = found.strong
-    rows = [
-        (
-            Cell(SIGNALS[p.signal].label, "bad" if p in strong else ""), p.payload,
-            p.speed / MM, f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none",
-            p.frequency, p.mode or "none",
-        )
-        for p in found.peaks
-    ]  # fmt: skip
-    return catalogue.table("resonance.peaks_found", rows)

@@ -109,16 +109,11 @@ def quantity_table(name: str, table: Columns, names: Iterable[str], **options: A
         options: further fields of the table, and its `first` columns with their cells.
     """
     first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
-    shown_names = [
-        n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))
-    ]
+    empty = {n for n, x in table.items() if x.dtype.kind == "f" and np.isnan(x).all()} - {"supply_voltage_V"}
+    shown_names = [n for n in dict.fromkeys(names) if n in table and n not in empty]
     heads = (*(column for column, _ in first), *map(quantity_column, shown_names))
     cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown_names)]
     return Table(name, heads, list(zip(*cells, strict=True)), **options)
-
-
-def _is_empty(values: np.ndarray) -> bool:
-    return values.dtype.kind == "f" and bool(np.isnan(values).all())
 
 
 def reading_text(value: Any, channel: Channel) -> str:

@@ -248,7 +248,14 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
     ]
     used_limits = run_tables.use_of_limits(limits, float(robot.motor.temperature_ambient))
     if PEAK in run and not math.isnan(peak := float(run[PEAK])):
-        inrush = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
+        # Largest current for all motors [A]: that of the driver, or of the battery minus other consumers.
+        driver_limit, battery = float(robot.driver.current_limit), robot.battery
+        current_limits = (
+            [float(robot.sides) * driver_limit] if driver_limit < float(type(robot.driver)().current_limit) else []
+        )
+        if math.isnan(float(run.get("supply_voltage_V", math.nan))) and battery.current_limit is not None:
+            current_limits.append(battery.current_limit - float(battery.current_other))
+        inrush = min(current_limits, default=None)
         used_limits.append({
             "words": "largest current of the start, all motors", "value": f"{peak:.1f} A",
             "limit": "not stated" if inrush is None else f"{inrush:.1f} A",
@@ -256,14 +263,3 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
     return used_limits
-
-
-def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
-    """Largest current for all motors [A]: that of the driver, or of the battery minus other consumers. None: not
-    stated.
-    """
-    driver_limit, battery = float(robot.driver.current_limit), robot.battery
-    limits = [float(robot.sides) * driver_limit] if driver_limit < float(type(robot.driver)().current_limit) else []
-    if on_battery and battery.current_limit is not None:
-        limits.append(battery.current_limit - float(battery.current_other))
-    return min(limits, default=None)

@@ -24,8 +24,14 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
     """Report of a finished study."""
     method = f"Method: {sensitivity_words.METHODS[found.method]} (`{found.method}`)"
     ran = f", {found.evaluations:,} model evaluations in {found.seconds:.1f} s." if found.evaluations else "."
+    p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
+    parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
+    _, own_values, symbol = p.imposed
+    for _, x, unit in (("", own_values, f" {symbol}"), *p.ground):
+        on_battery = unit == " V" and np.isnan(x).all()
+        parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     overview = catalogue.figure(
-        "sensitivity.overview", found, words=(_OF.get(found.method, ""), _ranges(found), 100 * NEGLIGIBLE),
+        "sensitivity.overview", found, words=(_OF.get(found.method, ""), "; ".join(parts), 100 * NEGLIGIBLE),
         more=catalogue.text("sensitivity.sobol") if found.method == "sobol" else "",
     )  # fmt: skip
     idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
@@ -91,7 +97,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     """Sentence on the most important inputs for an output, with its spread."""
     share, row = study.overall_share, study.row
     if not _any_influence(study):
-        return "No value at any of these operating points, or no input changes it."
+        return "No value at these operating points, or no input changes it."
     order = np.argsort(-share, kind="stable")[:3]
     top = [k for k in order if share[k] >= NEGLIGIBLE] or order[:1]
     who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
@@ -142,14 +148,3 @@ def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
 def _two_digits(sd: float) -> str:
     """Sd as text with two digits, without an exponent."""
     return f"{sd:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))}f}"
-
-
-def _ranges(found: SensitivityResult) -> str:
-    """Values of the operating points at which an output was studied, in words."""
-    p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
-    parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
-    _, own_values, symbol = p.imposed
-    for _, x, unit in (("", own_values, f" {symbol}"), *p.ground):
-        on_battery = unit == " V" and np.isnan(x).all()
-        parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
-    return "; ".join(parts)

@@ -110,7 +110,7 @@ COLUMNS = columns(
 
 #: Number of motors in the table of a terminal, and of further designs in its few lines.
 SHOWN, NEXT = 5, 2
-_DESIGNS = "The best design, and the best designs with other parts, with the makers' gear ratios and whole cells."
+_DESIGNS = "The best design, and the best with other parts, all with makers' gear ratios and whole cells."
 
 
 def size_document(found: SizeResult, robot_name: str) -> Document:

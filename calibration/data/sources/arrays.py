@@ -149,8 +149,8 @@ def _inside(group: Any, key: str, name: str) -> bool:
     link = group.get(key, getlink=True)
     if isinstance(link, h5py.ExternalLink):
         raise BadData(
-            f"{name}, {group.name.rstrip('/')}/{key}: is a link to another file, {link.filename}; expected data in "
-            "this file; copy them into it"
+            f"{name}, {group.name.rstrip('/')}/{key}: is a link to another file, {link.filename}; copy its data "
+            "into this file"
         )
     return not isinstance(link, h5py.SoftLink) and not key.startswith("#")
 
@@ -181,9 +181,7 @@ def _add_group(
         if not isinstance(item, h5py.Dataset) or item.shape is None:
             continue
         if item.external or item.is_virtual:
-            raise BadData(
-                f"{name}, {item_path}: its values are in another file; expected data in this file; copy them into it"
-            )
+            raise BadData(f"{name}, {item_path}: its values are in another file; copy its data into this file")
         words = h5py.check_string_dtype(item.dtype) is not None
         char = matlab and item.attrs.get("MATLAB_class") == b"char"
         dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype

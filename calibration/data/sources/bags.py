@@ -57,8 +57,8 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
                     _refused(
                         topic,
                         count,
-                        f"has messages of type {kind}, which the bag does not define; record it as MCAP, which holds "
-                        "the definitions, or convert it with rosbags-convert",
+                        f"has messages of type {kind}, which the bag does not define; record it as MCAP, or "
+                        "convert it with rosbags-convert",
                     )
                 )
                 continue

@@ -126,8 +126,8 @@ def format_of(path: Path, name: str) -> Format | None:
             return BAG
         if parts := sorted(file.name for file in path.iterdir() if file.suffix in _RECORDINGS):
             raise BadData(
-                f"{name}: is a folder without {_METADATA}; expected that file of the bag, or the path of a "
-                f"recording, as {path / parts[0]}"
+                f"{name}: is a folder without {_METADATA}; expected that file of the bag, or a recording, as "
+                f"{path / parts[0]}"
             )
     begin = input_files.first_bytes(path, name)
     for magic, format_name in BEGINNINGS.items():

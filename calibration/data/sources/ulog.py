@@ -37,10 +37,7 @@ def signals_of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
     with path.open("rb") as stream, contextlib.redirect_stdout(io.StringIO()):
         log = ULog(stream)
     if log.file_corruption or not log.data_list:
-        raise BadData(
-            f"{name}: is a damaged ULog file, or one without data; expected a whole log; download it again from the "
-            "autopilot"
-        )
+        raise BadData(f"{name}: is a damaged or empty ULog file; download it again from the autopilot")
     signals = []
     for data in log.data_list:
         topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
@@ -80,8 +77,8 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
             byte = next_message
     if byte != size:
         raise BadData(
-            f"{name}: ends within a message, at byte {byte} of {size}, as if it was cut off; copy it again, or, "
-            f"if the recorder lost power, keep only the complete messages: head -c {byte} {name}"
+            f"{name}: ends within a message, at byte {byte} of {size}, as if it was cut off; copy it again, or "
+            f"keep the complete messages: head -c {byte} {name}"
         )
     return formats
 

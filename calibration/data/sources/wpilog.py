@@ -74,8 +74,8 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
         entry, size, stamp = fields
         if begin + size > len(content):
             raise BadData(
-                f"{name}: ends within a record, at byte {record_start} of {len(content)}, as if it was cut off; copy "
-                f"it again, or keep only the complete records: head -c {record_start} {name}"
+                f"{name}: ends within a record, at byte {record_start} of {len(content)}, as if it was cut off; "
+                f"copy it again, or keep the complete records: head -c {record_start} {name}"
             )
         payload, record_start = content[begin : begin + size], begin + size
         if entry == 0 and payload[:1] == bytes([START]):

@@ -190,7 +190,7 @@ class SettledRuns(Observer):
                     )
                 )
         if remarks and len(alike) == 1:
-            raise BadData(f"{describe(remarks[0])}; no condition varies, so nothing can be fitted")
+            raise BadData(f"{describe(remarks[0])}; no condition varies")
         whole_table = runs.whole
         thinned = (
             []

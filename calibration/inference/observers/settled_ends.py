@@ -175,7 +175,16 @@ def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
 
     Shared parameters come from the point that fits all runs best.
     """
-    by_run = _misfit_of_runs(problem, points)
+    observe: Histories = problem.observe  # type: ignore[assignment]
+    filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
+    parts = filled.reshape(-1, TOGETHER, points.shape[1])
+    first_misfits = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
+    with Threads(CORES) as cores:
+        misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
+    by_row = np.sum(np.concatenate([np.asarray(x) for x in misfits])[: len(points)] ** 2, 2)
+    summed = np.zeros((len(points), len(observe.rows_of)))
+    np.add.at(summed.T, np.asarray(observe.run), by_row.T)
+    by_run = np.where(np.isfinite(summed), summed, np.inf)
     mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
     configuration = np.asarray(problem.observe.conditions.configuration)
     for k, name in enumerate(problem.base.configurations):
@@ -277,20 +286,6 @@ def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
     return jax.vmap(
         lambda z, pinned: levenberg_marquardt(problem, z, problem.data, Pin(pinned, z), max_steps=STEPS)[0]
     )(starts, held)
-
-
-def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Sum of squared residuals of each run at each point [σ²], infinite if a run fails, shape (points, runs)."""
-    observe: Histories = problem.observe  # type: ignore[assignment]
-    filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
-    parts = filled.reshape(-1, TOGETHER, points.shape[1])
-    first_misfits = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
-    with Threads(CORES) as cores:
-        misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
-    by_row = np.sum(np.concatenate([np.asarray(x) for x in misfits])[: len(points)] ** 2, 2)
-    by_run = np.zeros((len(points), len(observe.rows_of)))
-    np.add.at(by_run.T, np.asarray(observe.run), by_row.T)
-    return np.where(np.isfinite(by_run), by_run, np.inf)
 
 
 @compiled

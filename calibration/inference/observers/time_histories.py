@@ -275,14 +275,13 @@ class Histories(Observer):
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         if runs.turns:
             raise BadConfiguration(
-                f"{runs.source}: logs of both sides can be simulated but not fitted; fit the settled turns "
-                f"(mmrjax settle {runs.source} --robot FILE), or straight runs with the columns of one side as those "
-                "of the robot"
+                f"{runs.source}: logs of both sides cannot be fitted; fit their settled turns (mmrjax settle "
+                f"{runs.source} --robot FILE), or straight runs with the columns of one side"
             )
         if runs.has("held") and robot.loose:
             raise BadConfiguration(
-                f"{runs.source}, held: got a clamp in a log of a load with backlash or an elastic joint; leave these "
-                "rows out, or remove backlash and stiffness from the robot's file"
+                f"{runs.source}, held: got a clamp on a load with backlash or an elastic joint; leave these rows "
+                "out, or remove backlash and stiffness"
             )
         whole_log, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"
@@ -352,16 +351,15 @@ class Histories(Observer):
             run_rows = names == name
             if len(np.unique(runs["configuration"][run_rows])) > 1:
                 raise BadData(
-                    f"{runs.source}, configuration: run {name or '(no run_id)'} has several values; "
-                    "a run has one configuration, so give each its own run_id"
+                    f"{runs.source}, configuration: run {name or '(no run_id)'} has several values; give each "
+                    "its own run_id"
                 )
             if runs.has("total_mass_kg"):
                 empty = runs["total_mass_kg"][run_rows] - runs["payload_kg"][run_rows]
                 if np.ptp(empty) > ROUNDING:
                     raise BadData(
-                        f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
-                        f"{np.ptp(empty):g} kg apart from its payload; "
-                        "within a run only payload_kg may change it"
+                        f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by {np.ptp(empty):g} "
+                        "kg apart from its payload; within a run only payload_kg may change"
                     )
         _check_signs(runs)
         remarks: list[Remark | str] = []
@@ -387,8 +385,8 @@ class Histories(Observer):
         moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
         for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
             raise BadData(
-                f"{runs.source}, {channel.column}: time histories do not model it; remove the column, or give "
-                "settled runs without time_s"
+                f"{runs.source}, {channel.column}: not modelled over time; remove the column, or give settled "
+                "runs without time_s"
             )
         for name in np.unique(names):
             run_rows = np.flatnonzero(names == name)
@@ -406,11 +404,10 @@ class Histories(Observer):
                     column, unit = runs.channels[k].column, runs.channels[k].unit
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
-                        f"{runs['time_s'][first]:g} s ({runs[column][first]:g} "
-                        f"{unit}); a history "
-                        "begins at rest at its first row. If it began earlier, add a row at that time without "
-                        'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
-                        "settled travel is one row a run, without time_s"
+                        f"{runs['time_s'][first]:g} s ({runs[column][first]:g} {unit}); a history begins at "
+                        "rest. If it began earlier, add a row then without readings. If it began in motion, set "
+                        'start = "measured" or "free" in the robot\'s file. If it is settled, give one row a '
+                        "run, without time_s"
                     )
         remarks: list[Remark | str] = []
         step = runs["time_s"].max() / STEPS
@@ -1010,10 +1007,9 @@ def _check_signs(runs: Runs) -> None:
                 if readings.size and np.median(readings) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
-                        f"{runs[channel.column][rows[0]]:g} {channel.unit} at "
-                        f"{volts[rows[0]]:g} {unit}; "
-                        "expected readings with a sign, negative in reverse; or state [instruments."
-                        f"{channel.name}] signed = false in the robot's file, if it shows the magnitude only"
+                        f"{runs[channel.column][rows[0]]:g} {channel.unit} at {volts[rows[0]]:g} {unit}; "
+                        f"expected negative readings in reverse; or set [instruments.{channel.name}] signed = "
+                        "false in the robot's file, if it shows a magnitude"
                     )
 
 
@@ -1115,7 +1111,12 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            slow = _may_pass_rest(speeds, SLOW[rig.imposed])
+            # True between rows where a run may pass through rest. All True if no reading can tell.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+                is_moving = np.abs(speeds) > SLOW[rig.imposed] * np.nanmax(np.abs(speeds), 0, initial=0.0)
+            ways = np.where(is_moving, np.sign(speeds), 0.0)
+            slow = ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
             early_steps = int(np.ceil(early / _usual_interval(row_steps)))
             slow = np.convolve(slow, np.ones(early_steps + 1))[early_steps:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
@@ -1123,20 +1124,6 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             longest = np.minimum(longest, ELASTIC / elastic)
         found.append(longest)
     return found
-
-
-def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
-    """True between rows where a run may pass through rest. All True if no reading can tell.
-
-    Args:
-        speeds: readings that are 0 at rest, or rates of readings, shape (rows, channels).
-        share: a run may pass through rest below this share of the largest reading.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-        is_moving = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
-    ways = np.where(is_moving, np.sign(speeds), 0.0)
-    return ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
 
 
 def _common_length(instants: int) -> int:

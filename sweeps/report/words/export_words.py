@@ -37,13 +37,13 @@ USE = {
     ),
     "mjlab": (
         '`from mjlab_actuator import DriveActuatorCfg`, then `DriveActuatorCfg(target_names_expr=("{at}",))` '
-        "among the actuators of an entity. The effort target is the voltage [V]. It was tested against a "
-        "stand-in for mjlab's interface, not within mjlab."
+        "among the actuators of an entity. The effort target is the voltage [V]. It was tested with a stand-in "
+        "for mjlab."
     ),
     "table": (
         "Read the voltage for a speed and a torque of the joint, and divide by the supply's voltage to get the "
-        "duty. The torque is the torque at the joint. Add inertia · acceleration of the rotating parts: the "
-        "rotor has {armature:.4g} kg·m² at the joint."
+        "duty. Add inertia · acceleration of the rotating parts to the torque: the rotor has {armature:.4g} "
+        "kg·m² at the joint."
     ),
     "randomization": (
         '`numpy.load("draws.npz")`: each array has one value per sample. Use all values of one sample '
@@ -59,9 +59,9 @@ GOALS = {
 }
 NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
-    "Fast changes. Only settled runs are compared, so inductance and inertia have the given values.",
+    "Fast changes: only settled runs are compared.",
 )
-BACKWARD = "Runs in which the load drives the motor, because none is among the runs above."
+BACKWARD = "Runs in which the load drives the motor."
 
 
 def export_statement(found: Export) -> str:
@@ -77,7 +77,7 @@ def export_statement(found: Export) -> str:
     return (
         f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
         f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is "
-        f"{channels_shown or 'unknown, since these runs contain neither its current nor its speed'}."
+        f"{channels_shown or 'unknown: these runs have neither current nor speed'}."
     )
 
 
@@ -96,16 +96,16 @@ def export_remarks(found: Export) -> list[str]:
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
-        said.append("no measurements were given, so the reference is the native model. Give runs with --data")
+        said.append("the reference is the native model. Give measured runs with --data")
     else:
         said.append(
-            "the refit used no measurements. The errors are hold-out errors if the robot was not fitted to these runs"
+            "the refit used no measurements. Errors are hold-out errors unless the robot was fitted to these runs"
         )
     dropped_names = [f.name for f in compared.fates if f.verdict == DROPPED]
     if dropped_names:
         said.append(f"dropped: {', '.join(dropped_names)}")
     if drive.idle:
-        said.append(f"{', '.join(drive.idle)}: not exported, since it has no effect in {drive.configuration}")
+        said.append(f"{', '.join(drive.idle)}: not exported: no effect in {drive.configuration}")
     if found.posterior is None and drive.file.source.endswith(".toml"):
         said.append("no posterior.nc next to the robot's file: intervals come from the priors")
     return said

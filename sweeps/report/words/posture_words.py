@@ -201,6 +201,5 @@ def tipping_remarks(found: Postures) -> list[str]:
         else "runs " + ", ".join(str(k + 1) for k in tipping_runs[:ROWS])
     )
     return [
-        f"posture: {run_words} would tip over on that slope. Currents and speeds are for a robot that is held "
-        "upright on it"
+        f"posture: {run_words} would tip over on that slope. Currents and speeds are those of a robot held upright"
     ]

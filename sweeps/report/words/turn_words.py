@@ -64,7 +64,7 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     most_rate = np.interp(abs(speed), straight_speeds[::-1], round_[::-1], right=math.nan)
     most_speed = np.interp(abs(rate), round_, straight_speeds, right=math.nan)
     if most_rate >= abs(rate):
-        return "which would be enough. If friction falls with sliding speed, there may be no settled turn"
+        return "which would be enough, unless friction falls with sliding speed"
     told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
     told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
     told += (
@@ -120,8 +120,8 @@ def _moves(row: Json) -> str:
         return f"Straight at {speed:.0f} mm/s."
     if _sloping(row):
         return (
-            f"At this heading the forward speed is {speed:.0f} mm/s and the yaw rate {abs(rate):.2f} rad/s to the "
-            f"{_way(row)}. On a slope the heading keeps changing, so a turn is not a circle."
+            f"At this heading the forward speed is {speed:.0f} mm/s and the yaw rate {abs(rate):.2f} rad/s to "
+            f"the {_way(row)}. On a slope a turn is not a circle."
         )
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
@@ -140,13 +140,13 @@ def turn_notes(robot: Robot, row: Json) -> list[str]:
     width = float(row["effective_width_mm"])
     if math.isfinite(width) and not _sloping(row) and row["status"] == "converged":
         notes.append(
-            f"effective track width {width:.0f} mm, {width / true_width:.2f} times the {true_width:.0f} mm between "
-            "the sides: the speed difference that the turn needs, relative to the difference without sliding"
+            f"effective track width {width:.0f} mm, {width / true_width:.2f} times the {true_width:.0f} mm "
+            "between the sides: the speed difference of the turn, relative to that without sliding"
         )
     if robot.rig.inherits and not BETWEEN <= true_width * MM <= OVER:
         notes.append(
-            f"{true_width:.0f} mm between the sides is outside the range of the packaged robot's parts, "
-            f"{BETWEEN / MM:.0f} to {OVER / MM:.0f} mm"
+            f"{true_width:.0f} mm between the sides is outside the packaged robot's range, {BETWEEN / MM:.0f} to "
+            f"{OVER / MM:.0f} mm"
         )
     for side in SIDES:
         power, current = float(row[f"power_{side}_W"]), float(row[f"motor_current_{side}_A"])
