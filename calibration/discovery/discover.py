@@ -1399,7 +1399,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     remarks += [_repeat_row_remark(found, t) for t in doubtful if t.effect in names and not t.changed]
     different = [t for t in doubtful if t.changed]
     if different:
-        remarks.append(Remark("rests_on", test=max(different, key=lambda t: t.root_changed)))
+        remarks.append(Remark("run_differs", test=max(different, key=lambda t: t.root_changed)))
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
     settled, replicates_asked = found.replicates, found.settings.replicates
