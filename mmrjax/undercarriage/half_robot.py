@@ -39,6 +39,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solve_factorised
 from mmrjax.numerics.newton import root
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
 from mmrjax.undercarriage.belt import BeltPath, belt_runs
 from mmrjax.undercarriage.contact_sums import LinearizedSums
@@ -206,7 +207,7 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
         shifted = dataclasses.replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
-    voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
+    voltage, slope = value_and_slope(left, signals.current)
     z = step * slope / signals.inductance
     return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
 
