@@ -83,9 +83,9 @@ def test_runs_of_ten_milliseconds_are_said(short):
 #: A table or histories, and what is said of it by every command that fits.
 REFUSED = {
     "moving": "run start0 is moving at 0 s",
-    "every reading equal": "total_current_A: 2.5 in every row although the conditions vary; the instrument was stuck",
-    "every sample equal": "total_current_A: 2.5 in every row although the conditions vary; the instrument was stuck",
-    "two configurations": "runs.csv, configuration: run start0 has several values; a run has one configuration",
+    "every reading equal": "total_current_A: 2.5 in every row although conditions vary; the instrument was stuck",
+    "every sample equal": "total_current_A: 2.5 in every row although conditions vary; the instrument was stuck",
+    "two configurations": "runs.csv, configuration: run start0 has several values; give each its own run_id",
 }
 
 

@@ -102,4 +102,4 @@ def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     stiff = params.replace(base, {"running_gear.span_stiffness": 1e8})
     (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2")
-    assert "the track model's step of 0.0001 s is above the largest stable one" in said
+    assert "the step of 0.0001 s is above the largest stable one" in said

@@ -168,7 +168,7 @@ def test_a_table_takes_the_channels_of_the_robot_that_it_is_used_with(tmp_path, 
     assert wide.of(other).unknown == narrow.unknown and wide.of(other).columns.keys() == narrow.columns.keys()
     assert_array_equal(wide.of(other).measured(), narrow.measured())
     with pytest.raises(
-        BadData, match=r"t\.csv, output_torque_Nm: this channel of the robot was left out .* with robot="
+        BadData, match=r"t\.csv, output_torque_Nm: the table was read without this channel; .* with robot="
     ):
         narrow.of(bench)
 

@@ -210,8 +210,8 @@ def test_facts_state_what_the_command_line_needs():
 @pytest.mark.parametrize(
     ("name", "given", "message"),
     [
-        ("steady", {"duration": 5.0}, "duration: got 5.0; this fidelity has no such option; its options: none"),
-        ("drive", {"step": 1e-4}, "step: got 0.0001; this fidelity has no such option; its options: duration"),
+        ("steady", {"duration": 5.0}, "duration: got 5.0; this fidelity has the options: none"),
+        ("drive", {"step": 1e-4}, "step: got 0.0001; this fidelity has the options: duration"),
         ("drive", {"duration": 0.0}, "duration: got 0; expected more than 0, at most 86400 s"),
         ("track", {"step": 0.1}, "step: got 0.1; expected more than 0, at most 0.01 s"),
         ("track", {"duration": float("nan")}, "duration: got nan; expected more than 0, at most 3600 s"),

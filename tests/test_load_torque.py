@@ -218,7 +218,7 @@ def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path, robot):
     with pytest.raises(BadData) as error:
         read_table(tmp_path, f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n", robot, "runs.csv")
     assert str(error.value) == (
-        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; the torque of a brake acts only "
+        "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; a brake acts only "
         "on a shaft; give slope_deg or payload_kg, or describe the load as a shaft"
     )
 

@@ -186,8 +186,8 @@ def test_currents_of_a_joint_are_not_late(tmp_path, joint):
     ("old", "new", "joints", "message"),
     [
         ("", "", "wrist", r"--joints: got wrist; arm.xml has no such driven joint"),
-        ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow slides, is free"),
-        ('<body>\n  <joint name="shoulder"', '<body><freejoint name="base"/><geom size="1"/><body>\n  <joint name="shoulder"', "all", "joint base slides, is free"),
+        ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow is no named hinge"),
+        ('<body>\n  <joint name="shoulder"', '<body><freejoint name="base"/><geom size="1"/><body>\n  <joint name="shoulder"', "all", "joint base is no named hinge"),
         ('<motor joint="elbow"/>', '<motor joint="elbow"/><motor joint="elbow"/>', "all", "elbow has several actuators"),
         ("</actuator>", '</actuator><equality><joint joint1="elbow" joint2="shoulder"/></equality>', "all", "closed loops"),
     ],

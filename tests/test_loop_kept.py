@@ -113,7 +113,7 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     assert at_once == [code]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
     assert "s  verdict: class, iron_loss or windage. Next: held-out errors and other noise levels\n" in err  # at once
-    assert "verdict: class, iron_loss or windage. Held-out errors and other noise levels are still missing" in err
+    assert "verdict: class, iron_loss or windage. Held-out errors and other noise levels are missing" in err
     assert not (tmp_path / "found").exists()
 
     def again(*_, keep, **__):
@@ -131,7 +131,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
 
     monkeypatch.setattr(command, "discover", first)
     monkeypatch.setattr(command.loop_words, "verdict_line", lambda found: found.verdict)
-    _, _, err = ends(mmrjax(*rig), "verdict could not be saved. The same command starts from the beginning", code=130)
+    _, _, err = ends(mmrjax(*rig), "verdict could not be saved. The same command starts anew", code=130)
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
 
 

@@ -242,7 +242,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, 
 
     monkeypatch.setattr(population, "_observe_points", broken)
     name = "6T2A.ground.rolling_resistance"
-    with pytest.raises(BadConfiguration, match=r"none of \d+ members can be run in every row .*: \d+ tips"):
+    with pytest.raises(BadConfiguration, match=r"none of \d+ members runs in every row .*: \d+ tips"):
         calibrate(runs, robot, model="drive", free=(name,), population=4, generations=1)
 
 

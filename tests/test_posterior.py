@@ -151,7 +151,7 @@ def test_posterior_of_another_robot_is_refused(robot, posterior, fitted):
         posterior.check(robot, "here")
     other = dataclasses.replace(posterior, coordinates=("8W8T.mass", *posterior.coordinates[1:]))
     with pytest.raises(
-        BadData, match=r"here: this robot has no 8W8T.mass, so the posterior belongs to another.*6T2A.mass"
+        BadData, match=r"here: this robot has no 8W8T.mass, so the posterior is another robot's.*6T2A.mass"
     ):
         other.check(fitted, "here")
 

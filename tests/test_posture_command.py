@@ -28,7 +28,7 @@ def test_a_run_that_would_tip_is_said_to(flush):
         {**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over
     )
     assert posture_words.tipping_remarks(tipping) == [
-        "posture: the run would tip over on that slope. Currents and speeds are for a robot that is held upright on it"
+        "posture: the run would tip over on that slope. Currents and speeds are those of a robot held upright"
     ]
 
 

@@ -53,7 +53,7 @@ def test_battery_whose_own_parabola_turns_up_is_remarked():
     battery = Battery(curvature=1.25e-8, slope=-1.5e-4, capacity=20_000.0, capacity_curve=10_000.0)
     assert [bool(battery.rises(charge)) for charge in (11_999.0, 12_001.0)] == [False, True]
     assert curve_remark(battery) == (
-        "with this curvature and slope a cell's voltage rises again once 60 % of its capacity is taken "
+        "with this curvature and slope a cell's voltage rises after 60 % of its capacity is taken "
         "(capacity_curve: 10000 C)"
     )
 

@@ -188,7 +188,7 @@ WRONG = {
     "header only": ("time_s,duty\n", r"got a header and no rows; expected at least two rows"),
     "one row only": ("time_s,duty\n0,1\n", r"got one row; expected at least two rows, the last of which ends the mission"),
     "a short row": ("time_s,duty\n0,1\n5\n", r"row 2: got 1 cell; the header has 2 columns"),
-    "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected either decimal commas or decimal points"),
+    "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected decimal commas or decimal points"),
     "unknown surface": ("time_s,duty,surface\n0,1,ice\n5,1,ice\n", r"row 1, surface: got ice; expected one of these; .*asphalt"),
     "no cycles": ("# cycles = 0\ntime_s,duty\n0,1\n5,1\n", r"mission.csv, cycles: got 0; expected a whole number from 1"),
     "half a cycle": ("# cycles = 1.5\ntime_s,duty\n0,1\n5,1\n", r"cycles: got 1.5; expected a whole number"),

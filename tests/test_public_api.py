@@ -356,9 +356,7 @@ WRONG_ROBOT = {
 WRONG_CALL = {
     "model: got fast; allowed: steady, drive, track": dict(model="fast"),
     "model: got stedy; did you mean steady? allowed: steady, drive, track": dict(model="stedy"),
-    "model drive, patience: got 3; this fidelity has no such option; its options: duration": dict(
-        model="drive", patience=3
-    ),
+    "model drive, patience: got 3; this fidelity has the options: duration": dict(model="drive", patience=3),
     "model drive, duration: got -1; expected more than 0, at most 86400 s": dict(model="drive", duration=-1.0),
     "model track, duration: got 0.0015 s; expected a whole number of samples of 0.001 s": dict(
         model="track", duration=0.0015
@@ -391,7 +389,7 @@ def test_wrong_calls_are_said(message, robot):
 def test_other_wrong_use_is_said(robot):
     assert refused(robot, {"voltage": 3.0}) == "conditions: got dict; expected mmrjax.Conditions(...)"
     said = refused(robot, mm.Conditions(voltage=np.full(1001, 24.0)), model="drive")
-    assert said == "history: got 1001 runs; time histories can be kept for at most 1000; set history=False"
+    assert said == "history: got 1001 runs; expected at most 1000; set history=False"
     with pytest.raises(ValueError, match="shapes do not broadcast"):
         mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
 

@@ -20,12 +20,12 @@ from tests.commands import read_rig, read_table
 
 #: Column of a table, factor on its readings, and what is said.
 WRONG = {
-    "m/s": ("speed_mm_s", 1e-3, r"speed_mm_s: readings are about \d+ times too small for this robot; are they in m/s\?"),
+    "m/s": ("speed_mm_s", 1e-3, r"speed_mm_s: about \d+ times too small for this robot; are they in m/s\?"),
     "km/h": ("speed_mm_s", 3.6e-3, r"speed_mm_s: .* too small for this robot; are they in km/h( or m/s)?\?"),
     "rad/s": ("motor_speed_rpm", RPM, r"motor_speed_rpm: .*[89]\.\d times too small .*are they in rad/s\? expected rpm"),
     "of the wheel": ("motor_speed_rpm", 1 / 48, "motor_speed_rpm: .* too small .*rpm of the driving wheel"),
     "mA": ("total_current_A", 1e3, r"total_current_A: .* times too large .*are they in mA\? expected A"),
-    "seven times": ("speed_mm_s", 7.0, r"speed_mm_s: readings are about 6.9 times too large for this robot; check the unit, mm/s"),
+    "seven times": ("speed_mm_s", 7.0, r"speed_mm_s: about 6.9 times too large for this robot; check the unit, mm/s"),
     "g": ("total_mass_kg", 1 / 30, r"total_mass_kg: about 3\d times too small for this robot \(11.5 kg, 13.1 kg and"),
 }  # fmt: skip
 

@@ -172,25 +172,25 @@ REFUSED = {
     "speed of an imposed voltage": (
         "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* give --voltage",
     ),
-    "slope": ("bench", False, "simulate --voltage 9 --slope 5", r"--slope: the robot's load is a shaft"),
-    "payload": ("linear", False, "simulate --voltage 9 --payload 1", r"--payload: the robot's load is a"),
-    "mass": ("bench", False, "simulate --voltage 9 --mass 5", r"--mass: the robot's load is a shaft"),
-    "surface": ("bench", False, "simulate --voltage 9 --surface x", r"--surface: the robot's load is a"),
+    "slope": ("bench", False, "simulate --voltage 9 --slope 5", r"--slope: slope, payload, mass and surface do not act on a shaft"),
+    "payload": ("linear", False, "simulate --voltage 9 --payload 1", r"--payload: slope, payload, mass"),
+    "mass": ("bench", False, "simulate --voltage 9 --mass 5", r"--mass: slope, payload, mass"),
+    "surface": ("bench", False, "simulate --voltage 9 --surface x", r"--surface: slope, payload, mass"),
     "battery": ("bench", False, "simulate --battery", r"--battery: the robot's file has no battery"),
     "battery of an imposed speed": ("bench", True, "simulate --battery", r"--battery: the motors' speed is imposed"),
     "a pendulum's steady state": ("pendulum", False, "simulate --voltage 3", r"arm .* has no steady state"),
     "a pendulum's profile": (
-        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm, whose gravity load varies with its angle",
+        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm, which profiles do not cover",
     ),
     "an imposed speed's profile": (
         "bench", True, "simulate --profile shuttle", r"--profile: the motors' speed is imposed on this robot",
     ),
     "a shaft's travel": (
-        "bench", False, "simulate --voltage 9 --profile shuttle", r"shuttle.*load is a shaft",
+        "bench", False, "simulate --voltage 9 --profile shuttle", r"shuttle.*do not act on a shaft",
     ),
     "no axis": ("bench", False, "sweep", r"--voltages: not given, .* give it \[V\], such as --voltages 6,12,24"),
     "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not given, .* --motor-speeds 1000,2000"),
-    "axis of slopes": ("bench", False, "sweep --voltages 9 --slopes 0,5", r"--slopes: the robot's load"),
+    "axis of slopes": ("bench", False, "sweep --voltages 9 --slopes 0,5", r"--slopes: slope, payload, mass"),
     "axis of voltages": ("wheeled", True, "sweep --voltages 9", r"--voltages: the motors' speed is imposed"),
     "picture": ("bench", False, "render x.png --voltage 9", r"render: the robot's load is a shaft"),
     "picture of an imposed speed": (
@@ -201,10 +201,10 @@ REFUSED = {
         r"--model track: rover\.inertia: got 0; expected the inertia",
     ),
     "running gear of a bench": (
-        "bench", False, "simulate --voltage 9 --model track", r"--model track: the robot's load is a shaft",
+        "bench", False, "simulate --voltage 9 --model track", r"--model track: a shaft has no running gear",
     ),
     "resonance": ("bench", False, "resonance", r"resonance: the robot's load is a shaft"),
-    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft, without wheels"),
+    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft"),
     "the paper's figures": ("bench", False, "reproduce", r"reproduce: the robot's load is a shaft"),
     "steepest slope": (
         "bench", False, "sensitivity --voltages 9 --outputs steepest_slope",
@@ -219,7 +219,7 @@ REFUSED = {
     ),
     "sensitivity": ("bench", False, "sensitivity", r"--voltages: not given"),
     "varied slope": (
-        "bench", False, "sensitivity --voltages 9 --vary slope_deg=0:5", r"--vary slope_deg: the robot's lo",
+        "bench", False, "sensitivity --voltages 9 --vary slope_deg=0:5", r"--vary slope_deg: slope, payload",
     ),
 }  # fmt: skip
 
@@ -294,7 +294,7 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     plan.write_text(f'robot = "{rig.name}"\n[axes]\n"bench.loss_coulomb" = [0.05, 0.07]\n')
     ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not given")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nslope_deg = [0, 5]\n[conditions]\nmotor_speed = 100.0\n')
-    ends(mmrjax("sweep", plan), "plan.toml, slope_deg: the robot's load is a shaft")
+    ends(mmrjax("sweep", plan), "plan.toml, slope_deg: slope, payload, mass and surface do not act on a shaft")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nvoltage = [9, 12]\n')
     ends(mmrjax("sweep", plan), "the robot's file imposes the motor speed")
 

@@ -281,12 +281,13 @@ def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
     runs = read(tmp_path, f"run_id,time_s,supply_voltage_V,total_current_A\n{rows}", bench("voltage"))
     assert runs["time_s"].tolist() == [0.0, 0.0, 0.5, 0.25, 0.0]
     assert any(
-        n.startswith("runs.csv: time_s begins at 3600.25 in run a. Time is counted from the first row")
-        for n in runs.notes
+        n.startswith("runs.csv: time_s begins at 3600.25 in run a, and counts from the first row") for n in runs.notes
     )
     slow = "time_min,supply_voltage_V,total_current_A\n60,12,0.4\n60.5,12,0.4\n"
     runs = read(tmp_path, slow, bench("voltage"))
-    assert runs["time_s"].tolist() == [0.0, 30.0] and any("time_min begins at 60. Time is" in n for n in runs.notes)
+    assert runs["time_s"].tolist() == [0.0, 30.0] and any(
+        "time_min begins at 60, and counts" in n for n in runs.notes
+    )
     late = "time_s,supply_voltage_V,total_current_A\n60,12,0.4\n-1,12,0.4\n"
     with pytest.raises(BadData, match=r"row 2, time_s: got -1; expected 0 to 1e\+06"):
         read(tmp_path, late, bench("voltage"))
@@ -330,7 +331,7 @@ def test_a_unit_in_a_columns_name_is_converted_or_refused(tmp_path):
 def test_a_row_of_units_below_the_header_is_read(tmp_path):
     robot = of_torque()
     runs = read(tmp_path, "motor_speed_rpm,M,note\n[rpm],N·m,\n900,4,x\n1800,5,y\n", robot)
-    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "is units" in runs.notes[0]
+    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "units" in runs.notes[0]
 
 
 @pytest.mark.parametrize("above", ["# made by logger\n# on a bench, of 2 motors\n\n", "# made, by logger\n# "])
@@ -506,7 +507,7 @@ def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
     columns = {"supply_voltage_V": np.array([6.0, 9, 12, 24])}
     runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=columns["supply_voltage_V"]), columns)
     off = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] * np.pi / 30})
-    with pytest.raises(BadData, match=r"motor_speed_rpm: readings are about .* are they in rad/s"):
+    with pytest.raises(BadData, match=r"motor_speed_rpm: about .* are they in rad/s"):
         check_ranges(off, robot)
 
 

@@ -265,7 +265,7 @@ def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
 def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
     read_rig(tmp_path, "[battery]\ncurvature = 1e-8\n", "up.toml", notes=(notes := []))
     assert notes == [
-        "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises again once 87.7 % of its "
+        "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises after 87.7 % of its "
         "capacity is taken (capacity_curve: 7920 C)"
     ]
     robot = robot_file.change_robot(

@@ -234,11 +234,11 @@ REFUSED = {
     ),
     "thousands with points": (
         f"{SEMICOLONS}\n6T2A;15;13,1;0;0;2,75;4.800;422",
-        r"runs\.csv, motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected either decimal",
+        r"runs\.csv, motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected decimal",
     ),
     "thousands with commas": (
         f"{SEMICOLONS}\n6T2A;15;13.1;0;0;2.75;4,800;422",
-        r"motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected either decimal",
+        r"motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected decimal",
     ),
     "thousands next to whole numbers": (
         f"{SEMICOLONS}\n6T2A;15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
@@ -246,7 +246,7 @@ REFUSED = {
     ),
     "commas and points in one column": (
         f"{SEMICOLONS}\n6T2A;15;13.1;0;5;2,75;4800;400\n6T2A;33;21.1;8;0;3.2;11590;970",
-        r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected either decimal commas or decimal points",
+        r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected decimal commas or decimal points",
     ),
     "payload above total": (
         f"{HEADER}\n6T2A,15,5,8,5,2.75,4800,400",

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import candidates, discover, search
+from calibration.discovery import candidates, discover, log_simulation, search
 from calibration.discovery.active_set import candidate_space
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
@@ -108,14 +108,14 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
 def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
     found = dataclasses.replace(RANKING, parameters={"motor.inertia": (2.5e-4, 1e-6)})
     assert words.regression_verdict(found) == (
-        "regression only, not confirmed by simulation: perhaps a loss torque that changes with speed is "
+        "regression only, not confirmed: perhaps a loss torque that changes with speed is "
         "missing (churning). Parameters [SI]: motor.inertia 0.00025 ± 1e-06"
     )
     assert words.regression_verdict(dataclasses.replace(found, effects=(), parameters={})).endswith(
         "no effect explains it"
     )
     nothing = dataclasses.replace(RANKING, missing=False)
-    assert words.regression_verdict(nothing).endswith("simulation: no effect of the library exceeds chance")
+    assert words.regression_verdict(nothing).endswith("not confirmed: no effect of the library exceeds chance")
 
 
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
@@ -151,7 +151,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     assert code == 3 and "Strongest alone: churning\n" in err  # at once
     assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
-    assert "regression only, not confirmed by simulation: perhaps a loss torque that changes" in err
+    assert "regression only, not confirmed: perhaps a loss torque that changes" in err
     left = read_json(tmp_path / "found.partial/screening.json")
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
@@ -219,7 +219,7 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
     """An encoder that wrapped left 57 % of its rms, and an inertia was said to be missing."""
     base, best = SimpleNamespace(cost=100.0), SimpleNamespace(cost=10.0)
     run = SimpleNamespace(
-        space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, contradicts=False,
+        space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, disturbed=False, contradicts=False,
         diagnosis=lambda fit, left: SimpleNamespace(linear=fit),
     )  # fmt: skip
     monkeypatch.setattr(discover, "simulate_models", lambda *_: run)
@@ -242,6 +242,28 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
     assert {found.verdict, other.verdict} == {"undescribed" if missed else "class"}
     assert found.missed == other.missed == (missed_by[id(base)] if missed else ()) and found.run is run
     assert (found.alike is None) == bool(missed) and found.unused == ("angle",) * bool(missed)
+
+
+def test_a_slow_misfit_counts_as_noise_of_a_simulation(space):
+    """With the readings' noise, parameters of EMPS followed a disturbance until they were 15 prior sds off."""
+    random, data = np.random.default_rng(3), space.bare.data
+    residual = random.standard_normal(data.sd.shape)
+    fit = SimpleNamespace(active=None, z=None)
+
+    def of(residual):
+        at = SimpleNamespace(at=lambda *_: (np.append(residual, 9.0),), rows_of=space.bare.observe.rows_of)
+        problem = SimpleNamespace(observe=at, data=data)
+        noisy = SimpleNamespace(
+            weight=space.weight, fit_of=lambda *_: (problem, None, None), with_noise=space.with_noise
+        )
+        return noisy, log_simulation.with_misfit(noisy, fit)
+
+    as_read, noisy = of(residual)
+    assert noisy is as_read
+    for rows in np.asarray(space.bare.observe.rows_of):
+        residual[rows[rows >= 0], 0] += np.repeat(random.standard_normal(9), 99)[: np.sum(rows >= 0)] * 5
+    noisy = of(residual)[1].bare.data.sd / data.sd
+    assert np.all(noisy[:, 1] == 1) and np.all(noisy[:, 0] > 6)
 
 
 @pytest.fixture(scope="module")

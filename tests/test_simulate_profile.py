@@ -177,8 +177,8 @@ def test_battery_that_ends_in_the_mission_is_said(mmrjax, tmp_path):
 
 #: Profile and options, exit code, and the sentence.
 REFUSED = {
-    "mission.csv --model steady": (2, r"--profile has an effect only with --model drive, which simulates a profile; got --model steady"),
-    "mission.csv --model track": (2, r"got --model track"),
+    "mission.csv --model steady": (2, r"--profile has an effect only with --model drive; got steady"),
+    "mission.csv --model track": (2, r"got track"),
     "mission.csv --duration 5": (2, r"--duration cannot be combined with --profile"),
     "mission.csv --posterior 50": (2, r"--posterior cannot be combined with --profile"),
     "mission.csv --slope 0": (2, r"--slope: mission.csv contains slope_deg too"),

@@ -144,7 +144,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 11)
     code, out, said = mmrjax(*grid, "--out", "large")
     assert code == small and out.splitlines()[-1] == "large"
-    assert "12 points: too many for runs.csv (limit 11), so results go to results.zarr" in said
+    assert "12 points: too many for runs.csv (11), see results.zarr" in said
     assert "--export csv" in said
     left = {f.name for f in (tmp_path / "large").iterdir()}
     assert left == {
@@ -793,7 +793,7 @@ def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch,
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     many = CONFIG.replace("number = 50", "number = 20000000").replace("chunk = 40", "chunk = 100000")
     for dry in ([], ["--dry-run"]):
-        ends(sweep("s", *dry, config=many), "the results would take 3.4 GB (uncompressed)", "has 1 GB free")
+        ends(sweep("s", *dry, config=many), "results need 3.4 GB (uncompressed)", "has 1 GB free")
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 

@@ -305,11 +305,11 @@ REFUSED = {
     "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
                   "column motor_speed_rpm in addition to motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
     "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
-                "column motor_current_l_A: the two sides must be called left and right; rename it to motor_current_left_A"),
+                "column motor_current_l_A: the sides are called left and right; rename it to motor_current_left_A"),
     "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,
                  r"rename it to motor_current_left_A, or set \[columns\]"),
     "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
-                          "column duty_L: the two sides must be called left and right; rename it to duty_left"),
+                          "column duty_L: the sides are called left and right; rename it to duty_left"),
     "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),
                          r"row 4, yaw_rate_rad_s: got -0.9 although .* at -1500 and 1500 rpm \(as in 5 of 5 rows\); "
                          "expected a positive value if the right side is faster"),

@@ -133,6 +133,6 @@ def test_a_propeller_has_a_load_with_the_square_of_speed_and_a_law_of_the_driver
     assert unseen["total_current"]["rms_percent"] < 6 and unseen["motor_speed"]["rms_percent"] < 8
     assert "order" not in found["statement"]
     notes = "".join(capsys.readouterr())
-    assert "0 in rows 1, 2, 3, 4, 5, 6, 7, 8 although the current is that of a turning motor" in notes
-    listed, more = re.search(r"rows ([\d, ]+) and (\d+) more: the readings no longer change", notes).groups()
+    assert "0 in rows 1, 2, 3, 4, 5, 6, 7, 8 although the current is a turning motor's" in notes
+    listed, more = re.search(r"rows ([\d, ]+) and (\d+) more: readings no longer change", notes).groups()
     assert len(listed.split(",")) + int(more) == 16

@@ -377,7 +377,7 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, header, row, says):
 def test_what_cannot_change_within_a_run_is_refused(runs):
     nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
     other = np.where(np.arange(len(runs)) % 2, "6T2A", "4W2T")
-    with pytest.raises(BadData, match=r"configuration: run coasting has several values; a run has one configuration"):
+    with pytest.raises(BadData, match=r"configuration: run coasting has several values; give each its own run_id"):
         Histories.check(changed(runs, configuration=other), nothing)
     mass = 11.5 + runs["payload_kg"] + 0.5 * (runs["time_s"] > 1)
     with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg apart from its payload"):
@@ -388,7 +388,7 @@ def test_what_cannot_change_within_a_run_is_refused(runs):
 
 def test_speeds_without_a_sign_are_refused_where_a_run_is_driven_backward(runs):
     nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
-    with pytest.raises(BadData, match=r"motor_speed_rpm: got .* rpm at -15 V; expected readings with a sign"):
+    with pytest.raises(BadData, match=r"motor_speed_rpm: got .* rpm at -15 V; expected negative readings"):
         Histories.check(changed(runs, motor_speed_rpm=np.abs(runs["motor_speed_rpm"])), nothing)
 
 
