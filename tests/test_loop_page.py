@@ -31,6 +31,7 @@ from calibration.discovery.result import (
     WorseChannel,
 )
 from calibration.discovery.settings import WITHOUT_NAME
+from calibration.inference.fit_notes import Remark
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words
 from mmrjax.model import channels
@@ -388,6 +389,18 @@ def test_the_head_of_a_page_is_read_in_a_minute(shown, capsys):
     text = shown("churning", capsys).text
     head = text[text.index("<h1>") : text.index('<nav id="contents"')]
     assert len(re.sub(r"<table.*?</table>|<svg.*?</svg>|<[^>]+>", " ", head, flags=re.S).split()) <= 120
+
+
+def test_a_run_that_is_different_is_checked_before_another_experiment():
+    test = NameTest("cogging", 7.1, 3.7, (), 0.0, 4, changed="bench.inertia", root_changed=15.8)
+    remark = Remark("run_differs", test=test)
+    steps = [
+        loop_report._next_step(
+            SimpleNamespace(headline=SimpleNamespace(level=level), remarks=(remark,), next_experiment=None), ""
+        )
+        for level in ("place", "class")
+    ]
+    assert steps[0].startswith("A different bench.inertia in run 4 explains 15.8 σ") and "run 4" not in steps[1]
 
 
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):

@@ -215,8 +215,8 @@ SAMPLES = [
     *(Remark("unshown", source="log.csv", why=why.value) for why in MissingStates),
     Remark("outstanding", factors=(0.5, 2.0), word="assumed"),
     Remark("lost_replicates", settled=400, asked=500),
-    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="motor.inertia", root_changed=11.2)),
-    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="track", root_changed=11.2)),
+    Remark("run_differs", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="motor.inertia", root_changed=11.2)),
+    Remark("run_differs", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, changed="track", root_changed=11.2)),
     Remark(
         "rests_on",
         test=NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),

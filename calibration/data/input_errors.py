@@ -105,17 +105,18 @@ def stated_names(value: Any, where: str, expected: str, least: int = 1) -> Names
     return tuple(value)
 
 
-def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -> str:
+def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "", most: int = 1) -> str:
     """Returns a word of a file or an argument after checking that it is known.
 
     Args:
         wrong: beginning of the message about an unknown word. Empty: the message quotes the word.
+        most: largest number of suggestions.
 
     Raises:
         BadConfiguration: an unknown word. The message lists the nearest ones.
     """
     if not isinstance(value, str) or value not in known:
-        raise BadConfiguration(f"{where}: {wrong or f'got {value}'}; {allowed_words(str(value), known)}")
+        raise BadConfiguration(f"{where}: {wrong or f'got {value}'}; {allowed_words(str(value), known, most)}")
     return value
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from calibration.data import Columns, Names
 from calibration.data.contradictions import reason_without_stance
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import outputs as table_of_outputs
@@ -99,10 +99,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                     f"--outputs {name}: the robot travels straight; drive its sides differently, e.g. --vary "
                     f"{OF_SIDES[0]}=0.2:0.8"
                 )
-            if name not in outputs:
-                raise BadConfiguration(
-                    f"--outputs {name}: no such output; {allowed_words(name, [*outputs, 'start'])}"
-                )
+            stated_word(name, [*outputs, "start"], f"--outputs {name}", "no such output")
             if (row := outputs[name]) in derived.OF_GROUND and not robot.has_ground:
                 raise BadConfiguration(f"--outputs {name}: the robot's load is a shaft, which has no ground")
             if lacking := robot.unknown(row.rests_on):

@@ -821,11 +821,7 @@ def sentence_on_single_run(
     axis: str = "",
     beside: tuple[float, ...] = (),
 ) -> str:
-    """Sentence on an effect that depends on one row, or that one different run explains as well."""
-    if test.changed:
-        explained = f"explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ"
-        different = _changed_constant(test.changed, test.row)
-        return f"{different} {explained}. Check what was different in that run, or repeat it"
+    """Sentence on an effect that depends on one row."""
     place_words = _conditions(conditions)
     row = f"row {test.row}{f' ({place_words})' * bool(place_words)}"
     others = (
@@ -835,6 +831,13 @@ def sentence_on_single_run(
         f"{test.effect} depends on row {test.row} alone ({test.root:.1f} σ with it, "
         f"{test.root_without:.1f} σ without). Repeat {row}, and {others}"
     )
+
+
+def sentence_on_different_run(test: loop_notes.NameTest) -> str:
+    """Sentence on a run of a log that is just different, with the effect that explains less."""
+    different = _changed_constant(test.changed, test.row)
+    explained = f"explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ"
+    return f"{different} {explained}. Check what was different in that run, or repeat it"
 
 
 def unwritten_reason(curve: bool, gain: float, se: float) -> str:
@@ -874,6 +877,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "too_few_replicates": "{settled} bootstrap tables are too few for some evidence. Use --replicates 500",
     "rests_on": sentence_on_single_run,
+    "run_differs": sentence_on_different_run,
     "contradicted": (
         "a simulation explains {gained:.0%} of the misfit, not {promised:.0%} as the equations do, so the claim "
         "is one level lower"

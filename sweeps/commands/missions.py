@@ -48,7 +48,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     file = load_robot(config)
     robot = file.robot
     if robot.rig.imposed != "voltage":
-        imposed_words = imposed.SAID[robot.rig.imposed].words
+        imposed_words = imposed.IMPOSED_WORDS[robot.rig.imposed].words
         raise BadConfiguration(
             f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the voltage; "
             'simulate a table, or set imposed = "voltage" in the robot\'s file'

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from calibration.data import Names
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.robot_file import RobotFile
 from mmrjax.effects import Effect
 from mmrjax.model import balances, contact, params
@@ -197,11 +197,8 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     """
     robot = file.robot
     name = robot.configurations.names[0] if configuration is None else configuration
-    if name not in robot.configurations:
-        raise BadConfiguration(
-            f"--configuration: got {name}; the robot has no such configuration; "
-            f"{allowed_words(name, robot.configurations)}"
-        )
+    wrong = f"got {name}; the robot has no such configuration"
+    stated_word(name, robot.configurations, "--configuration", wrong)
     if robot.unlike:
         raise BadConfiguration(
             f"{file.name}: {', '.join(robot.unlike)} makes the sides differ, but an export is one drive; export "

@@ -18,7 +18,6 @@ from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import (
     SEEDS,
     BadConfiguration,
-    allowed_words,
     stated_count,
     stated_number,
     stated_word,
@@ -164,10 +163,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
 
 def _known_axis(name: str, robot: Robot, where: str) -> Axis:
     names = variation.variable_names(robot)
-    if name not in names:
-        raise BadConfiguration(
-            f"{where}: neither a parameter of the robot nor a condition; {allowed_words(name, names, 3)}"
-        )
+    stated_word(name, names, where, "neither a parameter of the robot nor a condition", 3)
     return variation.Variation(robot, (name,)).axes[name]
 
 
@@ -249,9 +245,8 @@ def _fixed_conditions(stated: Json, robot: Robot, where: str) -> tuple[dict[str,
         place = f"{where}.{name}"
         stated_word(name, allowed, place, "no such condition")
         if name == SURFACE:
-            if not isinstance(value, str) or (value not in SURFACES and robot.rig.scales_adhesion):
-                raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")
-            surface = str(value)
+            is_label = isinstance(value, str) and not robot.rig.scales_adhesion
+            surface = value if is_label else stated_word(value, SURFACES, place, f"got {value!r}")
         elif name == CONFIGURATION:
             fixed[name] = _configuration(value, robot, place)
         else:

@@ -37,7 +37,7 @@ class ImposedWords:
     several: str
 
 
-SAID = {
+IMPOSED_WORDS = {
     "voltage": ImposedWords("voltage", "V", "voltage_limit", "12", "6,12,24"),
     "motor_speed": ImposedWords("motors' speed", "rpm", "speed_limit", "3000", "1000,2000"),
     "motor_current": ImposedWords("motors' current", "A", "current_limit", "2", "0.5,1,2"),
@@ -70,7 +70,7 @@ def imposed_default(robot: Robot, option: str) -> float:
         return VOLTAGE
     limit = imposed_limit(robot)
     if limit is None:
-        raise BadConfiguration(_missing_limit_message(robot, option, SAID[robot.rig.imposed].one))
+        raise BadConfiguration(_missing_limit_message(robot, option, IMPOSED_WORDS[robot.rig.imposed].one))
     return limit if robot.rig.imposed == "voltage" else _digits(limit)
 
 
@@ -79,7 +79,7 @@ def imposed_example(robot: Robot) -> float:
     try:
         return imposed_default(robot, "")
     except BadConfiguration:
-        return float(SAID[robot.rig.imposed].one)
+        return float(IMPOSED_WORDS[robot.rig.imposed].one)
 
 
 def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[float, ...]:
@@ -95,7 +95,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
         return VOLTAGES_V
     limit = imposed_limit(robot)
     if limit is None:
-        raise BadConfiguration(_missing_limit_message(robot, option, SAID[robot.rig.imposed].several))
+        raise BadConfiguration(_missing_limit_message(robot, option, IMPOSED_WORDS[robot.rig.imposed].several))
     levels = tuple(_digits(share * limit) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
@@ -106,11 +106,11 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
 
 
 def _robot_phrase(robot: Robot) -> str:
-    return SAID[robot.rig.imposed].limit
+    return IMPOSED_WORDS[robot.rig.imposed].limit
 
 
 def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
-    unit = SAID[robot.rig.imposed].unit
+    unit = IMPOSED_WORDS[robot.rig.imposed].unit
     if robot.rig.imposed == "motor_current":  # not limited by files
         return f"{option}: not given; give it [{unit}], such as {option} {example}"
     return (
@@ -122,7 +122,7 @@ def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Reason for rejecting an option for a quantity that is not imposed."""
-    reason = SAID[robot.rig.imposed]
+    reason = IMPOSED_WORDS[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
         return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
     return f"{option}: the voltage is imposed on this robot, and the motor speed follows; give {instead} [V]"
@@ -149,7 +149,7 @@ def check_battery(robot: Robot) -> None:
         BadConfiguration: the motor speed is imposed, or the file states no battery.
     """
     if robot.rig.imposed != "voltage":
-        imposed_words = SAID[robot.rig.imposed].words
+        imposed_words = IMPOSED_WORDS[robot.rig.imposed].words
         raise BadConfiguration(
             f"--battery: the {imposed_words} is imposed on this robot, regardless of the supply; remove --battery"
         )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Json, profiles
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax import __version__, fidelities
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS, Variation
@@ -51,8 +51,8 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
     if name_clashes:
         raise BadConfiguration(f"{where}, outputs: got {name_clashes[0]}, which is varied; expected outputs of a run")
     task = task_of_configuration(config, robot, profile is not None and profile.turns)
-    if unknown := [name for name in config.outputs if name not in task.attributes]:
-        raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {allowed_words(unknown[0], task.attributes, 3)}")
+    for name in config.outputs:
+        stated_word(name, task.attributes, f"{where}, outputs", most=3)
     rests = {**{o.name: o.rests_on for o in outputs.output_table(robot.channels)}, **capabilities.RESTS_ON}
     for name in config.outputs:
         if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:

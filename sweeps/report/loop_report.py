@@ -189,6 +189,9 @@ def held_out_table(found: DiscoveryResult) -> Table:
 def _next_step(found: DiscoveryResult, more: str) -> str:
     """What to do next. `more`: text after the name and description of an experiment."""
     after = found.next_experiment
+    different = remarks_with_codes(found.remarks, "run_differs")
+    if different and found.headline.level not in ("named", "class"):
+        return as_paragraph(map(describe, different))
     if after is not None and after.name == NONE:
         return f"{after.description}."
     if after is not None:
