@@ -64,7 +64,7 @@ RATINGS = {
         0.0,
         1e3,
         "s",
-        "permitted time of a cell below its cut-off, since a start draws more current; assumed",
+        "permitted time of a cell below its cut-off; assumed",
     ),
     "battery.current_limit": (1e-3, 1e4, "A", "largest discharge current of a cell; not stated: no limit"),
     "battery.current_charge": (0.0, 1e4, "A", "largest charging current of a cell; not stated: no limit"),
