@@ -447,9 +447,7 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
     contact_geometry = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
-    (sunk, pitch), _ = root(
-        unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None, False
-    )
+    (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None)
     stays_upright = tipping_margin(run) > 0
     q = placed(turned, axle - jnp.where(stays_upright, sunk, 0.0), jnp.where(stays_upright, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
