@@ -87,7 +87,7 @@ def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
     """Parameters that a rig file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
     bare = blank_robot(robot.configurations, rig=robot.rig)
-    nothing, stated_parameters = {p.name: float(p.value) for p in params.walk_parameters(bare)}, []
+    nothing, stated_parameters = params.values_by_name(bare), []
     for p in params.walk_parameters(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations
@@ -105,7 +105,7 @@ def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
 
 def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
     """Parameters of `robot` that differ from the nominal robot's: name, both values, unit, meaning."""
-    base = {p.name: float(p.value) for p in params.walk_parameters(nominal)}
+    base = params.values_by_name(nominal)
     return [
         (p.name, float(p.value), base.get(p.name, "not in the paper's model"), p.spec.unit, p.spec.meaning)
         for p in params.walk_parameters(robot)

@@ -552,7 +552,7 @@ def run_identity(command: str, config: RobotPart, robot: Robot, runs: Runs | Non
         "command": command,
         "program": f"{source_hash()}, {jax.default_backend()}",
         "config": config.model_dump(exclude={"report", "table"}),
-        "robot": {p.name: float(p.value) for p in params.walk_parameters(robot)},
+        "robot": params.values_by_name(robot),
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [sha256_hex(Path(file).read_bytes()) for file in config.effects],
     }

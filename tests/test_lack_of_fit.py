@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.signal import lfilter
 from synthetic import table
 from worlds import settled, tables
 
@@ -16,7 +17,7 @@ from calibration.inference import lack_of_fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import AdequacyFinding
 from calibration.inference.lack_of_fit import Residuals, adequacy_of_residuals
-from calibration.inference.noise_factor import noise_factors, noise_remarks
+from calibration.inference.noise_factor import noise_factors, noise_remarks, variance_of_sums
 from calibration.inference.observers import SettledRuns
 from calibration.inference.simulation_errors import root_mean_square
 from mmrjax.model import params
@@ -181,6 +182,15 @@ def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
 def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():
     assert noise_remarks(toy(np.random.default_rng(9))) == []
     assert noise_factors(toy(np.random.default_rng(10), missing=4.0)) == {}
+
+
+def test_variance_of_sums_is_that_of_the_slowest_part():
+    """An autoregression has (1 + r) / (1 - r) times its own variance at frequency 0."""
+    white = np.random.default_rng(11).standard_normal((2, 20_000))
+    slow = lfilter([0.6], [1, -0.8], white, axis=1)
+    assert variance_of_sums(list(white)) == 1.0
+    assert variance_of_sums(list(slow)) == pytest.approx(9.0, rel=0.15)
+    assert variance_of_sums(list(3 * slow)) == pytest.approx(81.0, rel=0.15)
 
 
 @pytest.mark.slow

@@ -133,7 +133,7 @@ def test_units_of_a_log_reach_each_joint(tmp_path):
         return loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)["elbow"]
 
     table = runs("s,V,V,A,A,deg,deg")
-    assert any("is units" in note for note in table.notes)
+    assert any("contains units" in note for note in table.notes)
     assert_allclose(np.median(table["motor_current_sd_A"]), 0.01, rtol=0.1)
     milli = [
         ",".join(x if k != 4 else f"{1e3 * float(x):.9g}" for k, x in enumerate(line.split(","))) for line in lines

@@ -197,8 +197,8 @@ def test_a_mass_that_varies_is_said_and_its_median_written(robot):
     runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
     (said, _) = own_mass.mass_notes(robot, runs)
     assert said == (
-        "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. The fit used the mass of each row. "
-        "robot.toml contains the median, 14.35 kg, and does not reproduce the fit in rows with another mass"
+        "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. robot.toml contains "
+        "the median, 14.35 kg, so it does not reproduce the fit in other rows"
     )
     assert float(own_mass.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
 
@@ -228,7 +228,7 @@ def test_a_mass_that_no_robot_has_is_refused(robot):
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
     says = (
-        r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column, otherwise remove the prior"
+        r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
     )
     with pytest.raises(BadConfiguration, match=says):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})

@@ -204,7 +204,7 @@ WRONG = {
     "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 in addition to duty_left; expected one demand per row"),
     "yaw rate without a speed": ("time_s,yaw_rate_rad_s,duty\n0,1,1\n5,1,1\n", r"got yaw_rate_rad_s without speed_mm_s; expected a demanded ground speed"),
     "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the demanded yaw rate, 0 for straight travel"),
-    "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate needs a demanded speed, but this row has mode brake"),
+    "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate needs a demanded speed, not mode brake"),
     "setting twice": ("# cycles = 4\n# cycles = 4\ntime_s,duty\n0,1\n5,1\n", r"cycles is set twice"),
 }  # fmt: skip
 

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import active_set, candidates, discover, findings, screening, standing
+from calibration.discovery import active_set, candidates, discover, findings, score_tests, screening, standing
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
 from calibration.inference.observers import Histories, windows
@@ -25,7 +25,9 @@ SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
 SETTINGS = settings_for(Histories, 333)
 
 
-def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False):
+def log(
+    seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0
+):
     """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
 
     Args:
@@ -33,12 +35,14 @@ def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0
         forward: friction is larger by this share forward, smaller backward. sticks: larger by it at rest, and falls over 60 rad/s.
         rough: friction of the third run alone is larger by this share.
         swings: the voltage swings, and is held from row to row.
+        slow: sd of a torque that nobody knows and that changes every 0.4 s [N·m].
     """
     rng = np.random.default_rng(seed)
     levels = np.where(np.arange(5) % 2, rng.uniform(1.2, 4.0, (4, 5)), rng.uniform(4.0, 24.0, (4, 5)))
     volts = np.repeat(levels * rng.choice([-1.0, 1.0], (4, 5)), ROWS // 5, axis=1)
     if swings:
         volts = 13 * np.sin(np.arange(ROWS) * EVERY * np.array([[7.0], [9.0], [11.0], [5.0]])) + 4
+    unknown = np.repeat(slow * np.random.default_rng(seed + 99).standard_normal((4, 5)), ROWS // 5, axis=1)
     acts = np.concatenate([np.zeros((4, late)), volts], 1)[:, :ROWS]
     current, speed, shown = np.zeros(4), np.zeros(4), []
     for n in range(ROWS):
@@ -51,7 +55,7 @@ def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0
                 * (1 + rough * (np.arange(4) == 2) + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60))
                 * np.tanh(speed / 0.05)
             )
-            torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed
+            torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed + unknown[:, n]
             speed = speed + STEP * torque / 2.4e-4
     current, speed = (np.array(x).T for x in zip(*shown, strict=True))
     return {
@@ -181,6 +185,15 @@ def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered
         :, list(space.library.of).index(space.library.names.index("torque_offset"))
     ]
     assert abs(column @ offset) > 0.999 * np.linalg.norm(column) * np.linalg.norm(offset) > 0
+
+
+def test_a_torque_that_changes_slowly_does_not_look_like_an_effect(answered):
+    """As white noise of its windows, it gave an effect 3.0 sds."""
+    space = answered.space_of(seed=5, slow=0.01)
+    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
+    posed, _ = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    scores = np.abs(np.asarray(score_tests.score_tests(posed.observe.linear, ()).single))
+    assert 0 < scores.max() < 2.0
 
 
 @pytest.mark.slow

@@ -331,7 +331,7 @@ def test_a_unit_in_a_columns_name_is_converted_or_refused(tmp_path):
 def test_a_row_of_units_below_the_header_is_read(tmp_path):
     robot = of_torque()
     runs = read(tmp_path, "motor_speed_rpm,M,note\n[rpm],N·m,\n900,4,x\n1800,5,y\n", robot)
-    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "units" in runs.notes[0]
+    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "contains units" in runs.notes[0]
 
 
 @pytest.mark.parametrize("above", ["# made by logger\n# on a bench, of 2 motors\n\n", "# made, by logger\n# "])

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import candidates, discover, search
+from calibration.discovery import candidates, discover, log_simulation, search
 from calibration.discovery.active_set import candidate_space
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
@@ -219,7 +219,7 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
     """An encoder that wrapped left 57 % of its rms, and an inertia was said to be missing."""
     base, best = SimpleNamespace(cost=100.0), SimpleNamespace(cost=10.0)
     run = SimpleNamespace(
-        space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, contradicts=False,
+        space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, disturbed=False, contradicts=False,
         diagnosis=lambda fit, left: SimpleNamespace(linear=fit),
     )  # fmt: skip
     monkeypatch.setattr(discover, "simulate_models", lambda *_: run)
@@ -242,6 +242,28 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
     assert {found.verdict, other.verdict} == {"undescribed" if missed else "class"}
     assert found.missed == other.missed == (missed_by[id(base)] if missed else ()) and found.run is run
     assert (found.alike is None) == bool(missed) and found.unused == ("angle",) * bool(missed)
+
+
+def test_a_slow_misfit_counts_as_noise_of_a_simulation(space):
+    """With the readings' noise, parameters of EMPS followed a disturbance until they were 15 prior sds off."""
+    random, data = np.random.default_rng(3), space.bare.data
+    residual = random.standard_normal(data.sd.shape)
+    fit = SimpleNamespace(active=None, z=None)
+
+    def of(residual):
+        at = SimpleNamespace(at=lambda *_: (np.append(residual, 9.0),), rows_of=space.bare.observe.rows_of)
+        problem = SimpleNamespace(observe=at, data=data)
+        noisy = SimpleNamespace(
+            weight=space.weight, fit_of=lambda *_: (problem, None, None), with_noise=space.with_noise
+        )
+        return noisy, log_simulation.with_misfit(noisy, fit)
+
+    as_read, noisy = of(residual)
+    assert noisy is as_read
+    for rows in np.asarray(space.bare.observe.rows_of):
+        residual[rows[rows >= 0], 0] += np.repeat(random.standard_normal(9), 99)[: np.sum(rows >= 0)] * 5
+    noisy = of(residual)[1].bare.data.sd / data.sd
+    assert np.all(noisy[:, 1] == 1) and np.all(noisy[:, 0] > 6)
 
 
 @pytest.fixture(scope="module")

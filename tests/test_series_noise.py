@@ -197,6 +197,14 @@ def test_noise_of_a_log_is_that_of_its_readings_over_time(thinned):
     assert_allclose(known.sd[0, :2], [0.01, 0.3], rtol=0.15)
 
 
+def test_noise_of_a_position_or_an_angle_has_no_floor():
+    """An error of its scale is no noise of each reading. On EMPS, 0.1 % of the position is 6000 times its noise."""
+    sizes = np.array([0.25])
+    for name, floor in (("position", 0.0), ("output_angle", 0.0), ("motor_speed", series_noise.FLOOR)):
+        estimate = series_noise.SeriesNoise(channels.find_channel(name), 2.5e-8, 0.0, 100.0, "time_s", 1)
+        assert_allclose(estimate.sd(sizes), np.maximum(2.5e-8, floor * sizes))
+
+
 def test_noise_of_a_log_whose_dry_friction_reverses_is_not_that_of_its_jumps():
     """Each jump changes two differences by 4 of their sds. With differences up to five sds, a log at imposed speed had 1.22 of its noise."""
     time, random = np.arange(0.0, 4.0, 0.005), np.random.default_rng(6)

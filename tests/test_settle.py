@@ -207,7 +207,7 @@ BAD = {
     ),
     "frozen": (
         lambda c: c | {"motor_speed_rpm": np.full(600, 812.0)},
-        r"rows 1 to 600, motor_speed_rpm: 812 rpm in every row, so the channel is frozen or not connected; remove",
+        r"rows 1 to 600, motor_speed_rpm: 812 rpm in every row: frozen or not connected; remove",
     ),
     "never holds": (
         lambda c: c | {"supply_voltage_V": np.round(12 + 6 * np.sin(8 * c["time_s"]), 5)},
@@ -222,7 +222,7 @@ BAD = {
         ),
         r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of the imposed quantity; give duty the sign",
     ),
-    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V is about zero, so nothing drives the motors. Log rows"),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V is about zero, so nothing drives the motors. Log driven rows"),
     "never settles": (
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
@@ -361,7 +361,7 @@ def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
     columns = {k: v for k, v in both_ways(output_angle_deg=lambda x: 0 * x + 12.5).items() if k != "motor_speed_rpm"}
     robot = bench(tmp_path, columns, '"total_current", "output_angle"')
     with pytest.raises(
-        BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row, so the channel is frozen"
+        BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row: frozen"
     ):
         settled(tmp_path, robot)
 

@@ -109,8 +109,8 @@ def _check_mass(runs: Runs, robot: Robot) -> None:
     for name in np.unique(runs.configurations_named(robot)):
         if name in robot.configurations and float(robot.configurations[str(name)].mass) <= 0:
             raise BadData(
-                f"{runs.source}: no column total_mass_kg, and the robot's file gives no mass for {name}; a "
-                "vehicle needs one of the two"
+                f"{runs.source}: no column total_mass_kg, and the robot's file has no mass for {name}; a vehicle "
+                "needs one of the two"
             )
 
 

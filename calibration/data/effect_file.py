@@ -204,7 +204,7 @@ def _check_effect(path: Path, effect: type[Effect]) -> None:
         or not all(isinstance(c, str) for c in default_configurations)
     ):
         raise refuse(f', configurations: got {configurations!r}; expected a tuple of names such as ("4W2T",)')
-    declared = {p.name: p for p in params.walk_parameters(default)}
+    declared = params.parameters_by_name(default)
     amplitudes = [name for name, p in declared.items() if p.spec.amplitude]
     if amplitudes != ["amplitude"]:
         raise refuse(

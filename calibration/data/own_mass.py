@@ -77,9 +77,8 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
         if high - low > ROUNDING:
             why = "; does total_mass_kg exclude the payload?" if constant else ""
             notes.append(
-                f"{name}: total_mass_kg minus payload_kg varies from {low:.4g} to {high:.4g} kg. "
-                f"The fit used the mass of each row. robot.toml contains the median, {median:.4g} kg, and "
-                f"does not reproduce the fit in rows with another mass{why}"
+                f"{name}: total_mass_kg minus payload_kg varies from {low:.4g} to {high:.4g} kg. robot.toml "
+                f"contains the median, {median:.4g} kg, so it does not reproduce the fit in other rows{why}"
             )
         elif abs(median - mass) > ROUNDING:
             notes.append(
@@ -110,6 +109,6 @@ def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
     for name in stated_masses(robot, runs):
         if f"{name}.mass" in stated:
             raise BadConfiguration(
-                f"--prior {name}.mass: {runs.source} has a column total_mass_kg, which sets the mass of each run; to "
-                "fit the mass, remove that column, otherwise remove the prior"
+                f"--prior {name}.mass: {runs.source} has a column total_mass_kg, which sets the mass of each "
+                "run; remove that column or the prior"
             )

@@ -113,7 +113,7 @@ class Posterior:
         """
         from mmrjax.model import params
 
-        values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+        values = params.values_by_name(robot)
         for name in self.names:
             if name not in values:
                 alike = [n for n in values if n.rpartition(".")[2] == name.rpartition(".")[2]]

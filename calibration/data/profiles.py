@@ -153,8 +153,8 @@ class ProfileTable:
         """
         if battery and PAIRS[1][0] in self.values:
             raise BadConfiguration(
-                f"--battery cannot be combined with {self.source}, which gives voltage_left_V; a battery's "
-                "voltage falls, so give duty_left and duty_right instead"
+                f"--battery cannot be combined with {self.source}, which gives voltage_left_V; give duty_left "
+                "and duty_right instead"
             )
         if battery and "voltage" in self.values:
             raise BadConfiguration(
@@ -431,9 +431,7 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
             shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
         speed, has_yaw_rate = MODES[SPEED], bool(cells.text(YAW_RATE, row))
         if has_yaw_rate and mode != speed and not (cells.linear and mode_before == speed):
-            cells.refuse(
-                YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, but this row has mode {mode}"
-            )
+            cells.refuse(YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, not mode {mode}")
         if cells.has(YAW_RATE) and not has_yaw_rate and mode == speed and (cells.linear or row < len(cells) - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
         if has_yaw_rate:
@@ -484,5 +482,5 @@ def _check_demands(cells: _CellReader, row: int, before: str, mode: str, own: li
     if cells.linear and before in CONTROLLED and before != mode:
         raise BadData(
             f"{cells.source} row {row + 1}: goes from a demanded {before} to a demanded {mode} although "
-            "between_rows is linear; expected one kind of demand, or a row that brakes or coasts in between"
+            "between_rows is linear; expected one kind of demand, or a braking or coasting row between"
         )

@@ -352,7 +352,7 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     Raises:
         BadConfiguration: an sd is given for something that is not a parameter.
     """
-    parameters = {p.name: p for p in params.walk_parameters(robot)}
+    parameters = params.parameters_by_name(robot)
     for name in sds:
         if name not in parameters:
             raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; give the number without it")

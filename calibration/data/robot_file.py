@@ -64,7 +64,7 @@ RATINGS = {
         0.0,
         1e3,
         "s",
-        "permitted time of a cell below its cut-off, since a start draws more current; assumed",
+        "permitted time of a cell below its cut-off; assumed",
     ),
     "battery.current_limit": (1e-3, 1e4, "A", "largest discharge current of a cell; not stated: no limit"),
     "battery.current_charge": (0.0, 1e4, "A", "largest charging current of a cell; not stated: no limit"),
@@ -259,7 +259,7 @@ def _robot_before_parameters(
     robot = dataclasses.replace(robot, controller=controller)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     file_values = dict(_flatten(content))
-    parameters = {p.name: p for p in params.walk_parameters(robot)}
+    parameters = params.parameters_by_name(robot)
     resistance = file_values.get("motor.resistance")
     if isinstance(resistance, int | float):
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
@@ -337,7 +337,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     ratings = {name: _check_setting(where, name, new_values.pop(name)) for name in settings if name in new_values}
     if CURVE & new_values.keys() and "battery.capacity" in new_values:  # scaled to one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", new_values["battery.capacity"])
-    parameters = {p.name: p for p in params.walk_parameters(robot)}
+    parameters = params.parameters_by_name(robot)
     refused: dict[str, list[str]] = {}
     for name, value in new_values.items():
         if why := _refusal_reason(name, value, parameters):
@@ -462,7 +462,7 @@ def _check_pairs(robot: Robot, where: str) -> None:
                 f"expected more than speed_static, {float(friction.speed_static):g} m/s"
             )
     for effect in robot.effects:
-        ends = {p.name: float(p.value) for p in params.walk_parameters(effect)}
+        ends = params.values_by_name(effect)
         if effect.name in effects.UNNAMED and "low" in ends and not ends["low"] < ends["high"]:
             raise BadConfiguration(
                 f"{where}, effects.{effect.name}.high: got {ends['high']:g}; expected more than low, {ends['low']:g}"
@@ -514,10 +514,8 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
     """Table and line of each parameter that a file must state because it differs from the base robot."""
     inherits = robot.rig.inherits
-    start = {p.name: float(p.value) for p in params.walk_parameters(nothing)}
-    needed = rig_file.required_parameters(
-        robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot))
-    )
+    start = params.values_by_name(nothing)
+    needed = rig_file.required_parameters(robot.rig, params.values_by_name(robot).items())
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
         table, _, key = parameter.name.rpartition(".")

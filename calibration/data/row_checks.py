@@ -211,8 +211,11 @@ def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
     )
     if at_rest:
         return (
-            sentence + "A fit keeps the imposed quantity constant in the gap. If rows are missing, set start = "
-            '"measured" in the rig\'s file, so that a new run begins there',
+            sentence
+            + (
+                'A fit keeps the imposed quantity constant there. If rows are missing, set start = "measured" '
+                "in the rig's file to begin a new run"
+            ),
         )
     for part, row in enumerate(jumps):
         after = (np.arange(len(time)) >= row) & (run == run[row])
@@ -355,9 +358,8 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
         sloped = int(np.count_nonzero(slope))
         rows_text = f", as in {sloped} of {len(slope)} rows" if sloped > 1 else ""
         why = (
-            f" in a table of settled turns{rows_text}; expected 0, since on a slope the heading keeps changing and a "
-            "turn never settles. Remove these rows. To simulate such a turn over time: simulate --model drive --left "
-            "--right --slope"
+            f" in a table of settled turns{rows_text}; expected 0, since a turn never settles on a slope. Remove "
+            "these rows. To simulate one: simulate --model drive --left --right --slope"
         )
         check_rows(name, columns, [("slope_deg", slope, why)])
     if not set(layout.sides) & set(columns):
@@ -496,8 +498,8 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
     if copied := [rows for rows in alike.values() if len(rows) > 1]:
         others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
-            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}. "
-            "They count as repeats. Remove copies: they make results look more certain than they are"
+            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and "
+            f"readings{others}. They count as repeats. Remove copies"
         )
     if "run_id" in columns and not set(TIME) & set(columns):
         runs, times = np.unique(columns["run_id"], return_counts=True)

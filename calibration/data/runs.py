@@ -177,8 +177,8 @@ def runs_of_arrays(
     }
     notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
     notes = (*notes, *(
-        f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward. It "
-        "is assumed to show only the magnitude, so magnitudes are compared" for i in unsigned
+        f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward, so "
+        "magnitudes are compared" for i in unsigned
     ))  # fmt: skip
     notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
     if measured and robot is not None:
@@ -257,8 +257,8 @@ def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
         if rows:
             columns[channel.column] = values
             yield (
-                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor. Each "
-                "reading is used once, in its first row"
+                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor, and "
+                "counts once"
             )
 
 

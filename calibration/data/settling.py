@@ -430,8 +430,8 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
             column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
             value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
         raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {column}: {value:g} {unit} in every row, so the channel is "
-            "frozen or not connected; remove the column, or remove the channel from the rig's file"
+            f"{runs.source} rows 1 to {len(runs)}, {column}: {value:g} {unit} in every row: frozen or not "
+            "connected; remove the column, or its channel from the rig's file"
         )
 
 
@@ -925,14 +925,17 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
         )
     imposed = found.runs.layout.imposed_column
     message_of_reason = {
-        "idle": f"{imposed} is about zero, so nothing drives the motors. Log rows in which they are driven, or, if "
-        "another column has the command, name that one under [columns] in the rig file",
+        "idle": (
+            f"{imposed} is about zero, so nothing drives the motors. Log driven rows, or name the column of the "
+            "command under [columns]"
+        ),
         "rest": "no level shows motion above the noise. Use larger commands",
-        "stuck": f"{longest.channel} shows the same number for a long time: saturated or frozen. Repair the "
-        "instrument or change its range",
-        "glitches": f"{longest.channel} has many readings far from the others. Repair the instrument, or log its "
-        "mean",
-        "undriven": "the driver brakes or coasts in every row. Log rows in which it drives the motors",
+        "stuck": (
+            f"{longest.channel} shows one number for a long time: saturated or frozen. Repair the instrument or "
+            "change its range"
+        ),
+        "glitches": f"{longest.channel} has many outlying readings. Repair the instrument, or log its mean",
+        "undriven": "the driver brakes or coasts in every row. Log driven rows",
     }
     return f"{source} {rows}, no settled segment: {message_of_reason[why]}"
 

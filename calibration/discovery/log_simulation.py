@@ -17,6 +17,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.time_histories import HistoriesLinearization
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import channels
@@ -34,12 +35,14 @@ class LogSimulation:
     Attributes:
         space: candidate space of the log.
         base, best: the fits. Equal without effects.
+        disturbed: True if the misfit of the best fit counts as noise, see `with_misfit`.
         promised, gained: share of the misfit that the effects explain in the windows, and in the simulation.
     """
 
     space: CandidateSpace
     base: Candidate
     best: Candidate
+    disturbed: bool
     promised: float
     gained: float
 
@@ -75,6 +78,25 @@ class LogSimulation:
         )
 
 
+def with_misfit(space: CandidateSpace, fit: Candidate) -> CandidateSpace:
+    """Space whose noise includes the misfit of a simulated fit, as far as this exceeds the noise of the readings.
+
+    An unknown disturbance of a drive is integrated, so such a misfit changes slowly. As noise of each reading it has
+    the variance of sums of residuals. Otherwise the parameters would follow it, far from their priors.
+    """
+    problem, z, active = space.fit_of(fit.active, fit.z)
+    observe: Any = problem.observe
+    residual = np.asarray(observe.at(problem, z, active)[0])
+    sd, weight = np.asarray(problem.data.sd), np.asarray(problem.data.weight) > 0
+    by_row = residual[: sd.size].reshape(sd.shape)
+    runs = [rows[rows >= 0] for rows in np.asarray(observe.rows_of)]
+    variance = [
+        variance_of_sums([x[rows][counts[rows]] for rows in runs])
+        for x, counts in zip(by_row.T, weight.T, strict=True)
+    ]
+    return space if max(variance) == 1 else space.with_noise(sd * np.sqrt(variance), space.weight)
+
+
 _memory = functools.partial(compiled, options=SELDOM)(HistoriesLinearization.memory)
 
 
@@ -95,16 +117,20 @@ def refine_by_simulation(
 
 
 def simulate_models(
-    space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings, known: Candidate | None = None
-) -> LogSimulation:
+    space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings, disturbed: bool,
+    known: Candidate | None = None,
+) -> LogSimulation:  # fmt: skip
     """Simulates the base fit and the best fit of a log's linear rows, each refined by a few steps.
 
     Args:
+        disturbed: True if the misfit of the best fit may count as noise.
         known: simulated fit of the base. Its refinement starts there too.
     """
     space = space.with_room([*space.room, *best.effects])
     starts = [] if known is None else [known.z]
     last = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])], settings)
+    if disturbed := disturbed and (noisy := with_misfit(space, last)) is not space:
+        space, last = noisy, refine_by_simulation(noisy, last, [last.z], settings)
     without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
     first = last if best is base else refine_by_simulation(space, base, [base.z, without, *starts], settings)
-    return LogSimulation(space, first, last, 1 - best.cost / base.cost, 1 - last.cost / first.cost)
+    return LogSimulation(space, first, last, disturbed, 1 - best.cost / base.cost, 1 - last.cost / first.cost)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from jaxtyping import Float
 from scipy.special import chdtr, chdtrc
 
 from calibration.inference.fit_notes import Remark
@@ -15,6 +18,8 @@ OFF, IMPROBABLE = 1.25, 0.001
 BEYOND_DOUBT = 0.005
 #: Fewest degrees of freedom of a channel for a test of structure.
 FEWEST = 30
+#: Sds of chance by which a variance exceeds 1.
+CHANCE = 3.0
 #: Largest ratio of the factors of channels, squared, for one common factor.
 ALIKE = 1.3
 
@@ -69,3 +74,18 @@ def noise_remarks(fit: Residuals, source: str = "stated") -> list[Remark]:
             )
         ]
     return [Remark("noise_off", channel=name, factor=factor, source=source) for name, factor in factors.items()]
+
+
+def variance_of_sums(residuals: Sequence[Float[np.ndarray, " rows"]]) -> float:
+    """Variance of sums of consecutive residuals, divided by their number: 1 for white noise of unit variance.
+
+    The sums are over blocks whose length is the root of the number of residuals (batch means, Flegal and Jones, Ann.
+    Stat. 38 (2010) 1034). 1 if the excess is chance.
+
+    Args:
+        residuals: whitened residuals of each run, in order of time.
+    """
+    length = max(int(np.sqrt(sum(map(len, residuals)))), 1)
+    blocks = [b for e in residuals for b in np.array_split(e, max(len(e) // length, 1)) if len(b)]
+    variance = float(np.mean([np.sum(b) ** 2 / len(b) for b in blocks])) if blocks else 1.0
+    return variance if variance > 1 + CHANCE * np.sqrt(2 / len(blocks)) else 1.0

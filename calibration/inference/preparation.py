@@ -18,10 +18,11 @@ from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Notes, Remark
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
-from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, parameters_by_name
+from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.simulation import check_robot
 from mmrjax.model import paper_robots
+from mmrjax.model.params import values_by_name
 from mmrjax.model.robot import Robot
 
 #: Values of a part that makers and scales state, and values of its friction measured on the nominal robot.
@@ -124,9 +125,7 @@ def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> li
     """
     if not robot.rig.inherits:
         return []
-    own_friction, nominal = (
-        {name: float(p.value) for name, p in parameters_by_name(r).items()} for r in (robot, paper_robots.nominal())
-    )
+    own_friction, nominal = map(values_by_name, (robot, paper_robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
     inherited: dict[str, Remark] = {}

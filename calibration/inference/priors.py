@@ -20,7 +20,9 @@ from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
 from mmrjax.model.params import Parameter
+from mmrjax.model.params import parameters_by_name as parameters_by_name
 from mmrjax.model.robot import Robot
+from mmrjax.numerics.one_sided import value_and_slope
 
 #: Free by default in each configuration with rows: friction. The makers' electrical values, the gearbox and motor
 #: losses of Table 2, the ratio and radii and masses stay at the values of their tables.
@@ -166,7 +168,7 @@ class Coordinates(eqx.Module):
 
 @functools.partial(compiled, options=SELDOM)
 def _slope(coordinates: Coordinates, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-    return jax.jvp(coordinates.value, (z,), (jnp.ones_like(z),))[1]
+    return value_and_slope(coordinates.value, z)[1]
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -175,11 +177,6 @@ def _parameter_values(coordinates: Coordinates, z: Float[Array, " parameters"]) 
     theta = coordinates.value(z)
     tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
     return (*params.split_numbers(theta), *params.split_numbers(tied))
-
-
-def parameters_by_name(robot: Robot) -> dict[str, Parameter]:
-    """Parameters of the robot, by dotted name."""
-    return {p.name: p for p in params.walk_parameters(robot)}
 
 
 def friction_names(robot: Robot, configuration: str) -> Names:

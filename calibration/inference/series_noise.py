@@ -64,10 +64,10 @@ class SeriesNoise:
 
     def sd(self, sizes: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """Standard deviation of readings of these sizes [SI]. At least that of rounding, and at least `FLOOR` of the
-        reading. The error of an angle repeats with each turn, so its floor is that of one turn at most.
+        reading, the error of an instrument's scale. That of an angle or a position changes the fitted constants and
+        is no noise.
         """
-        largest = 2 * np.pi if self.channel.unit_si == "rad" else np.inf
-        least = np.maximum(self.least, FLOOR * np.minimum(sizes, largest))
+        least = np.maximum(self.least, FLOOR * sizes * self.channel.settled)
         return np.maximum(np.hypot(self.floor, self.share * sizes), least)
 
 

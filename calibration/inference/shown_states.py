@@ -35,8 +35,9 @@ CORRELATED, LONG, POINTS, FEWEST, APART = 0.35, 16, 32, 9, 0.25
 #: Jump of an imposed quantity as a share of its largest value, and the same for the acceleration of an imposed speed,
 #: with which the current jumps; a time between rows that is a gap, over the usual one.
 JUMP, KINK, GAP = 0.05, 0.3, 3.0
-#: Speed below which a shaft may be at rest: in sds of its reading, and as a share of the largest.
-REST_SD, REST = 5.0, 0.01
+#: Speed below which a shaft may be at rest: in sds of its reading, and as a share of the largest. From 1 %, windows
+#: of EMPS leave twice their variance, and a clean log of an angle has parameters up to 3 posterior sds off.
+REST_SD, REST = 5.0, 0.02
 #: Noise of the slope of an angle, as a share of its usual size; most rows whose slope it is.
 STEEP, STEEPEST = 0.02, 201
 #: Change of a delay from which its effect is extrapolated, at most [rows].

@@ -326,7 +326,18 @@ def _terms_with_derivatives(
     slopes, (values, signals) = jax.vmap(terms_of_point)(rows)
     base = problem.coordinates.robot(problem.base, z)
     memory = memory_by_point(base, rows, signals, effects)
-    entered = jax.vmap(lambda s, m: effect_terms(base, s, effects, m))(signals, memory)
+    angle = rows.angle
+    if plan.angle:  # The integrated readings have noise, which a gain of them would explain.
+        units = jax.vmap(lambda row: _measured_states(plan, base, row, row.shown).unit)(rows)
+        angle = rows.shown[:, plan.motion] / (units * base.gearbox.ratio)
+
+    def entering_terms(signals: Signals, angle: Array, memory: list[Array]) -> Array:
+        read = dataclasses.replace(signals, angle=angle)
+        each = zip(effects, memory, strict=True)
+        terms = [effect_terms(base, read if e.effect.balance == "sensor" else signals, (e,), [m]) for e, m in each]
+        return jnp.concatenate([jnp.zeros(0), *terms])
+
+    entered = jax.vmap(entering_terms)(signals, angle, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
     counts = np.array([len(e.at) for e in effects], int)

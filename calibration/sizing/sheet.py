@@ -297,7 +297,7 @@ def check_requirements(
     for r in asked.each:
         configuration = _configuration_name(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
-        by_name = {p.name: p for p in params.walk_parameters(robot)}
+        by_name = params.parameters_by_name(robot)
         names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
         checked_requirements.append(
             _QuantityOfRobot(
@@ -318,7 +318,7 @@ def check_requirements(
 
 
 def _present_values(held: _QuantityOfRobot) -> np.ndarray:
-    value_of_name = {p.name: float(p.value) for p in params.walk_parameters(held.robot)}
+    value_of_name = params.values_by_name(held.robot)
     return np.array([held.robot.battery.cells if n == CELLS else value_of_name[n] for n in held.names], float)
 
 
@@ -416,7 +416,7 @@ def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[P
         )
     )
     slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
-    by_name = {p.name: p for p in params.walk_parameters(held.robot)}
+    by_name = params.parameters_by_name(held.robot)
     changes = []
     for k, name in enumerate(names):
         if name == CELLS:

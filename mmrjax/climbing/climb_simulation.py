@@ -32,6 +32,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, Signals, State
 from mmrjax.model.track_friction import Track
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.undercarriage.half_robot import contact_damping, current_after
 from mmrjax.undercarriage.running_gear import RunningGear
 
@@ -401,7 +402,7 @@ def advance_climb(
     force = pulled.force @ touching.along + touching.force @ touching.off - resisted
     force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
     belts = motion.v[SHAFT] + motion.v[LED]
-    lever_loss, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
+    lever_loss, stiffens = value_and_slope(lambda speed: _lever_loss(run, speed), belts)
     stiffens = jnp.maximum(stiffens, 0.0)
     force = force.at[LED].add(-lever_loss)
 

@@ -20,6 +20,7 @@ from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Po
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
+from mmrjax.numerics.one_sided import value_and_slope
 
 #: Number of pitches searched first, then near the best one, and rounds; for one posture, and for any.
 _PITCHES, _POSTURES = (181, 33, 4), (13, 9, 1)
@@ -138,9 +139,7 @@ def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLim
         else pitch
     )
     neighbours = best + jnp.array([-_BESIDE, _BESIDE])
-    rises = jax.vmap(
-        lambda pitch: jax.jvp(lambda x: step_height_at(constant_side, x), (pitch,), (jnp.ones_like(pitch),))[1]
-    )(neighbours)
+    rises = jax.vmap(lambda pitch: value_and_slope(lambda x: step_height_at(constant_side, x), pitch)[1])(neighbours)
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
     height_change = jnp.asarray(
         jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(constant_side, pitch))(neighbours)

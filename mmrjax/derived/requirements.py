@@ -21,6 +21,7 @@ from mmrjax.model.params import Index, Scalar
 from mmrjax.model.quantities import CONDITIONS, TABLE, Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, CUT_OFF, Signals
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.turning.circling import circling_signals
 
 #: Quantities that depend on the temperature of the windings.
@@ -223,7 +224,7 @@ def _find_sign_change(margin, robot: Robot, low: Array, high: Array) -> tuple[Ar
     begin, end = jax.lax.stop_gradient((low, high))
     (a, b), _ = jax.lax.scan(halve, (begin, end), None, length=HALVINGS)
     root = (a + b) / 2
-    steep = jax.jvp(lambda x: margin(constant_robot, x), (root,), (jnp.ones_like(root),))[1]
+    steep = value_and_slope(lambda x: margin(constant_robot, x), root)[1]
     usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
     step = margin(robot, root) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
     edge = root - jnp.where(usable & jnp.isfinite(step), step, 0.0)

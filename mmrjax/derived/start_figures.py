@@ -7,7 +7,6 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -20,6 +19,7 @@ from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
+from mmrjax.numerics.one_sided import value_and_slope
 
 #: A number of each instant.
 OverTime = Float[np.ndarray, " times"]
@@ -212,7 +212,7 @@ def first_crossing(
 
     share = (level - x[k]) / jnp.where(rise > 0, rise, 1.0)
     for _ in range(3):
-        steep = jax.jvp(cubic, (share,), (jnp.ones_like(share),))[1]
+        steep = value_and_slope(cubic, share)[1]
         share = share - (cubic(share) - level) / jnp.where(jnp.abs(steep) > 0, steep, 1.0)
     return k, jnp.clip(share, 0.0, 1.0)
 

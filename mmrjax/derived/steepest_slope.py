@@ -16,6 +16,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, Signals
+from mmrjax.numerics.one_sided import value_and_slope
 
 #: The steepest slope considered [deg], returned for robots that hold it.
 STEEPEST = CONDITIONS["slope_deg"].range[1]
@@ -64,9 +65,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         throw=False,
     )
     root = jax.lax.stop_gradient(solution.value)
-    slope = jax.lax.stop_gradient(
-        jax.jvp(lambda a: slope_margin(still_robot, still, a), (root,), (jnp.ones_like(root),))[1]
-    )
+    slope = jax.lax.stop_gradient(value_and_slope(lambda a: slope_margin(still_robot, still, a), root)[1])
     steepest = root - slope_margin(robot, conditions, root) / slope
     holds_all = slope_margin(still_robot, still, jnp.full_like(root, STEEPEST)) > 0
     steepest = jnp.where(holds_all, STEEPEST, jnp.clip(steepest, 0.0, STEEPEST))

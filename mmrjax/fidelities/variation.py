@@ -84,7 +84,7 @@ class Variation(eqx.Module):
     @property
     def axes(self) -> dict[str, Axis]:
         """Properties of each name that varies, in order."""
-        parameters = {p.name: p for p in params.walk_parameters(self.robot)}
+        parameters = params.parameters_by_name(self.robot)
         return {name: self._axis(name, parameters.get(name)) for name in self.names}
 
     def _axis(self, name: str, parameter: params.Parameter | None) -> Axis:

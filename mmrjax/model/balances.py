@@ -25,7 +25,7 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
-from mmrjax.numerics.one_sided import at_least, clip
+from mmrjax.numerics.one_sided import at_least, clip, value_and_slope
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning.two_sides import SIDES, GroundForces, Stance, ground_forces, sum_of_sides
 
@@ -362,7 +362,7 @@ def gearbox(
     if not any(e.balance == "gearbox" for e in robot.effects):
         return _fill_unset(output, torque_carried=transmitted(output))
     for _ in range(TORQUE_STEPS):
-        residual, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
+        residual, rise = value_and_slope(surplus, torque)
         torque = torque - residual / rise
     return at_output(torque)
 
@@ -505,7 +505,7 @@ def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> S
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, given)
     current = jnp.zeros_like(jnp.asarray(fixed[1].motor_speed))
     for step in range(CURRENT_STEPS):
-        residual, rise = jax.jvp(lambda x: lacking(fixed, x), (current,), (jnp.ones_like(current),))
+        residual, rise = value_and_slope(lambda x: lacking(fixed, x), current)
         residual = lacking(given, current) if step == CURRENT_STEPS - 1 else residual
         current = current - residual / rise
     return current

@@ -158,6 +158,16 @@ def parameter_table(component: eqx.Module) -> str:
     return "\n".join(f"  {part}: {', '.join(lines)}" for part, lines in parts.items())
 
 
+def parameters_by_name(component: eqx.Module) -> dict[str, Parameter]:
+    """Parameters of a component by dotted name."""
+    return {p.name: p for p in walk_parameters(component)}
+
+
+def values_by_name(component: eqx.Module) -> dict[str, float]:
+    """Values of a component's parameters by dotted name [SI]."""
+    return {name: float(p.value) for name, p in parameters_by_name(component).items()}
+
+
 def number_text(value: Any) -> str:
     """A number to six digits. For an array its shape."""
     if isinstance(value, jax.core.Tracer) or not isinstance(value, jax.Array | np.ndarray | np.number | float | int):

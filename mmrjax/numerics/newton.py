@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.numerics import lanes
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.numerics.rarely import compute_if_needed
 
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
@@ -62,7 +63,7 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
             values = fn((*y[:k], x, *y[k + 1 :]), args)[0]
             return tuple(_watch_derivative(v, i, moved) for i, v in enumerate(values))
 
-        value, column = jax.jvp(along, (y[k],), (jnp.ones_like(y[k]),))
+        value, column = value_and_slope(along, y[k])
         columns.append([x if i in moved_inputs else None for i, x in enumerate(column)])
     return list(zip(*columns, strict=True)), value
 

@@ -1,4 +1,4 @@
-"""Bounds whose derivative at the bound is the one from inside, because many defaults are at a bound.
+"""Slopes, and bounds whose derivative at the bound is the one from inside, because many defaults are at a bound.
 
 JAX halves the derivative of `jnp.clip`, `jnp.minimum` and `jnp.maximum` if both arguments are equal, and the
 derivative of `jnp.abs` is 0 at 0.
@@ -6,10 +6,19 @@ derivative of `jnp.abs` is 0 at 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from mmrjax.model.params import Scalar
+
+
+def value_and_slope(function: Callable[[Any], Any], x: Any) -> tuple[Any, Any]:
+    """Value of a function and its derivative with respect to `x`, for an array element by element."""
+    return jax.jvp(function, (x,), (jnp.ones_like(x),))
 
 
 def clip(x: Scalar, low: Scalar, high: Scalar) -> Array:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.belt import BeltPath, belt_runs, tips_on_path
 from mmrjax.undercarriage.side_contacts import (
@@ -196,7 +197,7 @@ def linearize(
 
     def along(name: str) -> Float[Array, "sums contacts"]:
         value = jnp.asarray(given[name])
-        return jax.jvp(lambda x: each({**given, name: x}), (value,), (jnp.ones_like(value),))[1]
+        return value_and_slope(lambda x: each({**given, name: x}), value)[1]
 
     values, slopes = _sums_and_motion_derivatives(path, chassis, given, gained)
     if constants:
@@ -275,7 +276,7 @@ def _contact_derivatives(
     bears = jnp.where(at.force > 0, bearing_contacts(chassis), 0.0) * yields
     softens = at.compliance * stiff * yields * (gear.contact_exponent - 1) / depth
     sliding = -at.speed_x - given["slip"]
-    rise, bend = jax.jvp(friction.rise, (sliding,), (jnp.ones_like(sliding),))
+    rise, bend = value_and_slope(friction.rise, sliding)
     drawn = path.radius * ((1 - at.weight) * gained[3] + at.weight * gained[4])
     return _ContactDerivatives(
         at=at,
@@ -374,7 +375,7 @@ def _sums_and_motion_derivatives(
     unit = jnp.ones_like(front)
     (place, _), (by_front, shared) = jax.jvp(lambda a: path.place(a, rear), (front,), (unit,))
     by_front, shared, by_rear = join_contacts(by_front), join_contacts(shared), touching.weight * path.radius
-    tip = jax.tree.map(join_contacts, jax.jvp(lambda p: tips_on_path(path, p), (place,), (jnp.ones_like(place),))[1])
+    tip = jax.tree.map(join_contacts, value_and_slope(lambda p: tips_on_path(path, p), place)[1])
     cos, sin = cosine(pitch), sine(pitch)
     belt = (
         tip.forward * cos + tip.up * sin,

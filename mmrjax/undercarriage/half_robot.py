@@ -39,6 +39,7 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solve_factorised
 from mmrjax.numerics.newton import root
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
 from mmrjax.undercarriage.belt import BeltPath, belt_runs
 from mmrjax.undercarriage.contact_sums import LinearizedSums
@@ -206,7 +207,7 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
         shifted = dataclasses.replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
-    voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
+    voltage, slope = value_and_slope(left, signals.current)
     z = step * slope / signals.inductance
     return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
 
@@ -446,9 +447,7 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
     contact_geometry = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
-    (sunk, pitch), _ = root(
-        unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None, False
-    )
+    (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None)
     stays_upright = tipping_margin(run) > 0
     q = placed(turned, axle - jnp.where(stays_upright, sunk, 0.0), jnp.where(stays_upright, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}

@@ -15,6 +15,7 @@ from calibration.data import Columns, Json, Names
 from calibration.data.writing import table_text
 from mmrjax import __version__
 from mmrjax.errors import printable
+from mmrjax.numerics.one_sided import value_and_slope
 from sweeps.export import jax_actuator, mujoco
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, EffectFate
 from sweeps.export.joint import DriveJoint
@@ -77,7 +78,7 @@ def steady_state_map(
             return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
 
         def again(voltage: Any, _: None) -> tuple[Any, None]:
-            residual, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
+            residual, rise = value_and_slope(lacking, voltage)
             return voltage - residual / jnp.where(rise > 1e-12, rise, 1e-12), None
 
         constant, ratio = params["motor.torque_constant"], params["gearbox.ratio"]

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Json, Names
+from mmrjax.numerics.one_sided import value_and_slope
 from sweeps.export.comparison import DROPPED, HELD, EffectFate
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
@@ -47,7 +48,7 @@ class ActuatorLaw(eqx.Module):
             return settled_actuator(self.module, self.params, command, speed)[0] - load
 
         def nearer(speed: Any, _: None) -> tuple[Any, None]:
-            residual, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
+            residual, rise = value_and_slope(torque, speed)
             stride = jnp.where(rise != 0, -residual / jnp.where(rise != 0, rise, 1.0), 0.0)
             # Never across rest, where friction changes its sign.
             return jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed), None

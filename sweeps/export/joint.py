@@ -7,7 +7,6 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from calibration.data import Names
@@ -19,6 +18,7 @@ from mmrjax.model.channels import EVERY
 from mmrjax.model.controller import Controller
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
+from mmrjax.numerics.one_sided import value_and_slope
 from sweeps.export.expressions import ZERO, Symbol, names_in, trace_function
 
 #: Balances of a joint. Terms in other balances belong to the load or to an instrument.
@@ -164,7 +164,7 @@ class DriveJoint:
 
     def parameters(self) -> dict[str, params.Parameter]:
         """Parameters that the law depends on, by dotted name."""
-        by_name = {p.name: p for p in params.walk_parameters(self.robot)}
+        by_name = params.parameters_by_name(self.robot)
         symbol_names = [n for part in self.parts for n in names_in(*_symbols_of_part(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
@@ -258,7 +258,7 @@ class _ExpressionTracer:
         def slope(*numbers: Any) -> Any:
             k = self.names.index(by)
             function = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
-            return jax.jvp(function, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
+            return value_and_slope(function, numbers[k])[1]
 
         return trace_function(slope if by else value, self.names, what)
 

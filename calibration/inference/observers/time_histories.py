@@ -100,6 +100,7 @@ from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
 from mmrjax.numerics.linear_equations import solve
+from mmrjax.numerics.one_sided import value_and_slope
 
 #: Most knots of a run's defect in time, and largest product of knots and steps of all runs (2 GB of working memory).
 KNOTS, KNOT_STEPS = 256, 1e7
@@ -1418,7 +1419,7 @@ def _memory_along_run(
 
         def solve_next_stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
             law = lambda m: memory_rates(y, conditions, way, m)  # noqa: E731
-            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
+            speed, slope = value_and_slope(law, memory)
             return memory + span * speed / (1 - span * slope)
 
         first = solve_next_stage(memory, spans[0], state_there.places[0], state_there.sides[0])

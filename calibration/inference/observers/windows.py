@@ -22,6 +22,7 @@ from calibration.data import Columns, Names
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite_or_zero
+from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.linear_rows import LinearRows, grid_of_effects
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.problem import Problem, data_from_readings
@@ -261,11 +262,15 @@ def _unexplained(
     ]
     noise = [np.sum(x**2, 1).reshape(len(places), -1).T for x in of_readings]
     unit = [np.tile(np.sum(w.weight**2 / w.steps, 1)[:, None], len(places)) for w in parts]
-    counts = weight[:, places[0]] > 0
+    counts, run = weight[:, places[0]] > 0, np.asarray(linear.run)
     free = counts.sum() / max(counts.sum() - (size + FITTED) / len(places), 1.0)
     of_windows = (np.concatenate(x)[counts] for x in (plain, noise, unit))
     defect, variance, per_intensity = of_windows
-    return disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
+    white = by_window[counts] / np.maximum(np.sqrt(np.mean(by_window[counts] ** 2, 0)), 1e-300)
+    slow = [
+        variance_of_sums([white[run[counts] == k, e] for k in np.unique(run[counts])]) for e in range(len(places))
+    ]
+    return np.sqrt(slow) * disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
 
 
 def _stacked(cut: list[RunWindows]) -> tuple[RunWindows, np.ndarray]:
