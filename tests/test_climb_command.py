@@ -36,7 +36,7 @@ REFUSED = {
     "two obstacles": (["--step", "50", "--gap", "90"], r"--step and --gap are both given"),
     "none": ([], r"no obstacle is given"),
     "angles beside a sequence of them": (["--step", "50", "--sequence", "s.csv", "--levers-front", "30"],
-                                         r"s\.csv already gives all angles"),
+                                         r"s\.csv gives all angles"),
     "a search of another kind": (["--find", "gap", "--step", "50"], r"--find gap cannot be combined with --step"),
     "no such terrain": (["--terrain", "none.csv"], r"--terrain: got none\.csv, no such file"),
     "a derivative by nothing": (["--step", "50", "--derivatives", "payload,motor.resistence"],

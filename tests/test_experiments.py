@@ -565,4 +565,4 @@ def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
     traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
     proposal = discover._next_experiment(space, traced, None)
     assert proposal.experiments == (experiments.NONE,)
-    assert describe(proposal.instruction).endswith("not for goals of a controller")
+    assert describe(proposal.instruction).endswith("no experiments for goals of a controller")

@@ -598,7 +598,7 @@ def test_rig_with_another_command_is_refused(rig):
 @pytest.mark.parametrize(
     ("header", "row", "message"),
     [
-        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,total_current_A", f"{WHEELS},24,11.5,0,0,1,0.5,3", "independently"),
+        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,total_current_A", f"{WHEELS},24,11.5,0,0,1,0.5,3", "differently"),
         ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,lever_front_deg,lever_rear_deg",
          f"{TRACKS},24,13,0,0,3,30,-10", "levers"),
         ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A", f"{TRACKS},24,13,0,0,3", f"no run of {WHEELS}"),

@@ -88,7 +88,7 @@ def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, ma
     half = len(log[column]) // 2
     log[column] = np.where(np.arange(len(log[column])) < half, log[column], -log[column])
     text = rig_facts.swapped_sentence(records.read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log)))
-    assert f"relative to {column}" in text and abs(int(text.split()[2].strip(",")) - half) < 30
+    assert f"opposite to {column}" in text and abs(int(text.split()[2].strip(",")) - half) < 30
 
 
 @pytest.mark.parametrize(("delay", "stated", "words"), [

@@ -139,6 +139,6 @@ def test_rig_new_lists_what_robot_and_sheet_do_not_state(mmrjax, tmp_path):
     assert (code, err) == (0, "")
     assert "not found, so fill in: motor.inertia [kg·m^2], gearbox.efficiency_load [-], rover." in said
     text = (tmp_path / "r.toml").read_text()
-    assert text.startswith("# kind wheeled, filled from joint left_wheel_joint of diffbot.urdf and a data sheet;")
+    assert text.startswith("# kind wheeled, filled from joint left_wheel_joint of diffbot.urdf and a data sheet.")
     found = robot_file.read_robot(tmp_path / "r.toml")
     assert (float(found.motor.resistance), float(found.gearbox.ratio)) == (0.611, 34.0)

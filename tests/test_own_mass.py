@@ -227,9 +227,7 @@ def test_a_mass_that_no_robot_has_is_refused(robot):
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
-    says = (
-        r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
-    )
+    says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
     with pytest.raises(BadConfiguration, match=says):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
     own_mass.check_priors(["4W2T.mass"], robot, unweighed(table()))

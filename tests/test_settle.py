@@ -360,9 +360,7 @@ def test_a_shaft_that_stands_for_long_may_be_quick_for_a_while(moves):
 def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
     columns = {k: v for k, v in both_ways(output_angle_deg=lambda x: 0 * x + 12.5).items() if k != "motor_speed_rpm"}
     robot = bench(tmp_path, columns, '"total_current", "output_angle"')
-    with pytest.raises(
-        BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row: frozen"
-    ):
+    with pytest.raises(BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row: frozen"):
         settled(tmp_path, robot)
 
 

@@ -13,7 +13,7 @@ from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
-from calibration.discovery.projection import explained_function
+from calibration.discovery.projection import explained_function, projection_factor
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
@@ -51,7 +51,7 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
     Args:
         jacobian, residual: Jacobian and residual of a fit, with the residuals of the priors last.
     """
-    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    half = projection_factor(jacobian)
     prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
     leverage = np.sum(half[:, prior_rows] ** 2, 0)
     projected_residual = residual[prior_rows] - half[:, prior_rows].T @ (half @ residual)

@@ -11,6 +11,11 @@ from calibration.inference.bases import place_signature
 from calibration.inference.linearization import Linearization
 
 
+def projection_factor(jacobian: np.ndarray) -> np.ndarray:
+    """H = L⁻¹ Jᵀ with L Lᵀ = JᵀJ, so that HᵀH projects onto the columns of J, shape (columns, rows)."""
+    return np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+
+
 class Projection:
     """Projects columns orthogonally to the free parameters, as if these were fitted again.
 
@@ -21,7 +26,7 @@ class Projection:
     def __init__(self, linear: Linearization) -> None:
         jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
         self.readings = linear.readings
-        half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+        half = projection_factor(jacobian)
         self.half = half[:, : self.readings]
         self.left = (residual - half.T @ (half @ residual))[: self.readings]
 
@@ -73,7 +78,7 @@ def explained_function(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[
 
     Its results are the decrease of χ² by all columns, and their sensitivity that the free parameters leave [σ²].
     """
-    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    half = projection_factor(jacobian)
     projected_residual = residual - half.T @ (half @ residual)
 
     def explained(columns: np.ndarray) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import remove_effect
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
-from calibration.discovery.projection import Projection
+from calibration.discovery.projection import Projection, projection_factor
 from calibration.discovery.score_tests import ABSORBED, augment_with_columns, family_columns, statistics_with_columns
 from calibration.discovery.search import SearchResult, diagnose_candidate, refit_without_each
 from calibration.discovery.settings import Settings
@@ -437,16 +437,19 @@ def _largest_root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.nda
 
 def _score_roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
     """Square root of the score of each column [σ]. 0 for columns that the free parameters can imitate."""
-    projected_residual, scores = _projected_columns(jacobian, residual, signatures)
-    root = np.abs(scores) / np.sqrt(np.maximum(projected_residual, 1e-12))
-    return np.where(projected_residual > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
+    return _roots(*_projected_columns(jacobian, residual, signatures), np.sum(signatures**2, 0))
+
+
+def _roots(left: np.ndarray, scores: np.ndarray, norm2: np.ndarray) -> np.ndarray:
+    """Square roots of scores from the squared norms after and before projection [σ]."""
+    return np.where(left > ABSORBED**2 * norm2, np.abs(scores) / np.sqrt(np.maximum(left, 1e-12)), 0.0)
 
 
 def _projected_columns(
     jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Squared norm of each column after projection, and its product with the residual."""
-    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    half = projection_factor(jacobian)
     projected_residual, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
     return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ projected_residual[: len(signatures)]
 
@@ -563,7 +566,7 @@ def changed_run(
             names.append(place)
             columns.append(family_columns(linear, bases, k)[:, :1])
     constants = np.concatenate(columns, 1)
-    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    half = projection_factor(jacobian)
     projected_residual = residual - half.T @ (half @ residual)
     best: tuple[int | None, str, float] = None, "", 0.0
     runs = [(k, rows) for k, rows in enumerate(linear.runs()) if space.included[rows].any()]
@@ -574,8 +577,7 @@ def changed_run(
         of_run = constants[inside]
         norm2, scores = np.sum(of_run**2, 0), of_run.T @ projected_residual[inside]
         left = norm2 - np.sum((half[:, inside] @ of_run) ** 2, 0)
-        visible = left > ABSORBED**2 * norm2
-        roots = np.where(visible, np.abs(scores) / np.sqrt(np.where(visible, left, 1.0)), 0.0)
+        roots = _roots(left, scores, norm2)
         if roots.max() > best[2]:
             best = k + 1, names[int(np.argmax(roots))], float(roots.max())
     return best

@@ -119,7 +119,7 @@ def loop_answer(found: loop_notes.Headline) -> str:
     return {
         "none": f"Yes, as far as these runs show{noises}: the residuals are consistent with noise.",
         "undescribed": f"No verdict{noises}: this model does not describe these runs.",
-        "open": f"Perhaps. The answers{noises} differ: they depend on the noise.",
+        "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
         "named": f"No: {_are_missing(laws)}{noises}.",
         "class": f"No: {_are_missing(laws)}{noises}.",
         "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
