@@ -340,9 +340,12 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
     readings, runs = len(toy.readings), np.split(np.arange(toy.rows), 4)
     linear = toy.linear
     monkeypatch.setattr(type(linear), "runs", lambda self: runs)
-    monkeypatch.setattr("calibration.discovery.standing.bases_room.family_names", lambda _: [("slip", "speed")])
+    families = [("mass", "speed"), ("slip", "speed")]  # no reading shows the first
+    monkeypatch.setattr("calibration.discovery.standing.bases_room.family_names", lambda _: families)
     error = rng.standard_normal((readings, 1))
-    monkeypatch.setattr("calibration.discovery.standing.family_columns", lambda *_: np.c_[error, 2 * error])
+    monkeypatch.setattr(
+        "calibration.discovery.standing.family_columns", lambda _, __, k: np.c_[error, 2 * error][:, : 2 * k]
+    )
     jacobian, residual = augment_with_columns(toy.linear, rng.standard_normal((readings, 2)))
     parameters = np.asarray(toy.linear.jacobian)[:readings]
     names = [f"p{k}" for k in range(parameters.shape[1])]

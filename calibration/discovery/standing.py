@@ -563,8 +563,8 @@ def changed_run(
     columns = [np.asarray(linear.jacobian)[:readings, : space.free]]
     for k, (place, _) in enumerate(bases_room.family_names(bases)):
         if place not in names:
-            names.append(place)
             columns.append(family_columns(linear, bases, k)[:, :1])
+            names += [place] * columns[-1].shape[1]  # none if the readings do not show the place
     constants = np.concatenate(columns, 1)
     half = projection_factor(jacobian)
     projected_residual = residual - half.T @ (half @ residual)
