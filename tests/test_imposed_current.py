@@ -249,6 +249,7 @@ def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("robot")
 def test_commands_take_a_current_or_say_what_to_state(tmp_path, mmrjax):
     ends(mmrjax("simulate --robot rig.toml --motor-current 2 --no-report --out one"), code=0)
     row = (tmp_path / "one/runs.csv").read_text().splitlines()

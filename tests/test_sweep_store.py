@@ -764,7 +764,7 @@ def test_chunk_is_split_along_the_points_among_all_devices():
         "found = compiled(compiled.points(0))['speed']\n"
         "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))\n"
         "rows = mmrjax.Conditions(voltage=np.array([15.0, 20, 24, 28, 33]))\n"
-        "job = scale.Job(robot, run_task('steady', {}, robot), axes.Plan.of_rows(rows), ('speed',), 'float64', Blocks.of((5,), 5))\n"
+        "job = scale.Job(robot, run_task('steady', {}, robot), axes.SweepPlan.of_rows(rows), ('speed',), 'float64', Blocks.of((5,), 5))\n"
         "compiled = scale.Compiled(job)\n"
         "table = compiled(compiled.points(0))['speed']\n"
         "print(len(table.sharding.device_set), bool((table == found).all()))"
