@@ -263,7 +263,7 @@ def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
     _, out, err = ends(
         mmrjax("sweep --robot", rig, "--set", "motor.voltage_limit=24", "--out", "run"),
-        "thirds of the voltage_limit in the robot's file are used: 8,16,24",
+        "Thirds of the voltage_limit in the robot's file are used: 8,16,24",
         code=0,
     )
     table = rows_of(tmp_path / "run/runs.csv")
