@@ -352,9 +352,9 @@ def conditions_of(runs: Any, robot: Any) -> SimpleNamespace:
 
 
 def _names(robot: Any) -> list[str]:
-    from calibration.inference import priors
+    from mmrjax.model import params
 
-    return list(priors.parameters_by_name(robot))
+    return list(params.parameters_by_name(robot))
 
 
 def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> Drive:
@@ -368,7 +368,7 @@ def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> 
     Raises:
         Unable: a kind of data or channel that they do not support.
     """
-    from calibration.inference import priors
+    from mmrjax.model import params
 
     if robot.rig.imposed not in ("voltage", "motor_speed"):
         raise Unable(f"{robot.rig.imposed} is imposed")
@@ -377,7 +377,7 @@ def drive(runs: Any, robot: Any, coordinates: Any, term: Term | None = None) -> 
     strange = [c.name for c in runs.channels if c.name not in CHANNELS]
     if strange:
         raise Unable(f"channel {strange[0]}")
-    known = {name: float(field.value) for name, field in priors.parameters_by_name(robot).items()}
+    known = {name: float(field.value) for name, field in params.parameters_by_name(robot).items()}
     given = conditions_of(runs, robot)
     if given.motor_speed is not None:
         given.most *= known["motor.torque_constant"]

@@ -64,10 +64,10 @@ def attempt(kind: str, seed: int, stratum: str = "") -> logs.Case | str:
     if kind == "clean":
         return logs.case(made(), "", 0.0, seed, stated=stated)
     if kind == "fault":
-        made = made()
-        names = [n for n in DIFFERING if n in made.names]
-        name, run = names[(seed // len(logs.IMPOSED)) % len(names)], int(rng.integers(len(made.inputs)))
-        return logs.case(made, name, float(rng.uniform(*sigmas[kind])), seed, stated=stated, run=run)
+        rig = made()
+        names = [n for n in DIFFERING if n in rig.names]
+        name, run = names[(seed // len(logs.IMPOSED)) % len(names)], int(rng.integers(len(rig.inputs)))
+        return logs.case(rig, name, float(rng.uniform(*sigmas[kind])), seed, stated=stated, run=run)
     pool = [n for n, x in (laws.LOGS if kind == "library" else laws.OUTSIDE_LOGS).items() if x.needs(imposed)]
     name, why = pool[(seed // len(logs.IMPOSED)) % len(pool)], ""
     for _ in range(TRIES):

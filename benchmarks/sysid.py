@@ -160,7 +160,7 @@ def main() -> None:
     options.add_argument("--draws", type=int, default=20, help="noise draws")
     chosen = options.parse_args()
     robot, times = lifted(), STEP * np.arange(1, SAMPLES + 1)
-    fields, known = priors.parameters_by_name(robot), constants(robot)
+    fields, known = params.parameters_by_name(robot), constants(robot)
     truth = np.array([float(fields[n].value) for n in NAMES])
     start, clean = truth * OFF, exact(known, truth, times)
     rng = np.random.default_rng(0)

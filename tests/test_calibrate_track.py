@@ -58,10 +58,10 @@ def test_in_track_the_guide_friction_stands_for_the_product(base):
     names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.fidelity_facts("track").computes)
     assert GUIDE_FRICTION in names and GUIDE_SHARE not in names and len(names) == 11
     turned, known = priors.with_guide_share(base, "6T2A")
-    fields, mean = priors.parameters_by_name(turned), known[GUIDE_FRICTION][0]
+    fields, mean = params.parameters_by_name(turned), known[GUIDE_FRICTION][0]
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
-    assert priors.parameters_by_name(base)[GUIDE_SHARE].value == 0.3
+    assert params.parameters_by_name(base)[GUIDE_SHARE].value == 0.3
     assert "in track, fit guide_friction" in table_words.would_measure(GUIDE_SHARE)
 
 

@@ -234,7 +234,7 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     data = SimpleNamespace(sd=np.full((rows, 1), 0.5))
     space = SimpleNamespace(weight=np.ones((rows, 1)), included=np.ones(rows, bool), bare=SimpleNamespace(data=data))
     beside = SimpleNamespace(left=SimpleNamespace(linear=linear), where=SPEED, bases=())
-    got = room._linear_gain_of_curve(space, range(rows), None, beside, {})
+    got = room._linear_gain_of_curve(space, range(rows), beside)
 
     def errors(design, out):
         kept = np.append(~out, np.ones(len(design) - rows, bool))
@@ -254,4 +254,4 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     wave = SimpleNamespace(
         **vars(beside) | {"where": dataclasses.replace(SPEED, variable="order 2 of the driving shaft")}
     )
-    assert list(room._linear_gain_of_curve(space, range(rows), None, wave, {}).errors) == ["part"]
+    assert list(room._linear_gain_of_curve(space, range(rows), wave).errors) == ["part"]

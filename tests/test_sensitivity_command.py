@@ -55,7 +55,7 @@ def study(robot):
 def test_local_derivatives_are_finite_differences_and_zero_across_configurations(study, robot):
     found = local_derivatives(study)
     step = 1e-6
-    fields = priors.parameters_by_name(robot)
+    fields = params.parameters_by_name(robot)
     for k, name in enumerate(NAMES):
         value = float(fields[name].value)
         up, down = (

@@ -801,7 +801,7 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     given.progress(progress_remark("confirm"))
     best = _chosen_fit(traced)
     space = space if traced.searched is None else space.with_room(traced.searched.room)
-    run = simulate_models(space, linear.candidate, best, settings, False, screened.base.candidate)
+    run = simulate_models(space, linear.candidate, best, settings, screened.base.candidate)
     traced = dataclasses.replace(traced, run=run)
     if traced.searched is None:
         return traced
@@ -941,7 +941,7 @@ def _confirm_by_simulation(given: LoopInput, windows: LoopInput, traced: LoopSta
     given.progress(progress_remark("confirm"))
     chosen, base = _chosen_fit(traced), _delayed_by_rows(given, screened.base.candidate)
     best = base if chosen is screened.base.candidate else _delayed_by_rows(given, chosen)
-    run = simulate_models(given.space.with_room(searched.room), base, best, given.settings, True)
+    run = simulate_models(given.space.with_room(searched.room), base, best, given.settings, disturbed=True)
     confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
     noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
     if not confirmed.rejected or (not run.disturbed and excess_misfit(run.space, run.base) < noise):

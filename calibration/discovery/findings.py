@@ -40,7 +40,7 @@ from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import WeakFormScreening
 from calibration.discovery.search import refit_without_each, single_p_value
 from calibration.discovery.settings import Settings
-from calibration.inference import bases, priors
+from calibration.inference import bases
 from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
@@ -53,6 +53,7 @@ from calibration.inference.linearization import (
 )
 from calibration.inference.problem import Observation, Problem
 from mmrjax.effects import Effect
+from mmrjax.model import params
 from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
 
@@ -244,7 +245,7 @@ def parameter_shifts(
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [coordinates.stated, *(coordinates.value(x) for x in z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
+    fields, held_names = params.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])
     return {
         name: ParameterShift(

@@ -117,19 +117,25 @@ def refine_by_simulation(
 
 
 def simulate_models(
-    space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings, disturbed: bool,
+    space: CandidateSpace,
+    base: Candidate,
+    best: Candidate,
+    settings: Settings,
     known: Candidate | None = None,
-) -> LogSimulation:  # fmt: skip
+    disturbed: bool = False,
+) -> LogSimulation:
     """Simulates the base fit and the best fit of a log's linear rows, each refined by a few steps.
 
     Args:
-        disturbed: True if the misfit of the best fit may count as noise.
         known: simulated fit of the base. Its refinement starts there too.
+        disturbed: True if the misfit of the best fit may count as noise.
     """
     space = space.with_room([*space.room, *best.effects])
     starts = [] if known is None else [known.z]
     last = refine_by_simulation(space, best, [best.z, *(starts if best is base else [])], settings)
-    if disturbed := disturbed and (noisy := with_misfit(space, last)) is not space:
+    noisy = with_misfit(space, last) if disturbed else space
+    disturbed = noisy is not space
+    if disturbed:
         space, last = noisy, refine_by_simulation(noisy, last, [last.z], settings)
     without = np.where(np.arange(len(last.z)) < space.free, last.z, 0.0)
     first = last if best is base else refine_by_simulation(space, base, [base.z, without, *starts], settings)

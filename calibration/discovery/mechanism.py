@@ -108,8 +108,12 @@ def find_mechanism(
             if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_recurrence(space, left, bases, families, blocks, settings))
         else:
-            held_out = _linear_gain_of_curve if over_time else _hold_out_gain_of_curve
-            gain, effects = held_out(space, runs, base, beside, predicted), ()
+            gain = (
+                _linear_gain_of_curve(space, runs, beside)
+                if over_time
+                else _hold_out_gain_of_curve(space, runs, base, beside, predicted)
+            )
+            effects = ()
             again = _curve_recurrence(space, left, bases, families, blocks, settings)
         share = share_of_excess(excess, explained.get(leader, 0.0))
         ammeters = errors_of_ammeters(space, families)
@@ -263,9 +267,7 @@ def _hold_out_gain_of_curve(
     return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
 
 
-def _linear_gain_of_curve(
-    space: CandidateSpace, runs: Runs, base: Candidate, beside: BaseCurve, predicted: Predicted
-) -> Gain:
+def _linear_gain_of_curve(space: CandidateSpace, runs: Runs, beside: BaseCurve) -> Gain:
     """The gain of `_hold_out_gain_of_curve` for a log, to first order at the base fit.
 
     A simulated fit of a curve takes minutes, and windows have no simulation. A wave has its own phase in each run, so

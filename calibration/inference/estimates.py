@@ -10,7 +10,6 @@ from calibration.data import Columns
 from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference import priors
 from calibration.inference.identifiability import Z95, Identifiability, ProfileLikelihoods
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
@@ -30,7 +29,7 @@ from calibration.inference.result import (
 )
 from calibration.inference.scans import Scan
 from calibration.inference.simulation_errors import channel_errors, sized_error
-from mmrjax.model import channels
+from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
@@ -68,7 +67,7 @@ def parameter_estimates(
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
-    bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
+    bound, fields = coordinates.beyond(z), params.parameters_by_name(base)
     estimates = {}
     for k, name in enumerate(coordinates.names):
         interval, shift, is_open = linear[k], z[k] + Z95 * about.sd[k] * np.array([-1.0, 1.0]), (False, False)

@@ -19,6 +19,7 @@ from calibration.inference.identifiability import Identifiability, determined_to
 from calibration.inference.preparation import prepare_input
 from calibration.inference.problem import Problem
 from mmrjax import fidelities
+from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
 
@@ -108,7 +109,7 @@ def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(is_reached, float)[:, None])
     about = identifiability.analyse_identifiability(posed, z, data)
     is_prior_bound = identifiability.held_by_prior(about.sd)
-    fields = priors.parameters_by_name(robot)
+    fields = params.parameters_by_name(robot)
     width = coordinates.prior_sd
     estimates = tuple(
         ParameterInformation(

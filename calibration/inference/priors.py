@@ -19,8 +19,7 @@ from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
-from mmrjax.model.params import Parameter
-from mmrjax.model.params import parameters_by_name as parameters_by_name
+from mmrjax.model.params import Parameter, parameters_by_name
 from mmrjax.model.robot import Robot
 from mmrjax.numerics.one_sided import value_and_slope
 

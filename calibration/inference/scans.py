@@ -19,8 +19,8 @@ from jaxtyping import Float
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.optimizers import Optimum, evaluate_residuals
-from calibration.inference.priors import parameters_by_name
 from calibration.inference.problem import Data, Observation, Problem
+from mmrjax.model.params import parameters_by_name
 
 #: Half of the range of a scan [prior sd].
 RANGE = 4.0

@@ -22,6 +22,7 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.variation import CONDITIONS, Axis, Variation
+from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
 #: Smallest distance from the ends of the unit interval, which limits normal scores to 6 sds.
@@ -133,7 +134,7 @@ def default_input_names(
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
     excluded = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
-    by_name = priors.parameters_by_name(robot)
+    by_name = params.parameters_by_name(robot)
     left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # parameters of another robot do not count
         prior_names = {name for name, _, _ in robot.rig.priors}
@@ -160,11 +161,11 @@ def inputs_from_priors(
         BadConfiguration: a name is unknown (the message lists the choices), its prior has zero width, or a range is
             invalid.
     """
-    everything = list(priors.parameters_by_name(robot))
+    everything = list(params.parameters_by_name(robot))
     names = list(
         dict.fromkeys(name for word in words for name in priors.expand_name(word, everything, "--parameters"))
     )
-    by_name = priors.parameters_by_name(robot)
+    by_name = params.parameters_by_name(robot)
     for name in names:
         if not by_name[name].spec.prior_sd(float(by_name[name].value)) > 0:
             raise BadConfiguration(

@@ -198,9 +198,13 @@ NO_MECHANISM = {
 
 def no_mechanism(found: loop_notes.Mechanism) -> str:
     """Reasons against the best mechanism."""
-    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": found.candidates}
-    changed = _changed_constant(found.changed, found.run)
-    why = [NO_MECHANISM[name].format(found, **numbers, changed=changed) for name in found.fails]
+    parts = {
+        "share": 100 * found.share,
+        "again": 100 * found.again,
+        "many": found.candidates,
+        "changed": _changed_constant(found.changed, found.run),
+    }
+    why = [NO_MECHANISM[name].format(found, **parts) for name in found.fails]
     return f"the best candidate is a {found.families[0]}, but {' and '.join(why)}"
 
 
