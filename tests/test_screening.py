@@ -222,7 +222,7 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
         space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, disturbed=False, contradicts=False,
         diagnosis=lambda fit, left: SimpleNamespace(linear=fit),
     )  # fmt: skip
-    monkeypatch.setattr(discover, "simulate_models", lambda *_: run)
+    monkeypatch.setattr(discover, "simulate_models", lambda *_, **__: run)
     monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
     monkeypatch.setattr(discover, "excess_misfit", lambda *_: 1e3)
     monkeypatch.setattr(discover, "unused_inputs", lambda _: ("angle",))
