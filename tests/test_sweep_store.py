@@ -782,11 +782,9 @@ REFUSED = {
     "zero shares": (CONFIG, ["--shard", "1/0"], "--shard: got 1/0; expected i/n with i from 1 to n"),
     "share zero": (CONFIG, ["--shard", "0/3"], "--shard: got 0/3; expected i/n"),
     "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
-    "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: not allowed with --scheduler"),
     "unknown export": (CONFIG, ["--export", "xls"], "--export: got 'xls'; expected 'csv' or 'parquet'"),
     "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: has an effect only with a grid given by options"),
     "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml in addition to plan.toml"),
-    "not a scheduler": (CONFIG, ["--scheduler", "nonsense"], "--scheduler: got nonsense; no scheduler answers there"),
     "axes are no table": ("axes = 3\nreport = false\n", [], "plan.toml, axes: got 3"),
 }  # fmt: skip
 
