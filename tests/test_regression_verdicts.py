@@ -110,6 +110,7 @@ def answered(tmp_path_factory):
     return of
 
 
+@pytest.mark.quick(4)
 @pytest.mark.parametrize("fault, family", [
     ({}, ""),
     ({"scale": 0.95}, "reading of motor speed that is the same share everywhere"),
