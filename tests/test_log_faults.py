@@ -54,17 +54,36 @@ def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words)
     assert words in text and column in text and len(text) <= 400
 
 
-@pytest.mark.parametrize(("kind", "make", "column", "length", "words"), [
-    ("servo", servo, "output_angle_deg", 360, "jumps by -3.* like an angle that wraps or .*; expected an angle that keeps"),
-    ("carriage", carriage, "position_mm", 50, "jumps by -4.* like a position that wraps or .*; expected a position that"),
-])  # fmt: skip
-def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path, kind, make, column, length, words):
+def wrapped(tmp_path, kind, make, column, length):
+    """A log as it is read, and the same log with an encoder that wraps."""
     log = make(np.random.default_rng(1))
     robot = written(tmp_path, kind, log)
-    records.read_runs(tmp_path / "log.csv", robot=robot)
+    yield records.read_runs(tmp_path / "log.csv", robot=robot)
     written(tmp_path, kind, {**log, column: log[column] % length})
+    yield records.read_runs(tmp_path / "log.csv", robot=robot)
+
+
+def test_a_position_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path):
+    words = "jumps by -4.* like a position that wraps or .*; expected a position that"
+    logs = wrapped(tmp_path, "carriage", carriage, "position_mm", 50)
+    assert next(logs).has("position_mm")
     with pytest.raises(BadData, match=words):
-        records.read_runs(tmp_path / "log.csv", robot=robot)
+        next(logs)
+
+
+@pytest.mark.parametrize("length", [360, 300])
+def test_an_angle_of_one_turn_keeps_counting(tmp_path, length):
+    logs = wrapped(tmp_path, "servo", servo, "output_angle_deg", length)
+    log = next(logs)
+    if length != 360:  # no turn
+        with pytest.raises(BadData, match=r"jumps by -29.* like an angle that wraps or "):
+            next(logs)
+        return
+    again = next(logs)
+    np.testing.assert_allclose(again["output_angle_deg"], log["output_angle_deg"], atol=1e-6)
+    assert [n for n in again.notes if n not in log.notes] == [
+        f"{again.source} row 254, output_angle_deg: wraps at 360 deg. The wraps are removed"
+    ]
 
 
 @pytest.mark.parametrize("step", [7.0, -2.0])
