@@ -289,11 +289,9 @@ class LoopInput:
         with contextlib.ExitStack() as others:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[], begin=begin)
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
-            long, converged = screened.base.space.bare.observe.long, screened.base.candidate.converged
-            if long and not converged and (of_settled := self.trace_settled()) is not None:
-                return of_settled
-            if long and not self.shows_unmodelled_backlash:
-                return _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
+            if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
+                settled = None if screened.base.candidate.converged else self.trace_settled()
+                return settled or _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
