@@ -151,7 +151,7 @@ def test_a_log_of_two_sides_is_fitted_at_its_settled_turns(log, robot):
         assert np.abs(z).max() < 5
         assert table[channel.sd_column].max() < 0.02 * np.abs(table[channel.column]).max()
     assert describe(note).startswith(f"{runs.source}: a log of two sides is not fitted over time, so the fit uses")
-    assert (note.runs, note.points) == (9, 9) and "9 settled runs" in describe(note)
+    assert note.runs == 9 and f"settled runs (9, {note.lasts:.3g} s in all)" in describe(note)
     assert 0.5 < note.lasts / (9 * turns.HOLD * turns.EVERY) < 1
 
 
@@ -162,7 +162,7 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     again = {name: np.tile(x, 4) for name, x in few.columns.items()}
     again["time_s"] = np.arange(len(again["time_s"])) * turns.EVERY
     with pytest.raises(
-        BadData, match=r"and 12 settled runs \(.* s\) at 3 operating points are too few. Hold 8 or more"
+        BadData, match=r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 8 or"
     ):
         rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
     short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
@@ -171,7 +171,7 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
     for command in ("loop", "calibrate"):
         run = mmrjax(command, str(table), "--robot", str(file), "--out", str(tmp_path / "out"))
-        ends(run, "3 operating points are too few. Hold 8 or more different levels until all readings", code=4)
+        ends(run, "too few operating points (3). Hold 8 or more different levels until all readings", code=4)
         assert not [*tmp_path.glob("out*")]
 
 

@@ -324,13 +324,11 @@ class LoopInput:
         if self.equations is not None or other or (equations := equations_of_log(self)) is None:
             return None, None
 
-        def keep(name: str, make: Callable[[], Any]) -> Any:
-            """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
-            return self.keep(name if name == "ranking" else f"windows {name}", make)
-
         confirm = functools.partial(_best_simulated_size, self.space.with_room(self.known_room), self.settings)
         simulates = self.known is None or self.known_room
-        equations = dataclasses.replace(equations, keep=keep, confirm=confirm if simulates else None)
+        equations = dataclasses.replace(
+            equations, keep=self.kept_apart("windows"), confirm=confirm if simulates else None
+        )
         traced = equations.trace()
         slides = self.robot.has_ground and self.robot.rig.imposed == "voltage"  # which equations do not show
         begin = None if slides else _delayed_by_rows(self, traced.screened.base.candidate)
@@ -348,12 +346,12 @@ class LoopInput:
         for note in ready.at_first:
             self.progress(note)
 
-        def keep(name: str, make: Callable[[], Any]) -> Any:
-            """Stores a stage apart from the one of the log."""
-            return self.keep(name if name == "ranking" else f"settled {name}", make)
-
-        table = dataclasses.replace(ready, progress=self.progress, keep=keep)
+        table = dataclasses.replace(ready, progress=self.progress, keep=self.kept_apart("settled"))
         return dataclasses.replace(table.trace(ahead=True), settled=(runs, settled))
+
+    def kept_apart(self, word: str) -> StoreStage:
+        """Storage of stages apart from those of the log over time. Only the ranking has the same name."""
+        return lambda name, make: self.keep(name if name == "ranking" else f"{word} {name}", make)
 
     @property
     def known_room(self) -> Names:
@@ -810,12 +808,11 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
     equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    apart = given.kept_apart("readings")
 
     def keep(name: str, make: Callable[[], Any]) -> Any:
-        """Stores a stage apart from the simulated one of this name."""
-        if name == "ranking":
-            return None if ranked else given.keep(name, make)
-        return given.keep(f"readings {name}", make)
+        """Stores a stage apart, except a second ranking."""
+        return None if ranked and name == "ranking" else apart(name, make)
 
     confirm = functools.partial(_smallest_confirmed, space, settings)
     table = dataclasses.replace(

@@ -56,18 +56,16 @@ def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, Notes]:
         why: reason, a key of `table_words.NOT_OVER_TIME`.
 
     Raises:
-        BadData: they have too few operating points, or as for `settling.settle_log`.
+        BadData: they have fewer than `POINTS` operating points, or as for `settling.settle_log`.
     """
     settled = settling.settle_log(log, robot)
-    silent = tuple(c.column for c in robot.channels if c.settled and not log.has(c.column))
-    lasts = sum(s.lasts for s in settled.kept)
-    note = Remark(
-        "settled_instead", source=log.source, why=why, runs=len(settled.kept), lasts=lasts, points=settled.points,
-        needed=POINTS, each=settled.shortest, silent=silent,
-    )  # fmt: skip
-    if settled.points < POINTS:
-        raise BadData(describe(note))
-    return settled.settled_runs(), (note,)
+    source, runs, lasts, points = log.source, len(settled.kept), sum(s.lasts for s in settled.kept), settled.points
+    if points < POINTS:
+        few = Remark(
+            "few_points", source=source, runs=runs, lasts=lasts, points=points, needed=POINTS, each=settled.shortest
+        )
+        raise BadData(describe(few))
+    return settled.settled_runs(), (Remark("settled_runs", source=source, why=why, runs=runs, lasts=lasts),)
 
 
 @dataclasses.dataclass(frozen=True)

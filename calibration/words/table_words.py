@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 from calibration.data import Names
-from mmrjax.errors import count_noun
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
@@ -134,22 +133,8 @@ def sentence_on_implausible_readings(
     return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, and the robot's file"
 
 
-#: Reasons why a log is not fitted over time.
+#: Reasons for fitting the settled runs of a log.
 NOT_OVER_TIME = {"sides": "a log of two sides is not fitted over time", "unfitted": "no fit over time converges"}
-
-
-def sentence_on_settled_runs(
-    source: str, why: str, runs: int, lasts: float, points: int, needed: int, each: float, silent: Names
-) -> str:
-    """Settled runs that replace a log, or what to record if they are too few."""
-    found = f"{source}: {NOT_OVER_TIME[why]}, {{}} {count_noun(runs, 'settled run')} ({lasts:.3g} s)"
-    if points >= needed:
-        return found.format("so the fit uses the means of") + ", which do not show inertias, delays or the start"
-    return (
-        f"{found.format('and')} at {count_noun(points, 'operating point')} are too few. Hold {needed} or more "
-        f"different levels until all readings are steady for {each:.2g} s" + "".join(f", and log {c}" for c in silent)
-    )
-
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
@@ -201,7 +186,15 @@ SAID: dict[str, str | Callable[..., str]] = {
         "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time. Change this with "
         "--rows, or use settle, which takes all"
     ),
-    "settled_instead": sentence_on_settled_runs,
+    "settled_runs": lambda source, why, runs, lasts: (
+        f"{source}: {NOT_OVER_TIME[why]}, so the fit uses the means of its settled runs ({runs}, {lasts:.3g} s in "
+        "all). They do not show inertias, delays or the start"
+    ),
+    "few_points": (
+        "{source}: a log of two sides is not fitted over time, and its settled runs ({runs}, {lasts:.3g} s in all) "
+        "have too few operating points ({points}). Hold {needed} or more different levels until all readings are "
+        "steady for {each:.2g} s"
+    ),
     "thinned_table": (
         "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers refer to "
         "them. Change this with --rows"
