@@ -562,12 +562,12 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             _terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects)
         )  # one program for all of them
 
-    def whole(factors: list[np.ndarray], given: EquationTerms) -> np.ndarray:
+    def whole(factors: list[np.ndarray], *given: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         windows = zip(factors, cut, strict=True)
-        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in windows])
+        return np.concatenate([solve_triangular(x, window_errors(plan, w, *given), lower=True) for x, w in windows])
 
-    def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Function of the parameters that returns residuals and their derivatives.
+    def of(z: np.ndarray) -> Callable[..., np.ndarray]:
+        """Function of the parameters that returns residuals and their derivatives, and at last signatures.
 
         The covariance and the noise-free states (`with_smooth_states`) are computed once, at z."""
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
@@ -576,7 +576,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         plain = [covariance_factor(plan, w, sd, terms_there, none) for w in cut]
         whitened_windows = [
             (
-                window_errors(plan, w, read)[:, 0],
+                window_errors(plan, w, (read.f, read.y)),
                 np.sum(x**2, 1),
                 np.tile(np.sum(w.weight**2 / w.steps, 1), equations),
             )
@@ -586,20 +586,20 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
         )
         unknown = disturbance_intensities(*by_equation)
-        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
-        offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
+        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut] if unknown.any() else plain
+        offset = whole(factors, (read.f, read.y)) - whole(factors, (terms_there.f, terms_there.y))
 
         states[:] = [centre, z, smooth, terms_there, read]
-        last: list[tuple[np.ndarray, np.ndarray]] = []
+        last: list[tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
 
-        def at(z: np.ndarray) -> np.ndarray:
+        def at(z: np.ndarray, signatures: bool = False) -> np.ndarray:
             if not last or np.any(last[0][0] != z):
-                factored = whole(factors, terms(smooth, z))
+                given = terms(smooth, z)
+                factored = whole(factors, (given.f[..., None], given.y[..., None]), given.by_z)
                 factored[:, 0] += offset
-                rest = np.zeros((len(z), factored.shape[1]))
-                rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))
-                last[:] = [(z.copy(), np.concatenate([factored, rest]))]
-            return last[0][1]
+                rest = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
+                last[:] = [(z.copy(), np.concatenate([factored, rest]), given.by_effects)]
+            return whole(factors, last[0][2]) if signatures else last[0][1]
 
         return at
 
@@ -608,34 +608,32 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
     if DELAY in coordinates.names:  # windows without jumps may not show it
         k = coordinates.names.index(DELAY)
         centre[k] = (late - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
-    z, size = centre, len(centre)
+    z = centre
     try:
         for _ in range(ROUNDS):
             terms_at_fit = of(z)
             regression = least_squares(
-                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1 : size + 1], method="lm",  # noqa: B023
+                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1:], method="lm",  # noqa: B023
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
             step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
             z, terms_after_step = z + step, terms_at_fit(z + step)
-            if np.abs(terms_after_step[:, 1 : size + 1] @ step).max() < SETTLED:
+            if np.abs(terms_after_step[:, 1:] @ step).max() < SETTLED:
                 break
+        signatures = terms_at_fit(z, True)
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    count = len(terms_after_step) - size
     return WeakFormFit(
-        z, terms_after_step[:, 0], terms_after_step[:, 1 : size + 1], terms_after_step[:count, size + 1 :], count,
-        plan, cut, *states,
-    )  # fmt: skip
+        z, terms_after_step[:, 0], terms_after_step[:, 1:], signatures, len(signatures), plan, cut, *states
+    )
 
 
-def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.ndarray:
-    """Errors of the equations in a run's windows, with their derivatives and signatures, shape (windows, 1 +
-    coordinates + instances).
+def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Errors of the equations in a run's windows, or their derivatives, from pairs of terms f and y, shape (windows,
+    columns of all pairs).
     """
-    term_arrays = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
-    integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in term_arrays], 2)
-    return integrals.reshape(-1, integrals.shape[2])
+    integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in terms], -1)
+    return integrals.reshape(-1, *integrals.shape[2:])
 
 
 def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:

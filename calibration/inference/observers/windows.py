@@ -193,6 +193,8 @@ def problem_of_windows(
     none = np.where((run < 0)[:, None] | absent, np.nan, 0.0)
     data = dataclasses.replace(data_from_readings(none, np.ones_like(none), size), centre=jnp.asarray(fit.centre))
     reading_slopes = tuple(np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True))
+    errors = fit.read.f[..., None], fit.read.y[..., None]
+    plain = [jnp.asarray(np.concatenate(x, 2)) for x in zip(errors, terms.by_z, terms.by_effects, strict=True)]
 
     def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
         factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
@@ -200,15 +202,12 @@ def problem_of_windows(
         arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
         integrals = Integrals(arrays[0], arrays[1], arrays[2], arrays[3], places, count)
 
-        def whole(f: Any, y: Any) -> np.ndarray:
-            return np.asarray(integrals(jnp.asarray(f), jnp.asarray(y))).reshape(-1, f.shape[-1])
-
-        errors = whole(fit.read.f[..., None], fit.read.y[..., None])[:, 0]
+        whitened = np.asarray(integrals(*plain)).reshape(-1, plain[0].shape[2])
         prior = np.concatenate([np.zeros(len(run)), fit.origin - fit.centre])
-        jacobian = np.concatenate([whole(*terms.by_z), np.zeros((len(run), size)), np.eye(size)])
+        jacobian = np.concatenate([whitened[:, 1 : size + 1], np.zeros((len(run), size)), np.eye(size)])
         linear = WindowsLinearization(
-            jnp.asarray(np.concatenate([errors, prior])), jnp.asarray(jacobian),
-            finite_or_zero(jnp.asarray(whole(*terms.by_effects))), jnp.zeros((len(PROBED), 0)), data.weight,
+            jnp.asarray(np.concatenate([whitened[:, 0], prior])), jnp.asarray(jacobian),
+            finite_or_zero(jnp.asarray(whitened[:, size + 1 :])), jnp.zeros((len(PROBED), 0)), data.weight,
             jax.tree.map(jnp.asarray, terms.signals), integrals, finite_or_zero(jnp.stack(reading_slopes)),
             fit.rows.time, fit.rows.angle, jnp.asarray(run),
             channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
