@@ -15,6 +15,7 @@ import functools
 import math
 from collections.abc import Callable
 from importlib import resources
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -148,7 +149,7 @@ def _nominal_signals() -> tuple[Robot, Signals]:
     `tests/test_scaled_effects.py` compares the file with `results_of_rows`.
     """
     table = np.genfromtxt(NOMINAL.read_text("utf-8").splitlines(), delimiter=",", names=True)
-    columns = {name: jnp.asarray(table[name]) for name in table.dtype.names or ()}
+    columns: dict[str, Any] = {name: jnp.asarray(table[name]) for name in table.dtype.names or ()}
     columns["configuration"] = columns["configuration"].astype(int)
     return params.without_weak_types(paper_robots.nominal()), dataclasses.replace(Signals(), **columns)
 

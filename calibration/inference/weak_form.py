@@ -446,7 +446,8 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
     inside = np.unique(np.concatenate([w.rows.ravel() for w in cut]))
-    rows, course = jax.tree.map(lambda x: x[inside], rows), dataclasses.replace(course, cell=course.cell[inside])
+    rows = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[inside]), rows)
+    course = dataclasses.replace(course, cell=course.cell[inside])
     cut = [dataclasses.replace(w, rows=np.searchsorted(inside, w.rows)) for w in cut]
     limit = TENTH * float(np.median([time[inside][w.rows].max() for w in cut]))
     grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
@@ -466,14 +467,17 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
         factor = change[first][0].mean(0)  # (equations, 1 + z)
         acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
         unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
+        prompt_integrals = np.concatenate([_integrate_terms(plan, w, *fixed) for w in cut], 1)[acts]
+        weighted = {n: [_weigh_terms(plan, w, *x)[acts] for w in cut] for n, x in change.items()}
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            mean_changes = {n: (means[n] - prompt[n])[:, None, None] for n in change}
-            f, y = (fixed[k] + sum(mean_changes[n] * change[n][k] for n in change) for k in range(2))
-            all_integrals = np.concatenate([_integrate_terms(plan, w, f, y) for w in cut], 1)[
-                acts
-            ]  # (equations, windows, 1 + z)
+            all_integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
+            for n, x in weighted.items():
+                by_run = zip(x, cut, strict=True)
+                all_integrals += np.concatenate(
+                    [np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x) for x, w in by_run], 1
+                )
             all_integrals[..., 1:] -= all_integrals[..., :1] * growth
             all_integrals /= unit
             size = np.sqrt(np.mean(all_integrals[..., 0] ** 2, 1))
@@ -562,7 +566,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             _terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects)
         )  # one program for all of them
 
-    def whole(factors: list[np.ndarray], *given: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    def whole(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
         windows = zip(factors, cut, strict=True)
         return np.concatenate([solve_triangular(x, window_errors(plan, w, *given), lower=True) for x, w in windows])
 
@@ -590,7 +594,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         offset = whole(factors, (read.f, read.y)) - whole(factors, (terms_there.f, terms_there.y))
 
         states[:] = [centre, z, smooth, terms_there, read]
-        last: list[tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
+        last: list[tuple[np.ndarray, np.ndarray, tuple[Any, Any]]] = []
 
         def at(z: np.ndarray, signatures: bool = False) -> np.ndarray:
             if not last or np.any(last[0][0] != z):
@@ -628,12 +632,12 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
     )
 
 
-def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np.ndarray:
     """Errors of the equations in a run's windows, or their derivatives, from pairs of terms f and y, shape (windows,
     columns of all pairs).
     """
     integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in terms], -1)
-    return integrals.reshape(-1, *integrals.shape[2:])
+    return np.concatenate(integrals)
 
 
 def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -641,6 +645,13 @@ def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarra
     slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
     integral = functools.partial(np.einsum, "wk,wk...->w...")
     return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
+
+
+def _weigh_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Terms at each point of a run's windows with their weights, shape (equations, windows, length, ...)."""
+    slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
+    weigh = functools.partial(np.einsum, "wk,wk...->wk...")
+    return np.stack([weigh(w.weight, f[w.rows, k]) + weigh(slope, y[w.rows, k]) for k, slope in slopes])
 
 
 def derivative_weights(plan: StatePlan, w: RunWindows, equations: int) -> list[np.ndarray]:

@@ -393,7 +393,7 @@ def results_of_rows(robot: Robot, conditions: Conditions, rests: bool = True) ->
         index = np.where(part < rows, part, 0)
         padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)  # noqa: B023
         parts.append(_shown_rows(robot, padded, *_solved_rows(robot, padded), rests))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:rows], *parts)
+    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:rows]), *parts)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -405,7 +405,8 @@ def _solved_rows(robot: Robot, conditions: Conditions) -> tuple[Float[Array, "ro
 def _shown_rows(
     robot: Robot, conditions: Conditions, unknowns: Array, found: Array, rests: bool
 ) -> tuple[Result, Signals]:
-    return jax.vmap(lambda *row: _results_at_unknowns(robot, *row, rests)[:2])(conditions, unknowns, found)
+    show = functools.partial(_results_at_unknowns, robot, rests=rests)
+    return jax.vmap(lambda *row: show(*row)[:2])(conditions, unknowns, found)
 
 
 def _run_batch(
