@@ -51,9 +51,7 @@ _Config = Annotated[
 ]
 _Trust = Annotated[
     bool,
-    typer.Option(
-        "--trust", hidden=True, help="Allow the file of --config to name code that runs: effects, or a scheduler."
-    ),
+    typer.Option("--trust", hidden=True, help="Allow the file of --config to name effects, which run as code."),
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="Python file with your own effects. May be repeated.")

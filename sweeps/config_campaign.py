@@ -97,10 +97,6 @@ class StoreOptions(FolderPart):
     dry_run: bool = option_field(False, "Print points, chunks, size and expected time, and write nothing")
     export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. May be repeated")
     shard: str | None = option_field(None, "Simulate the i-th of n shares, such as 3/8, in a job array")
-    scheduler: str | None = option_field(
-        None,
-        "Address of a dask scheduler, such as tcp://host:8786",
-    )
 
     @model_validator(mode="after")
     def _shared(self) -> Self:
@@ -110,8 +106,6 @@ class StoreOptions(FolderPart):
             raise PydanticCustomError(
                 "idle", f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8"
             )
-        if self.shard is not None and self.scheduler is not None:
-            raise PydanticCustomError("idle", "`shard`: not allowed with `scheduler`; give one of them")
         return self
 
     @property
@@ -128,7 +122,7 @@ class StoreOptions(FolderPart):
     @property
     def of_store(self) -> bool:
         """True if an option is given that only a store supports."""
-        return any((self.zarr, self.outputs, self.dry_run, self.export, self.shard, self.scheduler))
+        return any((self.zarr, self.outputs, self.dry_run, self.export, self.shard))
 
 
 def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> Campaign | Sweep:

@@ -267,7 +267,7 @@ OPTIONS = {
                     "--model", "--duration", "--step", "--discharge", "--left", "--profile", "--runs", "--effects",
                     "--config", "--posterior", "--levers-front"],
     ("sweep", "--dry-run"): ["--voltages", "--slopes", "--payloads", "--configurations", "--chunk", "--shard",
-                             "--scheduler", "--outputs", "--export", "--config"],
+                             "--outputs", "--export", "--config"],
     ("loop", "measured"): ["--prior", "--noise", "--seed", "--replicates", "--forbid", "--prefer", "--within", "--rows"],
     ("calibrate", "measured"): ["--free", "--fix", "--starts", "--population"],
     ("sensitivity",): ["--method", "--parameters", "--vary", "--evaluations", "--candidates"],

@@ -123,7 +123,7 @@ def test_figures_have_claim_machine_command_and_date():
 
 def test_extras_of_the_project_are_those_that_the_docs_name():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
-    assert {"test", "cluster", "bench", "docs"} <= set(extras)
+    assert {"test", "bench", "docs"} <= set(extras)
 
 
 def test_sentences_of_the_example_follow_from_the_recorded_result():

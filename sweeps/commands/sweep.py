@@ -9,7 +9,6 @@ import shutil
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,42 +87,32 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
     robot, place = file.robot, options.where
     plan = axes.plan_design(config, robot, place)
     robot = showing_turns(robot, {*plan.axes, *plan.conditions})
-    pool = None
-    if options.scheduler is not None and not options.dry_run:
-        from sweeps.points import cluster
-
-        pool = cluster.connect_workers(options.scheduler)
+    task = task_of_configuration(config, robot)
+    output_names = options.outputs or config.outputs or task.usual
+    chunk = config.chunk or scale.default_chunk(task)
+    config = config.model_copy(update={"chunk": chunk, "outputs": output_names})
+    job = prepare_job(config, robot, plan, place)
+    layout = store_layout(config, job)
+    path = options.out or default_path("sweep")
+    if options.dry_run:
+        dry_run(job, layout, path)
+        return DONE
+    files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
+    files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
+    identity = job_identity(config, robot, files, scale.device_kind())
+    if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
+        _reject_without_space(layout.size, 1.0, path)  # a continued sweep needs less
+    store = SweepStore(path, identity, layout, force=options.force)
     try:
-        device = scale.device_kind() if pool is None else pool.device
-        task = task_of_configuration(config, robot)
-        output_names = options.outputs or config.outputs or task.usual
-        chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
-        config = config.model_copy(update={"chunk": chunk, "outputs": output_names})
-        job = prepare_job(config, robot, plan, place)
-        layout = store_layout(config, job)
-        path = options.out or default_path("sweep")
-        if options.dry_run:
-            dry_run(job, layout, path)
-            return DONE
-        files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
-        files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
-        identity = job_identity(config, robot, files, device)
-        if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
-            _reject_without_space(layout.size, 1.0, path)  # a continued sweep needs less
-        store = SweepStore(path, identity, layout, force=options.force)
-        try:
-            if not store.finished:
-                simulate_chunks(store, job, options, pool)
-            return finish_sweep(store, config, file, job, identity, options)
-        except BaseException:
-            if options.shard is None:
-                store.abandon()
-            raise
-        finally:
-            store.close()
+        if not store.finished:
+            simulate_chunks(store, job, options)
+        return finish_sweep(store, config, file, job, identity, options)
+    except BaseException:
+        if options.shard is None:
+            store.abandon()
+        raise
     finally:
-        if pool is not None:
-            pool.close()
+        store.close()
 
 
 # --- before ---------------------------------------------------------------------------------------------------------
@@ -208,11 +197,11 @@ def chunks_of_shard(share: tuple[int, int], chunks: int) -> range:
     return range((k - 1) * chunks // n, k * chunks // n)
 
 
-def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, pool: Any) -> None:
+def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions) -> None:
     """Computes and writes the unfinished chunks of this process's share.
 
     Raises:
-        BadConfiguration: the disk has too little space or becomes full, or the scheduler's workers are lost for good.
+        BadConfiguration: the disk has too little space or becomes full.
     """
     store.begin(options.share)
     done = store.done()
@@ -228,10 +217,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     times = scale.Times()
     try:
         with progress_bar(total, quiet=False, done=points_before, rate=True) as advance:
-            if pool is not None:
-                chunks = pool.produce(job, chunks_left)
-            else:
-                chunks = scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance)
+            chunks = scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance)
             scale.write_chunks(store.write, job, chunks, advance, times)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):

@@ -52,7 +52,7 @@ KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """All data needed to compute any chunk of a sweep, in this or another process.
+    """All data needed to compute any chunk of a sweep.
 
     Attributes:
         robot: robot that is varied.
@@ -91,11 +91,9 @@ def device_kind() -> str:
     return f"{device.platform}: {device.device_kind}"
 
 
-def default_chunk(task: Task, device: str | None = None) -> int:
-    """Default number of points in a chunk, on all local devices or, with `device`, on one remote device."""
-    count = len(jax.local_devices()) if device is None else 1
-    accelerator = not (device or device_kind()).startswith("cpu")
-    return task.at_once[accelerator] * count
+def default_chunk(task: Task) -> int:
+    """Default number of points in a chunk, on all local devices."""
+    return task.at_once[not device_kind().startswith("cpu")] * len(jax.local_devices())
 
 
 class Compiled:
@@ -249,13 +247,13 @@ class Piece:
     Attributes:
         chunk: number of chunk.
         arrays: results by variable, possibly still on a device.
-        values: values of its points, one row each. None if they are not available.
+        values: values of its points, one row each.
         told: number of its points that have been reported as done.
     """
 
     chunk: int
     arrays: Json
-    values: Float[np.ndarray, "points names"] | None = None
+    values: Float[np.ndarray, "points names"]
     told: float = 0.0
 
 
@@ -324,9 +322,8 @@ def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] |
     if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
         return None
     sample_range = job.blocks.box(piece.chunk)[-1]
-    if piece.values is not None:  # samples vary fastest
-        return piece.values[: sample_range.stop - sample_range.start, len(design.axes) :].T
-    return samples.values(sample_range.start, sample_range.stop - sample_range.start)
+    # samples vary fastest
+    return piece.values[: sample_range.stop - sample_range.start, len(design.axes) :].T
 
 
 def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
