@@ -523,7 +523,8 @@ class WeakFormFit:
         plan, cut: channels that give the states, and the windows.
         centre, origin: prior mean, and coordinates of the terms.
         rows: points with states without noise.
-        smooth, read: terms there, and at the readings.
+        smooth: terms there.
+        read: terms f and y at the readings.
     """
 
     z: np.ndarray
@@ -537,7 +538,7 @@ class WeakFormFit:
     origin: np.ndarray
     rows: LogPoints
     smooth: EquationTerms
-    read: EquationTerms
+    read: tuple[Any, Any]
 
 
 def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakFormFit | None:
@@ -576,11 +577,12 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         The covariance and the noise-free states (`with_smooth_states`) are computed once, at z."""
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
         terms_there = terms(smooth, z)
-        read, none = terms(rows, z), np.zeros(equations)
+        given, none = terms(rows, z), np.zeros(equations)
+        read = given.f, given.y  # the rest of a long log is large
         plain = [covariance_factor(plan, w, sd, terms_there, none) for w in cut]
         whitened_windows = [
             (
-                window_errors(plan, w, (read.f, read.y)),
+                window_errors(plan, w, read),
                 np.sum(x**2, 1),
                 np.tile(np.sum(w.weight**2 / w.steps, 1), equations),
             )
@@ -591,7 +593,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         )
         unknown = disturbance_intensities(*by_equation)
         factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut] if unknown.any() else plain
-        offset = whole(factors, (read.f, read.y)) - whole(factors, (terms_there.f, terms_there.y))
+        offset = whole(factors, read) - whole(factors, (terms_there.f, terms_there.y))
 
         states[:] = [centre, z, smooth, terms_there, read]
         last: list[tuple[np.ndarray, np.ndarray, tuple[Any, Any]]] = []

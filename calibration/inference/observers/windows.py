@@ -198,7 +198,7 @@ def problem_of_windows(
     data = dataclasses.replace(data_from_readings(none, np.ones_like(none), size), centre=jnp.asarray(fit.centre))
     finite = functools.partial(np.nan_to_num, posinf=0.0, neginf=0.0)
     reading_slopes = finite([np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True)])
-    errors = fit.read.f[..., None], fit.read.y[..., None]
+    errors = [x[..., None] for x in fit.read]
     plain = [jnp.asarray(np.concatenate(x, 2)) for x in zip(errors, terms.by_z, terms.by_effects, strict=True)]
 
     def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
