@@ -271,7 +271,7 @@ def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):
     found = Comparison(table, summary, measured.channels, "a&b.csv", "steady", "<b>x.toml")
     page = page_renderer.write_report_page(tmp_path, comparison_report.comparison_document(found)).read_text()
     assert "<b>x.toml" not in page and "&lt;b&gt;x.toml" in page and "a&amp;b.csv" in page
-    assert drawn(page) == {"parity", "errors"} and outside(tmp_path) == []
+    assert drawn(page) == {"errors"} and outside(tmp_path) == []
     tables = Tables(page).tables
     assert [row[4] for row in tables["errors"][1:]] == [
         f"{cell['rms_percent']:.1f}" for cells in summary.values() for cell in cells.values()

@@ -1,4 +1,4 @@
-"""Figures of a comparison with measured runs: parity, and errors over each condition."""
+"""Figures of a comparison with measured runs: readings of an exported drive, and errors over each condition."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from sweeps.pages.figure_style import (
     INK,
     LOOKS,
     VERMILION,
-    add_corner_note,
-    axis_label,
     configuration_looks,
     new_figure,
 )
@@ -45,41 +43,6 @@ def draw_export_readings(compared: ExportComparison) -> Figure:
         axes.set_xlabel(f"{compared.reference}: {channel.label} [{channel.unit}]", color=INK)
         axes.set_ylabel(f"{channel.label} [{channel.unit}]", color=INK)
         axes.legend(loc="upper left", frameon=False)
-    return fig
-
-
-def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) -> Figure:
-    """Simulated over measured, one panel a channel. A reading that is missing is not drawn.
-
-    Args:
-        band: True to shade ±5 %.
-    """
-    fig, grid = new_figure(1, len(channels), 3.6)
-    look = configuration_looks(table["configuration"])
-    for axes, channel in zip(grid[0], channels, strict=True):
-        measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
-        is_paired = np.isfinite(measured) & np.isfinite(simulated)
-        ends = (
-            np.concatenate([measured[is_paired], simulated[is_paired]]) if is_paired.any() else np.array([0.0, 1.0])
-        )
-        low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
-        span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
-        if band:
-            axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
-        axes.plot(span, span, color="#666666", lw=0.9)
-        for kind, (colour, marker) in look.items():
-            pick = is_paired & (table["configuration"] == kind)
-            if pick.any():
-                _draw_dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
-        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
-        axes.set_xlim(*span)
-        axes.set_ylim(*span)
-        if not is_paired.any():
-            add_corner_note(axes, "no row has both numbers")
-    if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
-        grid[0, 0].legend(loc="lower right")
-    if band:
-        add_corner_note(grid[0, 0], "band: ±5 %")
     return fig
 
 

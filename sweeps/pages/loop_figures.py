@@ -1,4 +1,4 @@
-"""Figures of the loop: residuals before and after, the score ladder, defects, laws."""
+"""Figures of the loop: residuals before and after, defects, laws."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from calibration.data.courses import applied_drive
 from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
@@ -23,7 +22,6 @@ from sweeps.pages.figure_style import (
     GREEN,
     INK,
     ORANGE,
-    SKY,
     configuration_looks,
     is_narrow,
     new_figure,
@@ -33,7 +31,6 @@ from sweeps.report.fit_tables import Change
 from sweeps.report.run_tables import UNITS, imposed_column
 
 #: Most effects on the ladder.
-RUNGS = 20
 DEFECT_WORDS = {
     "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
     "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
@@ -185,52 +182,6 @@ def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], ve
 
 #: Most lags of a correlation with the input [samples].
 LAGS = 20
-
-
-def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Correlation of each residual with the input at lags of samples, over all runs, before and after."""
-    fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
-    rows_of_runs = list(runs.rows_by_run().values())
-    applied = applied_drive(runs)
-    largest_lag = min(LAGS, min(map(len, rows_of_runs)) - 1)
-    lags = np.arange(-largest_lag, largest_lag + 1)
-    centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
-    for axes, channel in zip(grid[0], channels, strict=True):
-        limit = 2 / np.sqrt(len(table["time_s"]))
-        axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
-        for when, colour in (("before", ORANGE), ("after", BLUE))[verdict == "none" :]:
-            sums, squares = np.zeros(len(lags)), np.zeros(2)
-            for rows in rows_of_runs:
-                residual = centred(table[f"residual_{when}_{channel.name}_sigma"][rows])
-                drive = centred(applied[rows])
-                sums += np.correlate(residual, drive, "full")[len(rows) - 1 + lags]
-                squares += residual @ residual, drive @ drive
-            axes.plot(lags, sums / max(np.sqrt(squares.prod()), 1e-300), "o-", ms=3, lw=1, color=colour, label=when)
-        axes.set(title=channel.label, xlabel="residual after the input [samples]")
-    grid[0, 0].set_ylabel("correlation with the input")
-    grid[0, 0].legend(loc="best")
-    return fig
-
-
-def draw_effect_scores(found: DiscoveryResult) -> Figure:
-    """Score of every effect at the base fit, with the threshold that noise rarely exceeds."""
-    rungs = found.scores[:RUNGS]
-    effect_names = {e.name for e in found.effects}
-    alike = {n for e in found.effects for n in e.members} - effect_names
-    fig, grid = new_figure(1, 1, 1.1 + 0.24 * len(rungs))
-    axes = grid[0, 0]
-    root = [np.sqrt(r.score) for r in rungs]
-    colours = [BLUE if r.name in effect_names else SKY if r.name in alike else "#c9c9c9" for r in rungs]
-    axes.barh(range(len(rungs)), root, color=colours, height=0.72)
-    level = found.before.kinds["single"].threshold
-    axes.axvline(level, color=ORANGE, lw=1.6)
-    axes.text(level, -0.6, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
-    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({place_in_words(r.balance)})" for r in rungs])
-    axes.set_ylim(len(rungs) - 0.4, -1.8)
-    axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: misfit that the effect alone explains at a plausible size [σ]")
-    axes.set_title("blue: found, light blue: indistinguishable from a found effect")
-    return fig
 
 
 #: Share of a variable's range over which the change by an effect is averaged to measure its smoothness.

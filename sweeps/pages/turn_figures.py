@@ -9,14 +9,11 @@ from matplotlib.figure import Figure
 
 from calibration.data import Columns, Json
 from mmrjax.fidelities.base import History
-from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, legend_columns, new_figure
-from sweeps.report.words.turn_words import FULL
 
 SIDES = (("left", BLUE), ("right", VERMILION))
-#: Settled turns of a larger radius are drawn as an arc of so many lengths of the robot.
-ARC = 20.0
 #: A path bends by no more between two points that are drawn [rad].
 BEND = 0.05
 
@@ -38,35 +35,6 @@ def _set_plan_axes(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("to the right of the start [m]", color=INK)
     axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
-
-
-def draw_turn_circle(robot: Robot, row: Json) -> Figure:
-    """The circle of a settled turn from above, or an arc of it, with the robot and the centre of rotation."""
-    rate, speed, across = (float(row[c]) for c in ("yaw_rate_rad_s", "speed_mm_s", "lateral_speed_mm_s"))
-    fig, grid = new_figure(1, 1, 4.6)
-    axes = grid[0, 0]
-    length = float(robot.running_gear.wheelbase)
-    velocity = np.array([speed, across]) * MM
-    size = float(np.hypot(*velocity))
-    # A whole turn, unless it is longer than a few robots.
-    time = ARC * length / max(size, 1e-9)
-    if abs(rate) > 1e-9:
-        time = min(time, FULL / abs(rate))
-        center = np.array([-velocity[1], velocity[0]]) / rate
-        axes.plot(-center[1], center[0], marker="+", color=FAINT, ms=12, mew=2, ls="none")
-        axes.annotate("centre of rotation", (-center[1], center[0]), xytext=(8, 6), textcoords="offset points",
-                      color=INK, fontsize=9)  # fmt: skip
-    times = np.linspace(0.0, time if np.isfinite(time) else 0.0, 200)
-    yaw_angles = rate * times
-    if abs(rate) > 1e-9:
-        x = (velocity[0] * np.sin(yaw_angles) - velocity[1] * (1 - np.cos(yaw_angles))) / rate
-        y = (velocity[0] * (1 - np.cos(yaw_angles)) + velocity[1] * np.sin(yaw_angles)) / rate
-    else:
-        x, y = velocity[0] * times, velocity[1] * times
-    axes.plot(-y, x, color=BLUE)
-    _draw_outline(axes, robot, row, 0.0, 0.0, 0.0, INK)
-    _set_plan_axes(axes)
-    return fig
 
 
 def path_arcs(

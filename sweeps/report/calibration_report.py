@@ -12,7 +12,6 @@ from calibration.data.table import Runs
 from calibration.described import as_paragraph
 from calibration.inference import blocks
 from calibration.inference.feedforward import Feedforward
-from calibration.inference.identifiability import HELD
 from calibration.inference.result import METHOD, CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import fit_words
@@ -59,11 +58,10 @@ def calibration_document(
             catalogue.note("calibration.free"),
         ),
         (
-            Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
             *_over_rows(found, sized),
             *([feedforward_report.voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
-            Section("How sure", tuple(_certainty(found))),
+            Section("How sure", (*_shifts(found), *_certainty(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
         brief=fit_words.brief_calibration(found),
@@ -99,7 +97,6 @@ def _errors(found: CalibrationResult) -> Table:
 
 
 def _shifts(found: CalibrationResult) -> Iterable[Block]:
-    yield catalogue.figure("calibration.parameters", found, words=(HELD,))
     if found.tied:
         ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in found.tied.items())
         yield Note(f"Tied: {'; '.join(ties)}.")
@@ -108,7 +105,7 @@ def _shifts(found: CalibrationResult) -> Iterable[Block]:
 
 
 def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
-    """Sections: frequency response of a log, simulated against measured readings, residuals over each condition."""
+    """Sections: frequency response of a log, residuals over each condition."""
     table, panels = found.rows(), found.channels
     table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in panels}
     if found.axis:
@@ -117,18 +114,11 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
             yield Section("Frequency response", (figure,))
     unit = "the channel's unit, band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
-    figures = (
-        catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
-        catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
-    )  # fmt: skip
-    headings = "Parity", "Residuals against every condition"
-    yield from (Section(heading, (figure,)) for heading, figure in zip(headings, figures, strict=True))
+    figure = catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,))
+    yield Section("Residuals against every condition", (figure,))
 
 
 def _certainty(found: CalibrationResult) -> Iterable[Block]:
-    if found.profiled:
-        yield catalogue.figure("calibration.profiles", found)
-    yield catalogue.figure("calibration.correlations", found)
     weak = [
         (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
         for value, parts in found.identifiability.weak_directions()

@@ -333,7 +333,8 @@ def _sections(
     error_blocks: tuple[Block, ...] = held_out_table(found), catalogue.note("loop.fitted_again"), *in_units
     yield Section("Errors on runs used in the fit, and on held-out runs", error_blocks)
     yield from _certainty_sections(found, missing)
-    yield Section("Candidates", tuple(_candidates(found)))
+    candidates = tuple(_candidates(found))
+    yield from [Section("Candidates", candidates)] if candidates else []
     yield from [looked_for] if missing else []
     rows = [
         (
@@ -378,7 +379,6 @@ def _blocks_of_missing_terms(
         names = ", ".join(detail.orders_unresolved)
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
-        yield catalogue.figure("loop.input_correlation", found.runs, table, found.channels, verdict)
     else:
         if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
             yield catalogue.figure("run.measured_drive_plane", found.robot, found.runs)
@@ -410,9 +410,7 @@ def _closed(found: DiscoveryResult, table: Columns) -> str:
 
 
 def _candidates(found: DiscoveryResult) -> Iterable[Block]:
-    """Section with the scores of all effects, and alternatives that explain the data."""
-    share, allowed = found.settings.shares["single"], found.settings.family_wise_error
-    yield catalogue.figure("loop.ladder", found, words=(100 * (1 - share), 100 * (allowed - share)))
+    """Section with alternatives that explain the data."""
     several = [(_named(a.effects), a.rise_chi2) for a in found.alternatives]
     curves = "; none of them is adequate, or curves explain the data better"
     sizes = [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible]

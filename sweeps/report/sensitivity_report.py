@@ -64,7 +64,7 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
     for k, (name, study) in enumerate(found.outputs.items()):
         yield Section(study.row.label.capitalize(), (Note(_sentence(study, found)),), name, level=3)
         if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _any_influence(study):
-            folded = "tornado, shares, where" if k >= UNFOLDED else ""
+            folded = "tornado" if k >= UNFOLDED else ""
             yield Section("", tuple(_output(name, study, found)), folded=folded)
     if found.next_runs is not None:
         yield Section("What to measure next", tuple(_next_runs(found, found.next_runs)), "measure")
@@ -77,13 +77,12 @@ def _any_influence(study: OutputStudy) -> bool:
 
 
 def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable[Block]:
-    """Section on an output: tornado, indices, and certain interactions, the strongest first."""
+    """Section on an output: tornado and certain interactions, the strongest first."""
     label = study.row.label
-    for kind in ("tornado", "indices"):
-        figure = catalogue.figure(
-            f"sensitivity.{kind}", study, found, finding=_sentence(study, found), words=(label.capitalize(),)
-        )
-        yield dataclasses.replace(figure, name=f"{kind}_{name}")
+    figure = catalogue.figure(
+        "sensitivity.tornado", study, found, finding=_sentence(study, found), words=(label.capitalize(),)
+    )
+    yield dataclasses.replace(figure, name=f"tornado_{name}")
     sure = [pair for pair in interactions(study, found.names) if pair.sure and pair.second >= NEGLIGIBLE / 2]
     rows = [(" with ".join(p.pair), 100 * p.second, "{:.1f} to {:.1f}".format(*(100 * x for x in p.interval)))
             for p in sure[:PAIRS]]  # fmt: skip

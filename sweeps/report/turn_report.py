@@ -48,9 +48,7 @@ def turn_document(
     robot, row = file.robot, {name: values[0] for name, values in run.items()}
     sides, going = sides_table(robot, row), turn_words.has_motion(row)
     sections = []
-    if sides.rows and history is None:
-        sections.append(Section("From above", (catalogue.figure("turn.circle", robot, row),)))
-    elif sides.rows:
+    if sides.rows and history is not None:
         sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, history),)))
     if history is not None:
         sections.append(Section("Over time", (catalogue.figure("turn.course", history),)))
