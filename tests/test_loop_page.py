@@ -38,7 +38,7 @@ from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
 from sweeps.pages import page as page_room
-from sweeps.pages.figure_style import NARROW, figure_settings
+from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.fit_tables import Change
 from sweeps.report.terminal_renderer import print_document
@@ -406,14 +406,3 @@ def test_a_run_that_is_different_is_checked_before_another_experiment():
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):
     resolved(shown("churning", capsys).found, 1e-6).save(tmp_path / "saved")
     assert (tmp_path / "saved/robot_track.toml").exists()
-
-
-def test_labels_of_many_groups_do_not_cover_each_other():
-    """Forty configurations on a phone were a black bar."""
-    speed, count = channels.find_channel("speed"), 40
-    table = {"configuration": np.array([f"t{k:02d}" for k in range(count)]), "supply_voltage_V": np.full(count, 12.0)}
-    table |= {f"residual_{when}_speed_sigma": np.zeros(count) for when in ("before", "after")}
-    with figure_settings(NARROW):
-        (axes,) = loop_figures.draw_residuals_before_after(table, (speed,), "named").axes
-    labels = [label.get_text() for label in axes.get_xticklabels()]
-    assert len(labels) == count and 10 <= len([*filter(None, labels)]) <= 20 and labels[0] == "t00, 12 V"

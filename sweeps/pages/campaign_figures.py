@@ -23,7 +23,6 @@ from sweeps.pages.figure_style import (
     SKY,
     VERMILION,
     add_corner_note,
-    colour_bar,
     new_figure,
 )
 from sweeps.points.climbs import SIZE
@@ -185,7 +184,7 @@ def _draw_map(
     for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
         cells.flat[number] = np.median(values)
     mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    colour_bar(fig, mesh, axes, label=f"median {label}")
+    fig.colorbar(mesh, ax=axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label)
     _set_ticks(axes.xaxis, one)
     _set_ticks(axes.yaxis, other)

@@ -21,7 +21,6 @@ from sweeps.pages.figure_style import (
     ORANGE,
     PURPLE,
     VERMILION,
-    is_narrow,
     new_figure,
 )
 from sweeps.report.climb_report import ClimbResult, footing_coordinates
@@ -29,8 +28,8 @@ from sweeps.report.climb_report import ClimbResult, footing_coordinates
 _GROUND = "#b8a98f"
 #: Most silhouettes on a page.
 SHOWN = 6
-#: Numbers of silhouettes closer than this share of the time are joined, in wide and narrow figures.
-NEAR = (0.03, 0.09)
+#: Numbers of silhouettes closer than this share of the time are joined.
+NEAR = 0.03
 
 
 def _belt_outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -137,7 +136,7 @@ def draw_climb_course(found: ClimbResult) -> Figure:
             ax.axvline(x, color=FAINT, lw=0.8)
         ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
     above = axes[0, 0].secondary_xaxis("top")
-    ends = [0, *(np.flatnonzero(np.diff(times) > NEAR[is_narrow()] * t["time_s"][-1]) + 1), len(times)]
+    ends = [0, *(np.flatnonzero(np.diff(times) > NEAR * t["time_s"][-1]) + 1), len(times)]
     numbers = [(a + 1, b) for a, b in itertools.pairwise(ends)]
     above.set_xticks(
         [(times[a - 1] + times[b - 1]) / 2 for a, b in numbers],

@@ -23,7 +23,6 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     configuration_looks,
-    is_narrow,
     new_figure,
     outer_legend,
 )
@@ -94,7 +93,7 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
         axes.set_ylabel(f"{channel.label} [σ]")
     outer_legend(grid[0, 0], "upper left")
     starts = [0, *edges]
-    step = -(-len(starts) // (NAMED // 2 if is_narrow() else NAMED))
+    step = -(-len(starts) // NAMED)
     group_labels = [groups[a] if k % step == 0 else "" for k, a in enumerate(starts)]
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], group_labels,
                            rotation=90 if sum(len(word) + 2 for word in group_labels) > ABREAST else 0)  # fmt: skip

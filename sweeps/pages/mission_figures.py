@@ -7,10 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.integrate import cumulative_trapezoid
 
-from calibration.data import Columns, Json
+from calibration.data import Columns
 from mmrjax.model.channels import SIDES
-from mmrjax.model.energy import SINKS
-from sweeps.pages import words
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -18,21 +16,14 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     PURPLE,
-    SKY,
     VERMILION,
     add_corner_note,
-    legend_columns,
     new_figure,
 )
 from sweeps.points.imposed import UNLIMITED
 
 #: Units of a time axis: shortest mission [s], size [s], name.
 _TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
-#: Colours of uses of energy.
-_COLOURS = {
-    "battery": INK, "other": FAINT, "driver": FAINT, "winding": VERMILION, "motor": ORANGE, "gearbox": PURPLE,
-    "track": BLUE, "sliding": SKY, "rolling": SKY, "lift": GREEN,
-}  # fmt: skip
 
 
 def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
@@ -106,7 +97,7 @@ def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
 def _draw_legend(axes: Axes, *others: Axes) -> None:
     handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
     labels = [str(h.get_label()) for h in handles]
-    axes.legend(handles, labels, loc="upper center", ncols=legend_columns(labels), fontsize=8)
+    axes.legend(handles, labels, loc="upper center", ncols=len(labels), fontsize=8)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for the label
 
@@ -218,34 +209,3 @@ def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
         add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
-
-
-def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> Figure:
-    """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
-
-    Args:
-        run: row of the run in runs.csv.
-    """
-    energy = float(run["energy_drawn_Wh"])
-    source = "drawn from the battery's charge" if on_battery else "drawn from the supply"
-    bars: list[tuple[str, float, str]] = [(source, energy, INK)]
-    for name in SINKS:
-        bars.append((words.sink_labels(on_ground)[name], float(run[f"energy_to_{name}_Wh"]), _COLOURS[name]))
-    bars.append(("kinetic energy at the end", float(run["energy_stored_Wh"]), FAINT))
-    bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
-    bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(energy, 1e-12)]
-    fig, grid = new_figure(1, 1, 0.9 + 0.34 * len(bars))
-    axes = grid[0, 0]
-    bar_positions = np.arange(len(bars), dtype=float)
-    widths = np.array([bar[1] for bar in bars])
-    axes.barh(bar_positions, widths, height=0.7, color=[bar[2] for bar in bars])
-    for y, (_, width, _) in zip(bar_positions, bars, strict=True):
-        share = f" ({100 * width / energy:.1f} %)" if energy > 0 else ""
-        axes.text(max(width, 0.0), y, f"  {width:.3g} Wh{share}", va="center", fontsize=8.5)
-    axes.set_yticks(bar_positions, [bar[0] for bar in bars], fontsize=9)
-    axes.invert_yaxis()
-    axes.grid(False, axis="y")
-    axes.axvline(0, color="#666666", lw=0.8)
-    low = min(0.0, float(widths.min()))
-    axes.set(xlabel="energy [Wh]", xlim=(1.1 * low, 1.22 * float(widths.max())))
-    return fig

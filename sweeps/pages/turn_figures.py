@@ -11,7 +11,7 @@ from calibration.data import Columns, Json
 from mmrjax.fidelities.base import History
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
-from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, legend_columns, new_figure
+from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
 
 SIDES = (("left", BLUE), ("right", VERMILION))
 #: A path bends by no more between two points that are drawn [rad].
@@ -84,7 +84,7 @@ def draw_turn_course(history: History) -> Figure:
     steady = read["motor_current_left"][time > 0.1 * time[-1]], read["motor_current_right"][time > 0.1 * time[-1]]
     axis_limit = float(np.nanmax(np.abs(np.concatenate(steady)), initial=0.1))
     grid[0, 0].set_ylim(-2.5 * axis_limit, 2.5 * axis_limit)
-    grid[0, 0].legend(ncols=legend_columns(grid[0, 0].get_legend_handles_labels()[1], 2))
+    grid[0, 0].legend(ncols=2)
     grid[-1, 0].set_xlabel("time [s]", color=INK)
     return fig
 
