@@ -134,9 +134,6 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
         fall = got.found.chi2[0] - got.found.chi2[1]
         assert e.score == pytest.approx(fall, abs=0.1) or len(got.found.effects) > 1
-    assert got.text.count('id="definitions"') == 1
-    for heading in ("Lowers the misfit by:", "Family-wise p:", "Rise of χ²:", "Score:"):
-        assert got.page.text.count(heading) == 1
 
 
 @pytest.mark.slow
@@ -170,8 +167,8 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     """A stranger has to find the law, its band and whether the robot can be used before anything else."""
     got = shown("churning", capsys)
     head = got.text[: got.text.index('<nav id="contents"')]
-    assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
-        head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
+    assert [head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")] == sorted(
+        head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")
     )
     assert "May I use it for …" in head and "new law, 95 % band" in head
     with figure_settings():

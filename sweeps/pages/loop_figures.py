@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.bases import place_in_words
@@ -102,50 +101,6 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
     words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
     grouping = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
     grid[-1, 0].set_xlabel(f"runs, in each group {grouping}, band: ±2σ of the instruments")
-    return fig
-
-
-#: Most histories whose residual is drawn, and samples over which it is averaged.
-RUNS_SHOWN, AVERAGED = 8, 5
-
-
-def _range_text(x: np.ndarray) -> str:
-    low, high = np.min(x), np.max(x)
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
-def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every history over time in sigmas, before and after. One column for each run, with samples as dots
-    and their running mean as a line. `table` has the rows of `runs`.
-    """
-    names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
-    count = len(channels)
-    fig, grid = new_figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
-    whens = [("before", ORANGE)] if verdict != "none" else []
-    whens += [("after", BLUE)]
-    for column, name in enumerate(names):
-        run_rows = runs.in_order(name)
-        for axes, channel in zip(grid[:, column], channels, strict=True):
-            axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
-            axes.axhline(0, color=FAINT, lw=0.8)
-            for when, colour in whens:
-                y = table[f"residual_{when}_{channel.name}_sigma"][run_rows]
-                axes.plot(table["time_s"][run_rows], y, ".", ms=3, color=colour, alpha=0.35)
-                if len(y) >= AVERAGED:
-                    smooth = np.convolve(y, np.ones(AVERAGED) / AVERAGED, "valid")
-                    edge = AVERAGED // 2
-                    axes.plot(table["time_s"][run_rows][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
-            if column == 0:
-                axes.set_ylabel(f"{channel.label} [σ]")
-        first_row = run_rows[0]
-        grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first_row]} {_range_text(table[imposed_column(table)][run_rows])} "
-            f"{UNITS[imposed_column(table)]}"
-            + (f" {_range_text(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
-        )  # fmt: skip
-        grid[-1, column].set_xlabel("time [s]")
-    words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
-    fig.suptitle(f"{words}, line: mean of {AVERAGED} samples, band: ±2σ of the instruments", fontsize=8.5)
     return fig
 
 
