@@ -257,7 +257,7 @@ def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig,
         "import sys; from calibration.data import robot_file; "
         "from sweeps.export import jax_actuator, joint, law_source; "
         "drive = joint.joint_of_robot(robot_file.find_robot_file('rig.toml')); "
-        "module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None))); "
+        "module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None))); "
         "sys.stdout.buffer.write(jax_actuator.serialise_actuator(module))"
     )
     found = []

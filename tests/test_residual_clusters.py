@@ -267,8 +267,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     assert document["residual_clusters"][0]["statement"] == found.statement and found.statement in document["notes"]
     document = calibration_report.calibration_document(shifted, "nominal")
     page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")
-    assert "residuals of speed cluster by idle_wheel" in page
-    assert Tables(page).tables
+    assert found.statement in Tables(page).text
 
 
 @pytest.mark.slow

@@ -90,8 +90,10 @@ BOTH_WAYS = [800, 1600, 2400, 3200, 4000, 4800, -800, -1600, -2400, -3200, -4000
 
 @pytest.fixture
 def bench(tmp_path):
-    """A motor on a bench, its speed imposed, its current alone read, both ways, and its table."""
+    """A motor on a bench with numbers of its own, its speed imposed, its current alone read, both ways, and its table."""
     rig = of_kind(tmp_path, "bench", speed=True)
+    stated = re.sub(r'"([\d.e-]+) ±', lambda number: f'"{1.04 * float(number[1]):.3g} ±', rig.read_text("utf-8"))
+    rig.write_text(stated, "utf-8")
     return rig, table_of(rig, {"bench.loss_coulomb": 0.07}, BOTH_WAYS)
 
 
@@ -235,13 +237,6 @@ def test_what_a_rig_does_not_have_is_refused_in_one_sentence(mmrjax, tmp_path, c
 # --- what is imposed where nothing is stated -----------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_a_single_run_takes_the_limit_of_the_file(mmrjax, tmp_path):
-    rig = of_kind(tmp_path, "bench")
-    ends(mmrjax("simulate --robot", rig, "--set", "motor.voltage_limit=18", "--out", "run", "--no-report"), code=0)
-    assert float(rows_of(tmp_path / "run/runs.csv")[0]["supply_voltage_V"]) == 18.0
-
-
 def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
     robot = robot_file.change_robot(
         robot_file.read_robot(of_kind(tmp_path, "bench", speed=True)), {"motor.speed_limit": 500.0}, "x"
@@ -256,19 +251,6 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
 
 
 # --- sweep --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
-    rig = of_kind(tmp_path, "bench")
-    _, out, err = ends(
-        mmrjax("sweep --robot", rig, "--set", "motor.voltage_limit=24", "--out", "run"),
-        "Thirds of the voltage_limit in the robot's file are used: 8,16,24",
-        code=0,
-    )
-    table = rows_of(tmp_path / "run/runs.csv")
-    assert [float(row["supply_voltage_V"]) for row in table] == [8.0, 16.0, 24.0]
-    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
 @pytest.mark.slow
@@ -299,26 +281,6 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     ends(mmrjax("sweep", plan), "the robot's file imposes the motor speed")
 
 
-@pytest.mark.slow
-def test_a_vehicle_is_drawn(mmrjax, tmp_path):
-    rig = of_kind(tmp_path, "wheeled")
-    _, out, err = ends(
-        mmrjax(
-            "render x.png --robot",
-            rig,
-            "--voltage",
-            "12",
-            "--duration",
-            "0.2",
-            "--begin",
-            "0.1",
-        ),
-        code=0,
-    )
-    assert (tmp_path / "x.png").stat().st_size > 1000
-    assert "has no running_gear" in err and words_of_others(out, err) == []
-
-
 # --- measured tables ----------------------------------------------------------------------------------------------
 
 
@@ -332,7 +294,7 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
         mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"),
         code=0,
     )
-    assert re.search(r"rms error before → after on .*: total current 18", said)
+    assert re.search(r"rms error before → after on .*: total current 16.0 → 0.8 %", said)
     assert "speed" not in said.splitlines()[0]
     fitted = robot_file.read_robot(tmp_path / "fitted/robot.toml")
     assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
@@ -354,7 +316,7 @@ def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
     defects = (tmp_path / "found/figures/defects.svg").read_text()
     assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
     page = (tmp_path / "found/report.html").read_text()
-    assert "The channels determine the defects of 1 equation: torque." in page
+    assert "The channels determine the errors of 1 equation: torque." in page
     assert words_of_others(*left_in(tmp_path / "found"), told, err) == []
 
 
@@ -415,15 +377,6 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     amplitude = effect["parameters"]["amplitude"]
     assert effect["standing"] == "established" and effect["name"] in ("churning", "windage")
     assert abs(amplitude["value"] - 6e-9) < 3 * amplitude["sd"] < 1e-9
-
-
-@pytest.mark.slow
-def test_check_says_what_columns_of_an_own_table_are(mmrjax, tmp_path):
-    (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
-    data = precise_table(tmp_path / "runs.csv")
-    _, told, _ = ends(mmrjax("rig check motor.toml", data, "--verbose"), code=0)
-    assert re.search(r"supply_voltage_V, yours U \[V\] +imposed +18 +-23 +24", told)
-    assert re.search(r"motor_current_A, yours Strom \[mA\] +channel motor_current", told)
 
 
 @pytest.mark.slow

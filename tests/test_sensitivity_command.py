@@ -168,15 +168,6 @@ def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path, outputs):
     assert config["method"] == "sobol" and config["evaluations"] == 3000
 
 
-@pytest.mark.slow
-def test_morris_has_indices_of_its_own(mmrjax, tmp_path):
-    code, _, _ = mmrjax(*SMALL, "--method", "morris", "--no-report", "--out", "m")
-    document = read_json(tmp_path / "m/result.json")
-    jsonschema.validate(document, SCHEMA)
-    index = document["indices"]["speed"]["motor.torque_constant"]
-    assert code == 0 and {"mean_absolute_effect", "mean_effect", "sd_effect"} <= set(index)
-
-
 def test_a_share_of_a_reading_of_zero_tells_nothing():
     told = next_runs.fisher_information(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
     assert_array_equal(told, [[[0.25]]])
@@ -284,37 +275,6 @@ def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
     got, _, _ = mmrjax(*SMALL, "--method", "local", "--candidates", "two.csv", "--no-report", "--out", "c")
     runs = read_json(tmp_path / "c/result.json")["next_runs"]
     assert got == 0 and runs["candidates"] == 2 and runs["source"] == "two.csv" and len(runs["runs"]) == 2
-
-
-@pytest.mark.slow
-def test_points_that_are_not_held_are_said(mmrjax, tmp_path):
-    ends(
-        mmrjax(
-            "sensitivity --parameters",
-            NAMES[0],
-            "--voltages",
-            "24",
-            "--payloads",
-            "0",
-            "--slopes",
-            "0,25",
-            "--configurations",
-            "6T2A",
-            "--outputs",
-            "speed",
-            "--evaluations",
-            "2000",
-            "--no-report",
-            "--out",
-            "h",
-        ),
-        "1 of 2 operating points are left out",
-        code=0,
-    )
-    document = read_json(tmp_path / "h/result.json")
-    assert document["outputs"]["speed"]["studied"] == [True, False]
-    low, high = document["indices"]["speed"][NAMES[0]]["total_interval"]
-    assert low < 1 < high  # the only input
 
 
 @pytest.mark.slow

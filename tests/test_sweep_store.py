@@ -12,7 +12,6 @@ import tomllib
 import zlib
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -169,13 +168,6 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path, robot):
     alone = steady(robot, Conditions(0, 24.0, 5.0, 0.0))
     assert_allclose(found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12)
     ends(mmrjax(*grid, "--outputs", "slipp", "--out", "t"), "outputs: got slipp; did you mean slip")
-
-
-def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
-    monkeypatch.setattr(command, "MARGIN", 10**18)
-    ends(mmrjax("sweep --slopes 0,5 --out s"), "--out: results need")
-    assert not list(tmp_path.iterdir())
 
 
 def test_exports_hold_the_store_row_by_row(sweep, tmp_path, whole):
@@ -399,20 +391,6 @@ def begun(sweep, monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_sweep_of_another_configuration_is_refused(begun, sweep):
-    for options, what in (
-        (["--chunk", "50"], r"configuration (chunk was 40, is 50)"),
-        (
-            ["--set", "motor.inductance=2e-4"],
-            "configuration (set.motor.inductance is new, robot motor.inductance was",
-        ),
-    ):
-        _, _, err = ends(begun(*options), f"s.partial contains another sweep, which differs in {what}")
-        assert "choose another path, or use --force to start again" in err
-    assert begun()[0] == 0  # nothing was lost
-
-
-@pytest.mark.slow
 def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, monkeypatch, tmp_path):
     robot = tmp_path / "robot.toml"
     text = robot.read_text()
@@ -430,13 +408,6 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
     _, _, err = ends(begun(), "differs in device")
     assert "differs in device (device was 'cpu: cpu'" not in err
     monkeypatch.undo()
-
-
-@pytest.mark.slow
-def test_force_begins_anew(begun, tmp_path):
-    _, _, err = ends(begun("--chunk", "50", "--force"), code=0)
-    assert "resumes after" not in err
-    compare(tmp_path / "s", tmp_path / "first")
 
 
 def test_identity_differences_are_few_words():
@@ -474,13 +445,6 @@ def test_shares_started_at_once_finish_one_store(whole, tmp_path):
     ended = [(process.communicate(), process.returncode) for process in running]
     assert {code for _, code in ended} == {0}, ended
     assert arrays(tmp_path / "s") == arrays(whole) and not (tmp_path / "s.partial").exists()
-
-
-@pytest.mark.slow
-def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
-    assert sweep("s", "--shard", "2/5")[0] == 0
-    ends(sweep("s"), "resumes after", code=0)
-    assert arrays("s") == arrays(whole)
 
 
 def test_shares_hold_every_chunk_once():
@@ -787,16 +751,6 @@ def test_dry_run_states_points_chunks_bytes_and_time_and_writes_nothing(sweep, t
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 
-@pytest.mark.slow
-def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch, tmp_path):
-    usage = shutil.disk_usage(tmp_path)._replace(free=10**9)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    many = CONFIG.replace("number = 50", "number = 20000000").replace("chunk = 40", "chunk = 100000")
-    for dry in ([], ["--dry-run"]):
-        ends(sweep("s", *dry, config=many), "results need 3.4 GB (uncompressed)", "has 1 GB free")
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
-
-
 def laid_out_of(text):
     stated = tomllib.loads(text)
     config, robot = Campaign(**stated), paper_robots.nominal()
@@ -870,14 +824,3 @@ def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
 
 
 # --- last, since it forgets what was compiled ----------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_chunks_share_one_compilation(sweep, compilations):
-    jax.clear_caches()
-    assert sweep("t", "--chunk", "40")[0] == 0
-    once = len(compilations)
-    compilations.clear()
-    jax.clear_caches()
-    assert sweep("u", "--chunk", "40", config=CONFIG.replace("number = 50", "number = 500"))[0] == 0
-    assert len(compilations) <= once

@@ -156,33 +156,6 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     assert row["total_current_A"] in {r["total_current_A"] for r in rows}
 
 
-@pytest.mark.slow
-def test_the_command_line_reverses(mmrjax, tmp_path):
-    ends(
-        mmrjax("simulate --voltage -15 --no-report --out a"),
-        "speed -438 mm/s",
-        code=0,
-    )
-    mmrjax("simulate --voltage 15 --out b --no-report")
-    (back,), (forth,) = table(tmp_path / "a/runs.csv"), table(tmp_path / "b/runs.csv")
-    for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s"):
-        assert float(back[column]) == pytest.approx(-float(forth[column]), rel=1e-6)
-    ends(
-        mmrjax(
-            "sweep --voltages=-33,-15,15 --slopes 0,5 --payloads 0 --configurations 4W2T --out c",
-        ),
-        code=0,
-    )
-    assert read_json(tmp_path / "c/result.json")["statuses"]["reverses"] == 4
-    assert "-33 V" in (tmp_path / "c/report.html").read_text()
-    ends(
-        mmrjax("simulate --voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
-        "No operating point: gravity drives the robot",
-        code=0,
-    )
-    ends(mmrjax("simulate --voltage -10001"), "supply_voltage_V: got -10001; expected -10000 to 10000")
-
-
 COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm"
 
 
@@ -196,18 +169,6 @@ COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,tot
 def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
     with pytest.raises(BadData, match=f"mine.csv row 2, {sentence}"):
         runs.read_runs(text_file(tmp_path / "mine.csv", f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n{row}\n"))
-
-
-@pytest.mark.slow
-def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
-    (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
-    _, out, _ = ends(mmrjax("compare mine.csv --no-report --out a"), code=0)
-    assert "did not converge" not in out
-    rows = table(tmp_path / "a/comparison.csv")
-    # An error is simulated less measured, with its sign, over the size of the channel.
-    forth, back = (float(row["error_total_current_percent"]) for row in rows)
-    assert forth == pytest.approx(-back) and abs(forth) < 1
-    assert rows[1]["status"] == "reverses"
 
 
 @pytest.fixture(scope="module")
@@ -245,31 +206,6 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     assert (up.starting, up.slipping, up.settled) == pytest.approx((back.starting, back.slipping, back.settled))
     flat = api.simulate(robot, api.Conditions(0, 33.0, 0.0), "drive", duration=5.0)
     assert up.ended[0] > 1.2 * float(flat.total_current)
-
-
-@pytest.mark.slow
-def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
-    asked = "simulate --battery --model drive --discharge 2190 --duration"
-    _, out, _ = ends(mmrjax(asked, "60", "--out", "a"), code=0)
-    (row,) = table(tmp_path / "a/runs.csv")
-    assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
-    when, far = float(row["time_end_s"]), float(row["displacement_m"])
-    assert f"after {when:.1f} s and {far:.2f} m" in out and re.search(rf"displacement.* \[m\] +{far:.2f}\n", out)
-    # The same run, ended just before and just after: where the charge runs out does not depend on the samples.
-    assert mmrjax(asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
-    assert mmrjax(asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 0
-    (before,) = table(tmp_path / "b/runs.csv")
-    assert float(before["displacement_m"]) == pytest.approx(far, abs=0.01)
-    charge = 3.6 * 10 - np.trapezoid(
-        [float(r["total_current_A"]) + 1.5 for r in table(tmp_path / "b/history.csv")],
-        [float(r["time_s"]) for r in table(tmp_path / "b/history.csv")],
-    )
-    assert charge == pytest.approx(0.01 * (float(row["total_current_A"]) + 1.5), abs=0.05)
-    ends(
-        mmrjax("simulate --battery --model drive --discharge 2300 --no-report"),
-        "battery_empty: empty before the start",
-        code=0,
-    )
 
 
 @pytest.mark.slow
@@ -330,14 +266,6 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path, robot):
 def test_bad_limits_and_switches_are_refused(values, sentence, robot):
     with pytest.raises(BadConfiguration, match=sentence):
         robot_file.change_robot(robot, values, where="mine.toml")
-
-
-@pytest.mark.slow
-def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
-    ends(mmrjax("simulate --set gearbox.mesh_theory=true --no-report --out a"), code=0)
-    assert "mesh_theory = true" in (tmp_path / "a/robot.toml").read_text()
-    assert '"gearbox.mesh_theory" = true' in (tmp_path / "a/config.resolved.toml").read_text()
-    ends(mmrjax("simulate --set gearbox.mesh_theory=2 --out b"), "expected true or false")
 
 
 def test_rated_limits_stand_in_the_report(robot):

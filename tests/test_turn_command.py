@@ -195,11 +195,6 @@ def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
         )
 
 
-def test_one_imposed_speed_of_two_sides_is_refused(robot):
-    with pytest.raises(mm.UsageError, match="motor_speed_left needs motor_speed_right too; give both"):
-        mm.simulate(robot, mm.Conditions("6T2A", motor_speed_left=800.0))
-
-
 def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
     (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
     ends(
@@ -288,14 +283,6 @@ def test_compare_sets_both_sides_and_the_yaw_rate_of_turns_beside_their_readings
     left, right, yaw_rate = (float(row[f"simulated_{name}"]) for name in read)
     assert left < 0.5 < right and yaw_rate > 0.3  # to the left, the left track dragged along
     assert (row["duty_left"], row["duty_right"]) == ("0.6", "1")
-
-
-def test_simulate_in_python_refuses_turns_as_the_command_line_does(robot):
-    alone = dataclasses.replace(robot, sides=jnp.asarray(1.0))
-    with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
-        mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
-    with pytest.raises(UsageError, match="duty cannot be combined with duty_left and duty_right"):
-        mm.simulate(robot, mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
 
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
