@@ -230,53 +230,29 @@ def draw_starts(shown: list[StartRun], current_title: str = "total current", spe
 
 
 def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
-    end_time, peak = float(start.time[-1]), float(start.current.max())
+    peak = float(start.current.max())
     run = start.current[start.time > start.starting]
     run = run[len(run) // 20 :] if len(run) > 20 else start.current
     top = max(1.75 * float(run.max()), 0.1)
-    cut = peak > top
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
-    axes.set(
-        xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3))
-    )
+    low = min(0.0, 1.1 * float(start.current.min()))
+    axes.set(xlim=(0, start.time[-1]), ylim=(low, top if peak > top else 1.3 * max(peak, 1e-3)))
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _shade_stages(axes, start)
-    if cut:
+    if peak > top:
         add_corner_note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
-    during = (start.time > start.starting) & (start.time < start.slipping)
-    middle = float(np.median(start.current[during])) if during.any() else 0.0
-    if (
-        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * end_time
-        and start.gets_under_way
-    ):
-        label_time = (start.starting + start.slipping) / 2
-        axes.annotate(f"{middle:.2f} A", (label_time, middle), xytext=(0, 5), textcoords="offset points", ha="center")
-    crest = start.current[last_samples(start.time)].max()
-    axes.annotate(
-        f"{start.ended[0]:.2f} A", (0.98 * end_time, crest), xytext=(0, 5), ha="right", textcoords="offset points"
-    )
 
 
 def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
-    end_time, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
-    axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
-    axes.plot(start.time, start.speed, color=colour)
-    axes.set(xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
-    axes.set_ylabel("speed [mm/s]")
+    top = max(float(start.theoretical.max()), 1.0)
+    axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4, label=r"$V_{x\,teor}$ (shafts)")
+    axes.plot(start.time, start.speed, color=colour, label="$V_x$ (robot)")
+    axes.set(xlim=(0, start.time[-1]), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top))
+    axes.set(xlabel="time [s]", ylabel="speed [mm/s]")
     _shade_stages(axes, start)
-    axes.text(0.02 * end_time, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
-    if 0 < start.settled < end_time and start.gets_under_way:
-        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
-        text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
-        axes.text(start.settled + 0.02 * end_time, 0.1 * start.speed[-1], text, fontsize=8.5)
-    # Right of the line at t' if it is next to the curve, otherwise right of the curve.
-    half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
-    has_room = 0 < start.settled < 0.5 * end_time and start.gets_under_way
-    label_place = (start.settled if has_room else start.time[half], start.speed[half])
-    label_offset = (6, 6) if has_room else (6, -12)
-    axes.annotate(
-        "$V_x$ (robot)", label_place, xytext=label_offset, textcoords="offset points", color=colour, fontsize=8.5
-    )
+    if 0 < start.settled < start.time[-1] and start.gets_under_way:
+        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":", label=f"t' = {start.settled:.2f} s")
+    axes.legend(loc="lower right")
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 

@@ -26,9 +26,9 @@ from sweeps.pages.figure_style import (
     outer_legend,
 )
 from sweeps.report.fit_tables import Change
-from sweeps.report.run_tables import UNITS, imposed_column
+from sweeps.report.run_tables import imposed_column
 
-#: Most effects on the ladder.
+#: Label and unit of the error of each equation, and the variable over which it is drawn, with its label.
 DEFECT_WORDS = {
     "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
     "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
@@ -55,52 +55,21 @@ CONDITION_WORDS = {
 }
 
 
-#: Letters of labels that fit side by side below a figure, and most labels there.
-ABREAST, NAMED = 110, 36
-
-
 def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every reading in sigmas, before and after. Runs are grouped by configuration and voltage."""
-    own_column = imposed_column(table)
-    beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
-    order = np.lexsort((*(table[c] for c in beside), table[own_column], table["configuration"]))
+    """Residual of every reading in sigmas, before and after, over the number of the row."""
     fig, grid = new_figure(len(channels), 1, 1.8 * len(channels), sharex=True)
-    levels = np.unique(table[own_column]).size
-    few = levels <= 8 or own_column == "supply_voltage_V"  # otherwise grouped only by configuration
-    names_configurations = not few or np.unique(table["configuration"]).size > 1
-    groups = [
-        ", ".join(
-            [str(table["configuration"][k])] * names_configurations
-            + [f"{table[own_column][k]:g} {UNITS[own_column]}"] * few
-        )
-        for k in order
-    ]
-    edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
-    x = np.arange(len(order))
     for axes, channel in zip(grid[:, 0], channels, strict=True):
-        before = table[f"residual_before_{channel.name}_sigma"][order]
-        after = table[f"residual_after_{channel.name}_sigma"][order]
+        before, after = (table[f"residual_{when}_{channel.name}_sigma"] for when in ("before", "after"))
         axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
         axes.axhline(0, color=FAINT, lw=0.8)
         if verdict == "none":
-            axes.plot(x, before, "o", ms=4.5, color=BLUE, label="the fitted model")
+            axes.plot(table["row"], before, "o", ms=4.5, color=BLUE, label="the fitted model")
         else:
-            axes.plot(x, before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
-            axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with the effects found")
-        for edge in edges:
-            axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
+            axes.plot(table["row"], before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
+            axes.plot(table["row"], after, "o", ms=4, color=BLUE, label="after: with the effects found")
         axes.set_ylabel(f"{channel.label} [σ]")
     outer_legend(grid[0, 0], "upper left")
-    starts = [0, *edges]
-    step = -(-len(starts) // NAMED)
-    group_labels = [groups[a] if k % step == 0 else "" for k, a in enumerate(starts)]
-    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], group_labels,
-                           rotation=90 if sum(len(word) + 2 for word in group_labels) > ABREAST else 0)  # fmt: skip
-    grid[-1, 0].grid(axis="x", visible=False)
-    varied = own_column == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
-    words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
-    grouping = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
-    grid[-1, 0].set_xlabel(f"runs, in each group {grouping}, band: ±2σ of the instruments")
+    grid[-1, 0].set_xlabel("row, band: ±2σ of the instruments")
     return fig
 
 
