@@ -257,7 +257,7 @@ def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
         left = ((simulated - seen.measured) / seen.sd)[rows]
         assert d["of_readings"][when] == pytest.approx(float(np.nansum(left**2)), rel=1e-9)
         assert d["of_readings"][when] < d[when]  # the rest is what parameters moved from their priors
-    assert f"{d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ², with priors" in got.page.text
+    assert f"readings {d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ²" in got.page.text
 
 
 def test_reading_that_weighs_most_is_named(shown, capsys):

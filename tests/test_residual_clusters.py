@@ -227,7 +227,6 @@ def test_histories_are_compared_by_the_means_of_their_runs():
     assert sum(map(bool, false)) <= 3
     found = find_residual_clusters(made(1, 4.0))
     assert [c.column for c in found] == ["wheel"] and sum(m.rows for m in found[0].levels) == runs_of
-    assert len(found[0].residual) == runs_of
 
 
 # --- tables ---------------------------------------------------------------------------------------------

@@ -613,7 +613,7 @@ def clustered(levels, **other):
     means = tuple(LevelMean(name, "", mean, 9) for name, mean in levels.items())
     known = dict(
         column="wheel", channel="speed", unit="mm/s", within="", reversing=False, levels=means, correlation=None, p=2e-7,
-        alike=(), coarser=(), at=np.zeros(0), residual=np.zeros(0),
+        alike=(), coarser=(),
     )  # fmt: skip
     return ResidualCluster(**{**known, **other})
 
