@@ -11,53 +11,24 @@ from matplotlib.figure import Figure
 
 from calibration.data import Columns
 from mmrjax.model.channels import Channel
-from sweeps.export.comparison import NATIVE, ExportComparison
-from sweeps.export.joint import channels_of
 from sweeps.pages.figure_style import (
-    BLUE,
-    FAINT,
-    INK,
     LOOKS,
-    VERMILION,
     configuration_looks,
     new_figure,
 )
 
 
-def draw_export_readings(compared: ExportComparison) -> Figure:
-    """Readings of the exported drive over those of the reference, a panel for each channel."""
-    situation = compared.situation
-    channel_places = [(k, c) for k, c in enumerate(channels_of(situation.joint)) if c.name in compared.errors[NATIVE]]
-    reference = situation.measured if situation.is_measured else situation.native
-    fig, grid = new_figure(1, max(len(channel_places), 1), 3.4)
-    for axes, (k, channel) in zip(grid[0], channel_places, strict=False):
-        size = 1 / channel.factor
-        reference_readings = reference[:, k] * size
-        ends = np.nanmin(reference_readings), np.nanmax(reference_readings)
-        axes.plot(ends, ends, color=FAINT, lw=1)
-        if situation.is_measured:
-            axes.plot(
-                reference_readings, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native"
-            )
-        axes.plot(reference_readings, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
-        axes.set_xlabel(f"{compared.reference}: {channel.label} [{channel.unit}]", color=INK)
-        axes.set_ylabel(f"{channel.label} [{channel.unit}]", color=INK)
-        axes.legend(loc="upper left", frameon=False)
-    return fig
-
-
 def draw_errors_over_conditions(
     table: Columns,
     channels: Sequence[Channel],
-    in_units: bool = False,
     beside: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Error (35) of each channel over each condition, or over the row number if no condition varies.
+    """Simulated minus measured for each channel over each condition that varies, or over the row number.
+
+    A band shows two standard deviations of the readings if they are known.
 
     Args:
-        beside: columns in addition to conditions, with their headings, for errors in units.
-        in_units: True for errors in the unit of the channel, with a band of two sds if known, over conditions that
-            vary.
+        beside: columns in addition to conditions, with their headings.
     """
     errors_by_condition = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
@@ -66,21 +37,17 @@ def draw_errors_over_conditions(
     conditions = {
         c: words for c, words in errors_by_condition.items() if c in table and f"simulated_{c}" not in table
     }
-    if in_units:
-        conditions |= beside or {}
-        varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
-        conditions = varied or dict(list(conditions.items())[:1])
+    conditions |= beside or {}
+    varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
+    conditions = varied or dict(list(conditions.items())[:1])
     if not conditions:
         conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
     look = configuration_looks(table["configuration"])
     for row, channel in zip(grid, channels, strict=True):
-        error = table[f"error_{channel.name}_percent"]
-        half = 5.0
-        if in_units:
-            error = table[f"simulated_{channel.column}"] - table[channel.column]
-            sd = table.get(channel.sd_column, np.array([np.nan]))
-            half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
+        error = table[f"simulated_{channel.column}"] - table[channel.column]
+        sd = table.get(channel.sd_column, np.array([np.nan]))
+        half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
         for axes, (condition, words) in zip(row, conditions.items(), strict=True):
             axes.axhspan(-half, half, color="#eef3ee", zorder=0)
             axes.axhline(0, color="#666666", lw=0.9)
@@ -96,7 +63,7 @@ def draw_errors_over_conditions(
                 axes.set_xlabel(words)
                 if levels.size <= 8:
                     axes.set_xticks(levels)
-        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit if in_units else '%'}]")
+        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit}]")
     for axes in grid[0]:
         if axes.get_legend_handles_labels()[0] and len(look) <= LOOKS:
             axes.legend(loc="best")

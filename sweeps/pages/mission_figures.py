@@ -64,7 +64,7 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
 
 
 def draw_sides(rows: Columns) -> Figure:
-    """Current and duty of each side, and the yaw rate, over time.
+    """Current of each side, its duty or motor speed, and the yaw rate, over time.
 
     Args:
         rows: rows of history.csv of one run with sides.
@@ -73,12 +73,19 @@ def draw_sides(rows: Columns) -> Figure:
     span = float(rows["time_s"][-1])
     _, size, unit = next(t for t in _TIMES if span >= t[0])
     time = rows["time_s"] / size
+    column, factor, label = ("duty_{}", 100.0, "duty [%]") if "duty_left" in rows else (
+        "motor_speed_{}_rpm", 1.0, "motor speed [rpm]"
+    )  # fmt: skip
     for side, color in (("left", BLUE), ("right", VERMILION)):
         grid[0, 0].plot(time, rows[f"motor_current_{side}_A"], color=color, lw=1.0, label=side)
-        grid[1, 0].plot(time, 100 * rows[f"duty_{side}"], color=color, lw=1.0)
+        grid[1, 0].plot(time, factor * rows[column.format(side)], color=color, lw=1.0)
     grid[2, 0].plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
-    for axes, label in zip(grid[:, 0], ("current of a motor [A]", "duty [%]", "yaw rate [rad/s]"), strict=True):
-        axes.set_ylabel(label)
+    for axes, text in zip(grid[:, 0], ("current of a motor [A]", label, "yaw rate [rad/s]"), strict=True):
+        axes.set_ylabel(text)
+    later = [rows[f"motor_current_{side}_A"][time > 0.1 * time[-1]] for side in ("left", "right")]
+    limit = 2.5 * float(np.nanmax(np.abs(np.concatenate(later)), initial=0.1))
+    low, high = grid[0, 0].get_ylim()
+    grid[0, 0].set_ylim(max(low, -limit), min(high, limit))
     grid[0, 0].legend(ncols=2, fontsize=8)
     grid[-1, 0].set(xlabel=f"time [{unit}]", xlim=(0, time[-1]))
     return fig

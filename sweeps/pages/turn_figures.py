@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from calibration.data import Columns, Json
 from mmrjax.fidelities.base import History
-from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
 
@@ -67,25 +66,6 @@ def draw_history_path(robot: Robot, row: Json, history: History) -> Figure:
     for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
         _draw_outline(axes, robot, row, x[k], y[k], yaw[k], color)
     _set_plan_axes(axes)
-    return fig
-
-
-def draw_turn_course(history: History) -> Figure:
-    """Currents and motor speeds of both sides, and the yaw rate, over time."""
-    time = np.asarray(history.time)[0]
-    read = {name: np.asarray(values)[0] for name, values in history.reading.items()}
-    fig, grid = new_figure(3, 1, 6.0, sharex=True)
-    for side, color in SIDES:
-        for axes, name, factor in ((grid[0, 0], "motor_current", 1.0), (grid[1, 0], "motor_speed", RPM)):
-            axes.plot(time, read[f"{name}_{side}"] / factor, color=color, label=side)
-    grid[2, 0].plot(time, read["yaw_rate"], color=INK)
-    for axes, label in zip(grid[:, 0], ("current [A]", "motor speed [rpm]", "yaw rate [rad/s]"), strict=True):
-        axes.set_ylabel(label, color=INK)
-    steady = read["motor_current_left"][time > 0.1 * time[-1]], read["motor_current_right"][time > 0.1 * time[-1]]
-    axis_limit = float(np.nanmax(np.abs(np.concatenate(steady)), initial=0.1))
-    grid[0, 0].set_ylim(-2.5 * axis_limit, 2.5 * axis_limit)
-    grid[0, 0].legend(ncols=2)
-    grid[-1, 0].set_xlabel("time [s]", color=INK)
     return fig
 
 

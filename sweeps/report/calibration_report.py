@@ -112,9 +112,8 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
         for figure in fit_tables.frequency_response(runs, panels, LINES):
             yield Section("Frequency response", (figure,))
-    unit = "the channel's unit, band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
-    figure = catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,))
+    figure = catalogue.figure("calibration.residuals", table, panels, along)
     yield Section("Residuals against every condition", (figure,))
 
 

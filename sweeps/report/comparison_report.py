@@ -134,7 +134,7 @@ def comparison_document(found: Comparison) -> Document:
     known_sd = any(np.isfinite(found.table.get(c.sd_column, [])).any() for c in found.channels)
     band = " Band: ±2 standard deviations of the readings." * known_sd
     trend = _strongest_trend(found)
-    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=trend, more=band)
+    errors = catalogue.figure("comparison.errors", *table, found.over, finding=trend, more=band)
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
