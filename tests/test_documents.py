@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib
 import io
 import json
 import re
@@ -24,6 +25,7 @@ from mmrjax.model.paper_robots import nominal
 from sweeps import store
 from sweeps.inputs import recorded_fit
 from sweeps.report import (
+    catalogue,
     check_report,
     comparison_report,
     page_renderer,
@@ -262,3 +264,18 @@ def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
 def test_the_page_of_check_draws_motor_and_gear(tmp_path):
     page = page_renderer.write_report_page(tmp_path, check()).read_text(encoding="utf-8")
     assert drawn(page) == {"chart_of_corners", "drive_plane"}
+
+
+def test_every_figure_of_the_catalogue_can_be_drawn():
+    """A figure of turning missions named a function that was gone."""
+    draws = [
+        e["draws"].rpartition(".") for room in catalogue._content().values() for e in room.values() if "draws" in e
+    ]
+    folder = {False: "sweeps.pages", True: "sweeps"}
+    modules = [f"{folder[module.startswith('paper.')]}.{module}" for module, _, _ in draws]
+    assert len(draws) > 40
+    assert [
+        n
+        for m, (_, _, n) in zip(modules, draws, strict=True)
+        if not callable(getattr(importlib.import_module(m), n, None))
+    ] == []

@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.data import Columns, Json
-from mmrjax.fidelities.base import History
 from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, new_figure
 
@@ -55,10 +54,10 @@ def path_arcs(
     return path_points.real, path_points.imag
 
 
-def draw_history_path(robot: Robot, row: Json, history: History) -> Figure:
+def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
     """The path of a run over time from above, with the robot at its start, at its end and in between."""
-    finite = np.isfinite(np.asarray(history.reading["place_x"])[0])
-    x, y, yaw = (np.asarray(history.reading[c])[0][finite] for c in ("place_x", "place_y", "yaw"))
+    finite = np.isfinite(x)
+    x, y, yaw = x[finite], y[finite], yaw[finite]
     fig, grid = new_figure(1, 1, 4.6)
     axes = grid[0, 0]
     ahead, aside = path_arcs(x, y, yaw)

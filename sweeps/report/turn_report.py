@@ -51,7 +51,8 @@ def turn_document(
     sides, going = sides_table(robot, row), turn_words.has_motion(row)
     sections = []
     if sides.rows and history is not None:
-        sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, history),)))
+        path = (np.asarray(history.reading[name])[0] for name in ("place_x", "place_y", "yaw"))
+        sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, *path),)))
     if history is not None:
         names = [f"motor_{what}_{side}" for what in ("current", "speed") for side in SIDES]
         shown = channels_named((*names, "yaw_rate"))
