@@ -20,7 +20,7 @@ from mmrjax.model import paper_robots, params
 from mmrjax.model.channels import SIDES
 from mmrjax.model.quantities import HEAT
 from sweeps.commands import simulate
-from sweeps.pages import mission_figures, turn_figures
+from sweeps.pages import mission_figures
 from sweeps.pages.figure_style import figure_as_svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
@@ -328,7 +328,7 @@ def test_tables_have_no_negative_zero(robot):
 def test_a_path_between_places_that_turn_is_an_arc():
     """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
     x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
-    ahead, aside = turn_figures.path_arcs(x, y, yaw)
+    ahead, aside = mission_figures.path_arcs(x, y, yaw)
     assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
 

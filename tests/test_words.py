@@ -83,8 +83,6 @@ SAMPLES = [
             2e-7,
             (),
             (),
-            np.zeros(2),
-            np.zeros(2),
         ),
     ),
     Remark("unmeasured", name="6T2A.mass"),
