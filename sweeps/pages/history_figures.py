@@ -45,10 +45,6 @@ from sweeps.report.settle_report import IMPOSED
 SEGMENT, COHERENT = 256, 0.7
 #: Fewest rows of a run for a frequency response.
 SHORTEST = 32
-#: Most points of a line in a figure, in pairs of the smallest and largest of equally many samples.
-POINTS = 3000
-
-
 def draw_settled_log(found: Settled) -> Figure:
     """The imposed quantity and each channel over the log, with settled stretches and their means."""
     runs = found.runs
@@ -68,7 +64,7 @@ def draw_settled_log(found: Settled) -> Figure:
     ]
     fig, grid = new_figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
-        axes.plot(*_decimate_line(clock[order], values[order]), color=FAINT, lw=0.8)
+        axes.plot(clock[order], values[order], color=FAINT, lw=0.8, rasterized=len(order) > 3000)
         for s in found.stretches:
             ends = clock[s.rows[0]], clock[s.rows[-1]]
             if s.why:
@@ -79,17 +75,6 @@ def draw_settled_log(found: Settled) -> Figure:
         axes.set_ylabel(label, color=INK)
     grid[-1, 0].set_xlabel("time [s], recordings one after the other")
     return fig
-
-
-def _decimate_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line with fewer points that looks the same: the smallest and largest sample of each group."""
-    size = -(-2 * len(x) // POINTS)
-    if size <= 2:
-        return x, y
-    groups = [slice(k, k + size) for k in range(0, len(x), size)]
-    with np.errstate(all="ignore"):
-        ends = [(np.nanmin(y[g]), np.nanmax(y[g])) if np.isfinite(y[g]).any() else (np.nan, np.nan) for g in groups]
-    return np.repeat([x[g][0] for g in groups], 2), np.ravel(ends)
 
 
 INRUSH = 0.04  # s, shown enlarged
