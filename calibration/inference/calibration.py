@@ -15,7 +15,6 @@ from calibration.data import Names, Priors, surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
-from calibration.data.thinning import used_rows
 from calibration.described import report_in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
@@ -37,7 +36,7 @@ from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import GENERATIONS, LEAST, StoreStage, compute_without_storing
-from calibration.inference.preparation import PreparedInput, prepare_input
+from calibration.inference.preparation import PreparedInput, prepare_input, rows_to_fit
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import calibration_remarks, row_numbers
 from calibration.inference.residual_clusters import find_residual_clusters
@@ -118,7 +117,7 @@ def calibrate(
     for name, (value, low) in counts.items():
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
-    runs, progress = used_rows(runs, robot, rows), report_in_words(tell)
+    (runs, settled), progress = rows_to_fit(runs, robot, rows), report_in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
     facts = observers.facts_of_fidelity(fidelity)
@@ -127,7 +126,7 @@ def calibrate(
     blocks = facts.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
     choose = functools.partial(_free_names, runs, observe, fidelity, free, fix)
-    ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose)
+    ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose, settled=settled)
     for note in (*ready.foreign, *ready.doubted):
         progress(note)
     base, of_product = _with_guide_priors(runs, ready, fidelity)
