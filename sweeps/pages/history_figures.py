@@ -45,6 +45,8 @@ from sweeps.report.settle_report import IMPOSED
 SEGMENT, COHERENT = 256, 0.7
 #: Fewest rows of a run for a frequency response.
 SHORTEST = 32
+
+
 def draw_settled_log(found: Settled) -> Figure:
     """The imposed quantity and each channel over the log, with settled stretches and their means."""
     runs = found.runs
