@@ -74,8 +74,6 @@ SAMPLES = [
             2e-7,
             (),
             (),
-            np.zeros(2),
-            np.zeros(2),
         ),
     ),
     LOST_MOTION,
@@ -269,23 +267,6 @@ def other_noise():
     yield other(0.5, "place", TENTATIVE), other(2, "none")
 
 
-def ruled_out():
-    """What would explain more than the proposal, or as much, but is ruled out."""
-
-    def of(verdict, *names):
-        return SimpleNamespace(verdict=verdict, implausible=names, settings=SimpleNamespace(same=6.0))
-
-    def candidate(rise, *names):
-        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
-
-    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    yield of("named", candidate(6.5, "a"))
-    yield of("place")
-    yield of("named", near)
-    yield of("class", near, better)
-    yield of("place", better, near)
-
-
 WORSE = [
     ((10, 4.3, 4.72), (10, 10)), ((10, 0.141, 0.149), (10, 10)), ((8, 4.0, 5.0), (8, 10)), (None, (10, 8)),
     (None, (10, 9)), (None, (10, 10)),
@@ -304,7 +285,7 @@ def clustered(levels, **other):
     means = tuple(LevelMean(name, "", mean, 9) for name, mean in levels.items())
     known = dict(
         column="wheel", channel="speed", unit="mm/s", within="", reversing=False, levels=means, correlation=None, p=2e-7,
-        alike=(), coarser=(), at=np.zeros(0), residual=np.zeros(0),
+        alike=(), coarser=(),
     )  # fmt: skip
     return ResidualCluster(**{**known, **other})
 
@@ -347,7 +328,6 @@ def sentences():
     yield Proposal("ΔU = 1 V", (), (1.0,), (0.1,), (), 0.0, 3.0, 9).formula
     reasons = RuledOut("a", "power"), RuledOut("b", "size", 2.94, ("x", "y")), RuledOut("c", "edge")
     yield loop_words.why_ruled_out(reasons)
-    yield from map(loop_words.sentence_on_ruled_out_effects, ruled_out())
     for found, predicted in WORSE:
         worse = () if found is None else (WorseChannel("voltage", "motor_speed", *found),)
         yield loop_words.rising_errors_sentence(worse, {"voltage": predicted})
