@@ -221,9 +221,8 @@ def test_report_tells_the_story_in_order(done):
     text = (done.folder / "found/report.html").read_text(encoding="utf-8")
     assert done.result["statement"].split(" (")[0] in text
     order = [
-        'id="answer"', 'id="law"', 'id="summary"', 'id="advice"', 'id="found"', 'id="contents"', 'id="before_after"',
-        'id="defects"', '<table id="errors"', 'id="effects"', 'id="notes"', 'id="ladder"',
-        'id="would_be_seen"', 'id="unseen"', '<table id="base"', '<table id="words"', 'id="files"',
+        'id="answer"', 'id="law"', '<table id="errors"', 'id="advice"', 'id="found"', 'id="contents"',
+        'id="before_after"', 'id="defects"', 'id="adequacy"', 'id="would_be_seen"', 'id="unseen"', '<table id="base"', '<table id="words"', 'id="files"',
     ]  # fmt: skip
     at = [text.find(mark) for mark in order]
     assert -1 not in at and at == sorted(at)

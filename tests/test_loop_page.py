@@ -38,7 +38,7 @@ from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
 from sweeps.pages import page as page_room
-from sweeps.pages.figure_style import NARROW, figure_settings
+from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.fit_tables import Change
 from sweeps.report.terminal_renderer import print_document
@@ -134,9 +134,6 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
         fall = got.found.chi2[0] - got.found.chi2[1]
         assert e.score == pytest.approx(fall, abs=0.1) or len(got.found.effects) > 1
-    assert got.text.count('id="definitions"') == 1
-    for heading in ("Lowers the misfit by:", "Family-wise p:", "Rise of χ²:", "Score:"):
-        assert got.page.text.count(heading) == 1
 
 
 @pytest.mark.slow
@@ -170,8 +167,8 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     """A stranger has to find the law, its band and whether the robot can be used before anything else."""
     got = shown("churning", capsys)
     head = got.text[: got.text.index('<nav id="contents"')]
-    assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
-        head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
+    assert [head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")] == sorted(
+        head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")
     )
     assert "May I use it for …" in head and "new law, 95 % band" in head
     with figure_settings():
@@ -260,7 +257,7 @@ def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
         left = ((simulated - seen.measured) / seen.sd)[rows]
         assert d["of_readings"][when] == pytest.approx(float(np.nansum(left**2)), rel=1e-9)
         assert d["of_readings"][when] < d[when]  # the rest is what parameters moved from their priors
-    assert f"{d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ², with priors" in got.page.text
+    assert f"readings {d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ²" in got.page.text
 
 
 def test_reading_that_weighs_most_is_named(shown, capsys):
@@ -406,14 +403,3 @@ def test_a_run_that_is_different_is_checked_before_another_experiment():
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):
     resolved(shown("churning", capsys).found, 1e-6).save(tmp_path / "saved")
     assert (tmp_path / "saved/robot_track.toml").exists()
-
-
-def test_labels_of_many_groups_do_not_cover_each_other():
-    """Forty configurations on a phone were a black bar."""
-    speed, count = channels.find_channel("speed"), 40
-    table = {"configuration": np.array([f"t{k:02d}" for k in range(count)]), "supply_voltage_V": np.full(count, 12.0)}
-    table |= {f"residual_{when}_speed_sigma": np.zeros(count) for when in ("before", "after")}
-    with figure_settings(NARROW):
-        (axes,) = loop_figures.draw_residuals_before_after(table, (speed,), "named").axes
-    labels = [label.get_text() for label in axes.get_xticklabels()]
-    assert len(labels) == count and 10 <= len([*filter(None, labels)]) <= 20 and labels[0] == "t00, 12 V"

@@ -182,7 +182,7 @@ def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
     outputs = {k: SimpleNamespace(overall_share=v, **one) for k, v in shares.items()}
     found = SimpleNamespace(outputs=outputs, next_runs=None, comparison={}, names=("a", "b"))
     blocks = [block for section in sensitivity_report._sections(found) for block in section.blocks]
-    assert [b.name for b in blocks if isinstance(b, Figure)] == ["tornado_speed", "indices_speed"]
+    assert [b.name for b in blocks if isinstance(b, Figure)] == ["tornado_speed"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.parts import packaged_gearboxes, packaged_motors
-from calibration.sizing import chart, design_search, sheet
+from calibration.sizing import design_search, sheet
 from calibration.sizing.design import OBJECTIVES, build_robot, build_sizing_task, evaluate_design
 from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
@@ -205,17 +205,6 @@ def test_command_leaves_what_its_schema_says(folder):
         )
         == 0
     )
-
-
-@pytest.mark.slow
-def test_chart_has_the_limits_of_the_robot(robot, asked):
-    """On the bench's surface adhesion ends at 14.6°. The required speed counts within its envelope alone."""
-    of = chart.margin_chart(robot, requirements_file.parse_requirements("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
-    steep = of.slope > 14.6
-    assert np.all(of.margin[steep] < 0) and chart.LIMITS[of.nearest[-1, 0]] in ("adhesion", "gearbox input speed")
-    assert of.margin.shape == (chart.POINTS, chart.POINTS) and np.isfinite(of.margin).all()
-    payload, slope = chart.chart_extent(asked)
-    assert payload == pytest.approx(1.6 * 8) and slope == pytest.approx(16)
 
 
 @pytest.mark.slow

@@ -83,8 +83,6 @@ SAMPLES = [
             2e-7,
             (),
             (),
-            np.zeros(2),
-            np.zeros(2),
         ),
     ),
     Remark("unmeasured", name="6T2A.mass"),
@@ -544,30 +542,6 @@ def test_why_an_effect_is_ruled_out():
     )
 
 
-def test_names_say_what_would_explain_more_than_they():
-    def of(verdict, *ruled_out):
-        return SimpleNamespace(verdict=verdict, implausible=ruled_out, settings=SimpleNamespace(same=6.0))
-
-    def candidate(rise, *names):
-        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
-
-    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert (
-        loop_words.sentence_on_ruled_out_effects(of("named", candidate(6.5, "a")))
-        == ""
-        == loop_words.sentence_on_ruled_out_effects(of("place"))
-    )
-    assert loop_words.sentence_on_ruled_out_effects(of("named", near)).startswith(
-        "a would explain as much as what is proposed, but is"
-    )
-    assert loop_words.sentence_on_ruled_out_effects(of("class", near, better)) == (
-        "b and c would explain 30 σ² more than what is proposed, but are ruled out only by size or sign: too large."
-    )
-    assert loop_words.sentence_on_ruled_out_effects(of("place", better, near)).startswith(
-        "a would explain as much as the curve, but is"
-    )
-
-
 @pytest.mark.parametrize(
     ("found", "predicted", "said"),
     [
@@ -639,7 +613,7 @@ def clustered(levels, **other):
     means = tuple(LevelMean(name, "", mean, 9) for name, mean in levels.items())
     known = dict(
         column="wheel", channel="speed", unit="mm/s", within="", reversing=False, levels=means, correlation=None, p=2e-7,
-        alike=(), coarser=(), at=np.zeros(0), residual=np.zeros(0),
+        alike=(), coarser=(),
     )  # fmt: skip
     return ResidualCluster(**{**known, **other})
 

@@ -16,7 +16,7 @@ from calibration.inference.feedforward import UNITS, DriveLog, Feedforward, Tole
 from mmrjax.model.channels import EVERY
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
-from sweeps.report import feedforward_report
+from sweeps.report import calibration_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
 #: Names of signals with the battery voltage.
@@ -46,7 +46,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
     with open_folder("calibrate", config, robot, beside, runs) as folder:
         folder.write_json("feedforward.json", fit.to_json())
         folder.write_table("windows.csv", fit.windows)
-        page = print_report(feedforward_report.feedforward_document(fit))
+        page = print_report(calibration_report.feedforward_document(fit))
         note = "the rig of this log" if has_robot else "a rig that reads this log"
         return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=page, runs=runs)
 

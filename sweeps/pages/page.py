@@ -18,13 +18,11 @@ from calibration.data.writing import write_text
 from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model.robot import Robot
-from sweeps import capabilities, pages
+from sweeps import capabilities
 from sweeps.pages import words
 from sweeps.pages.figure_style import (
-    NARROW,
     figure_as_svg,
     figure_settings,
-    fit_for_phones,
     has_colour_scale,
 )
 from sweeps.pages.time_overlay import TimeOverlay
@@ -43,7 +41,7 @@ class FigureAlbum:
         self.overlays = False
 
     def add(self, name: str, draw: Callable[[], Any]) -> None:
-        """Draws a figure, and a narrow one for phones if its panels are side by side.
+        """Draws a figure.
 
         Args:
             draw: function that returns the figure, or an overlay over time.
@@ -53,16 +51,9 @@ class FigureAlbum:
             if isinstance(figure, TimeOverlay):
                 self.add_overlay(name, figure)
                 return
-            text, narrow = figure_as_svg(figure), ""
-        if pages.FOR_PHONES and hasattr(figure, "panels"):  # `new_figure` made it, so its panels can be stacked
-            with figure_settings(NARROW):
-                narrow = figure_as_svg(fit_for_phones(draw()))
+            text = figure_as_svg(figure)
         write_text(self.folder / f"{name}.svg", printable(text))
-        looks = "scale " * has_colour_scale(figure)
-        picture = _inline_svg(text, name, looks + ("wide" if narrow else "only"))
-        self.pictures[name] = Markup(
-            picture + (_inline_svg(narrow, f"{name}-narrow", looks + "narrow") if narrow else "")
-        )
+        self.pictures[name] = Markup(_inline_svg(text, name, "scale" if has_colour_scale(figure) else ""))
 
     def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
         """Draws readings over time, as a static figure with the data of an interactive one."""
@@ -74,7 +65,7 @@ class FigureAlbum:
 
 
 def _inline_svg(svg: str, name: str, looks: str) -> str:
-    """An SVG document as an element of a page, with the classes `looks` and unique ids."""
+    """An SVG document as an element of a page, with the class `looks` and unique ids."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
     element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
     used_ids = set(re.findall(r'(?:href="|url\()#([^")]+)', element))

@@ -131,21 +131,10 @@ def comparison_document(found: Comparison) -> Document:
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    parity = catalogue.figure(
-        "comparison.parity",
-        *table,
-        False,
-        finding="Simulated minus measured, on average: "
-        + "; ".join(
-            f"{c.label} {np.nanmean(e):+.1f} %"
-            for c in found.channels
-            if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
-        ),
-    )
     known_sd = any(np.isfinite(found.table.get(c.sd_column, [])).any() for c in found.channels)
     band = " Band: ±2 standard deviations of the readings." * known_sd
     trend = _strongest_trend(found)
-    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=trend, more=band)
+    errors = catalogue.figure("comparison.errors", *table, found.over, finding=trend, more=band)
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -169,7 +158,6 @@ def comparison_document(found: Comparison) -> Document:
         ),
         (
             *_over_time(found),
-            Section("Parity", (parity,)),
             Section("Errors against conditions", (errors,)),
             Section("Rows", (_rows(found),)),
         ),

@@ -118,12 +118,7 @@ def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]
     if not clusters:
         return ()
     statements = (f"{c.statement}." for c in clusters)
-    return (
-        Section(
-            "Columns that the residuals depend on",
-            (*remarks(statements, "clusters"), catalogue.figure("fit.clusters", clusters)),
-        ),
-    )
+    return (Section("Columns that the residuals depend on", remarks(statements, "clusters")),)
 
 
 def rows_section(
