@@ -151,7 +151,7 @@ SAMPLES = [
     Remark("thinned", source="log.csv", rows=25000, kept=3600),
     Remark("thinned_table", source="runs.csv", rows=50000, kept=3847),
     *(Remark("settled_runs", source="log.csv", why=why, runs=12, lasts=11.23) for why in ("sides", "unfitted")),
-    Remark("few_points", source="log.csv", runs=12, lasts=11.23, points=3, needed=8, each=0.4),
+    Remark("few_points", source="log.csv", runs=12, lasts=11.23, points=3, needed=6, each=0.4),
     Remark("never_grips", runs=("a",), share=0.31),
     Remark("coarse_steps", lasts=90.0, step=0.03),
     Remark("stops_on_slope", runs=("a", "b")),
