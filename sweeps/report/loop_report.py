@@ -64,8 +64,7 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
     """Figure of the law that was found, on its readings. For logs or without a law: measured and simulated values."""
     if isinstance(found.detail, TimeStatistics):
         lines = _simulated_lines(found)
-        fits = fit_tables.range_of_fits(fit_tables.fits_of_runs(table, found.channels, lines), found.channels)
-        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement, more=fits)
+        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
     elif changes:
         name, change = next(iter(changes.items()))
         effect = next(e for e in found.effects if e.name == name)
