@@ -340,30 +340,17 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         )
         for h in found.hidden
     ]  # fmt: skip
-    candidate_rows = [
-        (
-            f"**{', '.join(a.effects)}**" if a.leads else ", ".join(a.effects), a.rise_chi2, a.rms_sigma,
-            *a.by_kind.values(), a.lost,
-        )
-        for a in found.alternatives_held_out
-    ]  # fmt: skip
-    kinds = (
-        []
-        if not candidate_rows
-        else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
-    )
-    tables: dict[str, tuple[str, Sequence[Any], Sequence[str], Names]] = {
-        "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
-        "hidden": ("hidden", hidden, (), ()),
-        "held": ("alternatives_held_out", candidate_rows, kinds, ()),
-        "implausible": ("implausible", sizes, (), ()),
+    tables: dict[str, tuple[Sequence[Any], Names]] = {
+        "alternatives": (several, (curves if found.verdict in WITHOUT_NAME else "",)),
+        "hidden": (hidden, ()),
+        "implausible": (sizes, ()),
     }
-    if any(rows for _, rows, *_ in tables.values()):
+    if any(rows for rows, _ in tables.values()):
         yield catalogue.note("loop.definitions")
-    for above, (name, rows, more, values) in tables.items():
+    for name, (rows, values) in tables.items():
         if rows:
-            yield catalogue.note(f"loop.{above}-above", *values)
-            yield catalogue.table(f"loop.{name}", rows, *more)
+            yield catalogue.note(f"loop.{name}-above", *values)
+            yield catalogue.table(f"loop.{name}", rows)
 
 
 def _named(values: Mapping[str, float]) -> str:
