@@ -222,18 +222,6 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
     ]
     yield Section("How certain the verdict is", tuple(blocks))
     yield Section("Before you use it", remarks(filter(None, notes)))
-    if found.resolved is not None:
-        d = found.resolved.to_json()
-        rows = [
-            (f"`{n}`", e["value"], e["sd"], e["unit"], "no" if e["held_by_prior"] else "yes")
-            for n, e in d["constants"].items()
-        ]
-        labels = {c.name: c.label for c in found.channels}
-        rms = "; ".join(f"{labels[c]} {e['before']:.2g} → {e['after']:.2g} %" for c, e in d["rms_percent"].items())
-        pairs = "; ".join(f"{a['a']} and {a['b']} ({a['correlation']:+.2f})" for a in d["alike"])
-        trade = catalogue.text("loop.alike", pairs) if pairs else ""
-        table = catalogue.table("loop.resolved_constants", rows)
-        yield Section("What the track model says", (table, catalogue.note("loop.resolved-errors", rms, trade)))
 
 
 def _sections(
