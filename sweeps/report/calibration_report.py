@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
 from calibration.described import as_paragraph, sentences
 from calibration.inference import blocks
 from calibration.inference.feedforward import Feedforward, constant_units, interval_95
-from calibration.inference.result import METHOD, CalibrationResult
+from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import feedforward_words, fit_words
 from mmrjax.errors import count_noun
@@ -29,12 +27,6 @@ def calibration_document(
 ) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
-    chi, about = found.chi_square, found.identifiability
-    estimated = "" if chi.tests_adequacy else catalogue.text("calibration.estimated")
-    facts = catalogue.note(
-        "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
-        chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
-    )  # fmt: skip
     search = Note(
         as_paragraph([found.starts.statement()]), "" if found.converged else "warn", "search", terminal=True
     )
@@ -54,7 +46,6 @@ def calibration_document(
             search,
             *run_tables.curve_warning(found.robot),
             *remarks(found.notes),
-            facts,
             catalogue.note("calibration.free"),
         ),
         (

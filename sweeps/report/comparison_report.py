@@ -151,7 +151,6 @@ def comparison_document(found: Comparison) -> Document:
                 if name not in words.SETTLED
             ),
             _errors_table(found),
-            *([_both_robots(found)] if found.against else []),
             catalogue.note("comparison.errors-note"),
             *remarks(found.notes),
         ),
@@ -210,12 +209,6 @@ def _second_robot(found: Comparison) -> str:
         if rms_pair[c.name][0]
     ]
     return f"This robot and {found.against} on the same {count_noun(shared, 'row')}: {', '.join(parts)}."
-
-
-def _both_robots(found: Comparison) -> Table:
-    error_columns = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
-    rows = [(c.label, *found.rms_of_both[c.name]) for c in found.channels]
-    return catalogue.table("comparison.robots", rows, *error_columns)
 
 
 def _errors_table(found: Comparison) -> Table:
