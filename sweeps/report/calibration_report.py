@@ -52,7 +52,7 @@ def calibration_document(
             *_over_rows(found, sized),
             *([voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
-            Section("How sure", (*_shifts(found), *_certainty(found))),
+            Section("Noise", tuple(_noise(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
         brief=fit_words.brief_calibration(found),
@@ -87,7 +87,7 @@ def _errors(found: CalibrationResult) -> Table:
     return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)
 
 
-def _shifts(found: CalibrationResult) -> Iterable[Block]:
+def _noise(found: CalibrationResult) -> Iterable[Block]:
     if found.tied:
         ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in found.tied.items())
         yield Note(f"Tied: {'; '.join(ties)}.")
@@ -106,16 +106,6 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     along = {found.axis: "time [s]"} if found.axis else {}
     figure = catalogue.figure("calibration.residuals", table, panels, along)
     yield Section("Residuals against every condition", (figure,))
-
-
-def _certainty(found: CalibrationResult) -> Iterable[Block]:
-    weak = [
-        (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
-        for value, parts in found.identifiability.weak_directions()
-    ]
-    if weak:
-        yield catalogue.note("calibration.weak-note")
-        yield catalogue.table("calibration.weak", weak)
 
 
 def feedforward_document(found: Feedforward) -> Document:
