@@ -31,7 +31,7 @@ from calibration.discovery.result import (
     WorseChannel,
 )
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference.fit_notes import Remark
+from calibration.inference.fit_notes import Remark, remarks_with_codes
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words
 from mmrjax.model import channels
@@ -275,7 +275,7 @@ def test_reading_that_weighs_most_is_named(shown, capsys):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, name):
+def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys, tmp_path, name):
     seen = shown(name, capsys)
     made, sd = seen.found, np.sqrt(np.diag(seen.found.posterior.covariance))  # of coordinates whose prior sd is 1
     of_posterior = {n for n, x in zip(made.posterior.coordinates, sd, strict=True) if x > HELD}
@@ -283,25 +283,14 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
     held = {n for n, p in seen.document["base_shift"].items() if p["held_by_prior"]}
     assert held == {n for n in made.held_by_prior if n in made.base_shift}
     assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
-    (note,) = [n for n in made.notes if n.startswith("these runs do not determine ")]
+    (note,) = remarks_with_codes(made.remarks, "held_by_prior")
     far = {n for n, p in made.base_shift.items() if abs(p.shift_after) > FAR}
     pairs = {n for pair in made.together for n in (pair.one, pair.other)}
-    assert note.removeprefix("these runs do not determine ").split(" (posterior")[0].split(", ") == [
-        n for n in made.held_by_prior if n not in far | pairs
-    ]
-    assert " ".join(note.split()) in seen.printed
-    together = " ".join(n for n in made.notes if n.startswith("these runs determine only combinations"))
-    assert far == {n.split()[0] for n in made.notes if " has an implausible value, " in n} and all(
-        n in together for n in pairs
-    )
-    head, *rows = seen.page.tables["base"]
-    said = {row[0]: row[head.index("determined")] for row in rows}
-    assert {n for n, answer in said.items() if answer == "no"} == held - pairs
-    assert {n for n, answer in said.items() if answer.startswith("only with ")} == pairs & set(said)
-    made.save(tmp_path)
-    assert f"do not determine {', '.join(made.held_by_prior)} (posterior" in (tmp_path / "robot.toml").read_text(
-        "utf-8"
-    )
+    assert list(note.names) == [n for n in made.held_by_prior if n not in far | pairs]
+    assert far == {remark.name for remark in remarks_with_codes(made.remarks, "far_from_prior")}
+    assert pairs == {
+        n for r in remarks_with_codes(made.remarks, "only_together") for p in r.pairs for n in (p.one, p.other)
+    }
 
 
 def resolved(found, p, outside=(), settled=True):

@@ -105,15 +105,6 @@ def test_extremes_are_those_of_the_settled_runs(small):
 
 
 @pytest.mark.slow
-def test_sweep_that_slides_everywhere_says_so(tmp_path):
-    runs = _runs("6T2A", (15.0, 33.0), (0.0, 4.0), (25.0, 30.0))
-    assert (runs["status"] == "slides").all()
-    _, page = _write(tmp_path, runs)
-    assert [row[:2] for row in Tables(page).tables["statuses"][1:]] == [["slides", "8"]]
-    assert drawn(page) == SWEEP_FIGURES
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [

@@ -387,24 +387,6 @@ def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path, robot):
     )
 
 
-@pytest.mark.slow
-def test_a_command_says_it_on_stderr_before_it_fits(mmrjax, tmp_path, monkeypatch):
-    text = f"{HEADER}\n{ROW}\n{ROW.replace('2.75', '')}\n"
-    (tmp_path / "runs.csv").write_text(text.replace(",", ";"))
-
-    def stopped(*_, **__):
-        raise KeyboardInterrupt
-
-    for command in ("calibrate", "loop", "compare"):
-        monkeypatch.setattr("sweeps.commands.calibrate.run", stopped)
-        monkeypatch.setattr("sweeps.commands.loop.discover", stopped)
-        err = mmrjax(command, "runs.csv", "--no-report", "--out", command)[2]
-        assert (
-            "separated by semicolons" in err
-            and "1 of 2 cells of total_current_A are empty, the first in row 2" in err
-        )
-
-
 @pytest.mark.parametrize("named", [True, False])
 def test_pages_order_the_rows_of_a_run_as_the_table_does(named):
     """Rows of two runs, mixed and backwards in time. Of one run, where there is no `run_id`."""

@@ -23,7 +23,6 @@ from calibration.inference.preparation import rows_to_fit
 from mmrjax.model import balances, channels
 from tests.commands import csv_text, ends, text_file
 
-CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
 #: Duties of left and right side.
 DUTIES = (

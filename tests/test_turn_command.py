@@ -68,36 +68,6 @@ def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs()
     )
 
 
-REFUSED = {
-    "one side": (("--left", "33"), "--left needs --right"),
-    "volts and duties": (
-        ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
-        "--left cannot be combined with --duty-left",
-    ),
-    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "give --duty-left and --duty-right"),
-    "track, one side": (("--left", "3", "--model", "track"), "--left needs --right"),
-    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left cannot be combined with --profile"),
-    "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
-    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "so it has no steady state"),
-    "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
-    "shaft": (("--left", "3", "--right", "1", "--robot", "SHAFT"), "the robot's load is a shaft"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
-def test_bad_turns_are_refused_in_a_sentence(tmp_path, mmrjax, case):
-    told, sentence = REFUSED[case]
-    one = tmp_path / "one.toml"
-    one.write_text('base = "nominal"\nsides = 1\n')
-    shaft = tmp_path / "shaft.toml"
-    mmrjax("rig new", str(shaft), "--kind", "bench")
-    told = [{"ONE": str(one), "SHAFT": str(shaft)}.get(word, word) for word in told]
-    code, _, err = mmrjax("simulate", *told, "--out", str(tmp_path / "run"))
-    assert code == 2
-    assert sentence in " ".join(err.split())
-    assert not (tmp_path / "run").exists()
-
-
 HEADER, SIDED = "configuration,supply_voltage_V,payload_kg,slope_deg,", "duty_left,duty_right"
 
 
@@ -149,59 +119,12 @@ def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, 
     assert simulate.motor_currents(paper_robots.nominal(), table) == pytest.approx([1.8])
 
 
-def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
-    path = tmp_path / "turns.csv"
-    path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
-    for more in ((), ("--profile", "patrol", "--battery")):
-        ends(
-            mmrjax("simulate --runs", path, "--voltage", "4", "--mass", "12", *more),
-            "--voltage, --mass: not allowed with --runs",
-        )
-
-
-@pytest.mark.parametrize(
-    ("told", "said"),
-    [
-        ("motor_speed_left = 800", "motor_speed_left needs motor_speed_right too; give both"),
-        ("duty = 0.5", "duty cannot be combined with duty_left and duty_right"),
-    ],
-)
-def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
-    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", f"{told}\n[axes]"))
-    ends(mmrjax("sweep plan.toml --no-report --out run"), said)
-
-
-def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, mmrjax):
-    (tmp_path / "plan.toml").write_text(PLAN)
-    narrow = "--set", "6T2A.turning.width=0", "--no-report"
-    told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
-    for words in told:
-        ends(mmrjax(*words, *narrow), "duty_left: the robot's file lacks 6T2A.turning.width [m]")
-
-
 def test_results_of_turns_show_both_sides():
     """Nothing is computed before it is asked for. Who travels straight has the columns of before."""
     robot, sides = paper_robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
     turns, straight = (mm.simulate(robot, mm.Conditions("6T2A", voltage=33.0, **x)) for x in (sides, {}))
     assert {"yaw_rate", "motor_current_left", "motor_current_right"} <= {c.name for c in turns.channels}
     assert straight.channels == robot.channels
-
-
-def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
-    for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
-        ends(
-            mmrjax("simulate --surface ice", *more),
-            "--surface: got ice, for which no friction is known; allowed: linoleum",
-        )
-
-
-def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
-    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
-    ends(
-        mmrjax("sweep plan.toml --no-report --out run"),
-        "duty_left -1: got a slope of 10 deg for a robot that turns",
-    )
-    assert not (tmp_path / "run").exists()
 
 
 SLOPING = {"slope_deg": 10.0, "yaw_rate_rad_s": -0.04}

@@ -421,8 +421,7 @@ def prepare_loop(
             f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
-    with scales.compute_nominal_ahead(robot):
-        ready = preparation.prepare_input(distinct, robot, noise, stated, settled=(*settled, *of_sides))
+    ready = preparation.prepare_input(distinct, robot, noise, stated, settled=(*settled, *of_sides))
     for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
