@@ -203,7 +203,7 @@ def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
     assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)
 
 
-@pytest.mark.parametrize(("levels", "converged"), [(9, False), (9, True), (7, False)])
+@pytest.mark.parametrize(("levels", "converged"), [(6, False), (6, True), (5, False)])
 def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(robot, monkeypatch, levels, converged):
     volts, told, kept = np.repeat(np.linspace(8, 24, levels), 60), [], []
     noise = np.random.default_rng(0).standard_normal((2, len(volts)))
@@ -235,7 +235,7 @@ def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(rob
         prepare=lambda runs, settled: Table(settled, runs),
     )  # fmt: skip
     found = given.trace()
-    if converged or levels < 8:
+    if converged or levels < 6:
         assert (found, kept, told) == ("readings", ["base"], [])
         return
     assert kept == ["base", "ranking", "settled search 0"]

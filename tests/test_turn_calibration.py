@@ -152,6 +152,9 @@ def test_a_log_of_two_sides_is_fitted_at_its_settled_turns(log, robot):
     assert describe(note).startswith(f"{runs.source}: a log of two sides is not fitted over time, so the fit uses")
     assert note.runs == 9 and f"settled runs (9, {note.lasts:.3g} s in all)" in describe(note)
     assert 0.5 < note.lasts / (9 * turns.HOLD * turns.EVERY) < 1
+    rpm = 30 / np.pi  # a ratio of the sides' speeds that is also one of units
+    columns = {**runs.columns, "motor_speed_right_rpm": runs["motor_speed_left_rpm"] / rpm}
+    assert len(rows_to_fit(dataclasses.replace(runs, columns=columns), robot, 4000)[0]) == 9
 
 
 def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp_path, mmrjax):
@@ -161,16 +164,18 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     again = {name: np.tile(x, 4) for name, x in few.columns.items()}
     again["time_s"] = np.arange(len(again["time_s"])) * turns.EVERY
     with pytest.raises(
-        BadData, match=r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 8 or"
+        BadData, match=r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 6 or"
     ):
         rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
     short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
-    with pytest.raises(BadData, match=r"no settled segment: the longest level has .*; hold each level longer"):
+    with pytest.raises(
+        BadData, match=r"the longest level has .*; give one command for straight travel, or hold each"
+    ):
         rows_to_fit(short, robot, 4000)
     table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
     for command in ("loop", "calibrate"):
         run = mmrjax(command, str(table), "--robot", str(file), "--out", str(tmp_path / "out"))
-        ends(run, "too few operating points (3). Hold 8 or more different levels until all readings", code=4)
+        ends(run, "too few operating points (3). Hold 6 or more different levels until all readings", code=4)
         assert not [*tmp_path.glob("out*")]
 
 

@@ -230,7 +230,8 @@ def settle_log(
     if not result.kept:
         raise BadData(_nothing_settled_message(result))
     _check_signs(result)  # from their own sds, because repeats with different signs widen the final ones
-    _check_units(result, {} if robot is None else rolling_readings(robot))
+    if robot is not None and not runs.turns:  # the sides of a turn have different speeds
+        _check_units(result, rolling_readings(robot))
     return dataclasses.replace(
         result,
         stretches=tuple(
@@ -893,7 +894,7 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
 
 def _nothing_settled_message(found: Settled) -> str:
     """Message on a log without settled stretches: main reason and advice."""
-    instead = "" if found.runs.turns else "use the log itself with loop, or "
+    instead = "give one command for straight travel" if found.runs.turns else "use the log itself with loop"
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
     why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
@@ -911,19 +912,19 @@ def _nothing_settled_message(found: Settled) -> str:
             )
         return (
             f"{source}: no settled segment: the longest level has {longest_text} ({rows}); expected at least "
-            f"{least_text}; {instead}{cure}"
+            f"{least_text}; {instead}, or {cure}"
         )
     if why in ("settling", "accelerates"):
         return (
             f"{source}: never settles: at the end of its longest level ({rows}) {longest.channel or 'a channel'} "
-            f"still changes by {100 * longest.size:.2g} % (allowed: {100 * found.drift:g} %); {instead}hold each "
-            "level longer or set a larger --drift"
+            f"still changes by {100 * longest.size:.2g} % (allowed: {100 * found.drift:g} %); {instead}, or hold "
+            "each level longer or set a larger --drift"
         )
     if why == "unread":
         filled_shares = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
         return (
             f"{source}: no settled segment: no channel has enough readings ({filled_shares} of the rows); each level "
-            f"needs at least {FEWEST}; {instead}log them more often"
+            f"needs at least {FEWEST}; {instead}, or log them more often"
         )
     imposed = found.runs.layout.imposed_column
     message_of_reason = {

@@ -35,8 +35,6 @@ DRIVE = {
 CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 #: Relative difference above which a stated value belongs to another part [-].
 DIFFERS = 0.2
-#: Fewest operating points at which a log has to settle.
-POINTS = 8
 
 
 def rows_to_fit(runs: Runs, robot: Robot, most: int) -> tuple[Runs, Notes]:
@@ -56,13 +54,13 @@ def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, Notes]:
         why: reason, a key of `table_words.NOT_OVER_TIME`.
 
     Raises:
-        BadData: they have fewer than `POINTS` operating points, or as for `settling.settle_log`.
+        BadData: they have fewer operating points than the loop needs rows, or as for `settling.settle_log`.
     """
     settled = settling.settle_log(log, robot)
     source, runs, lasts, points = log.source, len(settled.kept), sum(s.lasts for s in settled.kept), settled.points
-    if points < POINTS:
+    if points < (needed := observers.SettledRuns.fewest):
         few = Remark(
-            "few_points", source=source, runs=runs, lasts=lasts, points=points, needed=POINTS, each=settled.shortest
+            "few_points", source=source, runs=runs, lasts=lasts, points=points, needed=needed, each=settled.shortest
         )
         raise BadData(describe(few))
     return settled.settled_runs(), (Remark("settled_runs", source=source, why=why, runs=runs, lasts=lasts),)

@@ -193,7 +193,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "few_points": (
         "{source}: a log of two sides is not fitted over time, and its settled runs ({runs}, {lasts:.3g} s in all) "
         "have too few operating points ({points}). Hold {needed} or more different levels until all readings are "
-        "steady for {each:.2g} s"
+        "steady for {each:.2g} s. For straight travel, give one command instead of two"
     ),
     "thinned_table": (
         "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers refer to "
