@@ -85,6 +85,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.linear_rows import problem_of_readings
 from calibration.inference.observers.windows import Windows, problem_of_windows
+from calibration.inference.optimizers import CORES
 from calibration.inference.population import StoreStage, compute_without_storing
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
@@ -189,7 +190,7 @@ def discover(
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    threads = Threads(2)
+    threads = Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
     sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
