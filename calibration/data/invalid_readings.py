@@ -188,9 +188,10 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
     return is_limited
 
 
-#: Reading above which a signal is not at rest, as a share of its largest value. A reading is held if it stays the
-#: same over these shares of the run and of the imposed range.
-MOVES, HELD = 0.01, 0.1
+#: Reading above which an angle is not at rest, as a share of its largest value. A reading is held if it stays the
+#: same over these shares of the run and of the imposed range. A smaller share suffices for an instrument that repeats
+#: few of its other readings, with the share of readings that differ from the one before.
+MOVES, HELD, SLIGHTLY, NOISY = 0.05, 0.1, 0.02, 0.8
 
 
 def drive_heading(runs: Runs) -> str:
@@ -210,12 +211,14 @@ def without_held(runs: Runs) -> Runs:
     changing = [c for c in shown if np.ptp(np.nan_to_num(runs[c.column])) > 0]  # others are frozen from the start
     for rows, channel in itertools.product(runs.rows_by_run().values(), changing):
         column, readings = channel.column, runs[channel.column][rows]
-        moves = np.abs(readings) > MOVES * np.nanmax(np.abs(readings), initial=0.0)
+        rest = 0.0 if channel.settled else MOVES * np.nanmax(np.abs(readings), initial=0.0)
         begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
         lasts = np.diff(np.r_[begins, len(rows)])
-        for k in np.flatnonzero((lasts > HELD * len(rows)) & moves[begins]):
+        is_long = lasts > HELD * len(rows)
+        noisy = np.mean(lasts[~is_long] == 1) > NOISY if not is_long.all() else False
+        for k in np.flatnonzero(is_long & (np.abs(readings[begins]) > rest)):
             held = rows[begins[k] : begins[k] + lasts[k]]
-            if np.ptp(drive[held]) <= HELD * np.ptp(drive):
+            if np.ptp(drive[held]) <= (SLIGHTLY if noisy else HELD) * np.ptp(drive):
                 continue
             cure = "Empty these cells to use the other rows"
             if channel.settled:
