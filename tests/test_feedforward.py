@@ -12,7 +12,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
 from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
-from sweeps.commands import feedforward_fit
+from sweeps.commands import calibrate as feedforward_fit
 from sweeps.report import calibration_report
 from tests.commands import read_json
 

@@ -37,7 +37,6 @@ from calibration.words import loop_words as words
 from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
-from sweeps.pages import page as page_room
 from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.fit_tables import Change
@@ -101,7 +100,7 @@ def shown(tmp_path_factory):
 def written(folder, found):
     """The page of a result, without its figures: pages with them are those of `shown`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_room, "figure_as_svg", lambda figure: "<svg/>")
+        patch.setattr(page_renderer, "figure_as_svg", lambda figure: "<svg/>")
         return page_of(folder, found)
 
 

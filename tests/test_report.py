@@ -24,7 +24,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import compare
-from sweeps.pages import power_figures, sweep_figures, words
+from sweeps.pages import power_figures, words
 from sweeps.points import run
 from sweeps.report import comparison_report, page_renderer, runs_report, sweep_report
 from sweeps.report.comparison_report import Comparison
@@ -124,19 +124,6 @@ def test_other_grids_are_drawn(shape, tmp_path):
     assert drawn(page) == SWEEP_FIGURES
     assert f"<h1>Sweep of {len(runs['status']):,} runs</h1>" in page
     assert path.stat().st_size < 5e6
-
-
-def test_blocks_cover_each_cell_once():
-    rng = np.random.default_rng(1)
-    cells = {(int(i), int(j)) for i, j in rng.integers(0, 9, (40, 2))}
-    for joined in (True, False):
-        covered = [
-            (i + p, j + q)
-            for i, j, wide, tall in sweep_figures._cover_cells(cells, joined)
-            for p in range(wide)
-            for q in range(tall)
-        ]
-        assert sorted(covered) == sorted(cells)
 
 
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):

@@ -63,8 +63,6 @@ _RC: dict[Any, Any] = {
     "lines.linewidth": 1.8,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
-    "hatch.color": "#9a9a9a",
-    "hatch.linewidth": 0.7,
     "svg.fonttype": "none",
     "svg.hashsalt": "mmrjax",
     "figure.facecolor": "white",

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib import colormaps, colors
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from calibration.data import Columns, Json
@@ -49,8 +48,8 @@ def runs_with_number(runs: Columns, channel: Channel) -> np.ndarray:
 def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     """One channel over slope and payload, a panel for each voltage and configuration.
 
-    With a single slope or payload the panels are lines over the other. A cell that did not settle is hatched
-    and names the reason.
+    With a single slope or payload the panels are lines over the other. A cell that did not settle is grey and
+    names the reason.
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
     volts = panels_by_imposed(runs[imposed_column(runs)], imposed_column(runs))
@@ -93,30 +92,10 @@ def _draw_map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, no
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
             axes.text(i, j, reading_text(image[j, i], channel), color=ink, fontsize=7.5, **_INSIDE)
-    for i, j, wide, tall in _cover_cells(set(missing), joined=not labelled):
-        axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
+    axes.set_facecolor("#d9d9d9")  # behind cells without a number
     _name_missing_cells(axes, missing, labelled)
     _set_ticks(axes.set_xticks, slopes)
     _set_ticks(axes.set_yticks, payloads)
-
-
-def _cover_cells(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
-    """Rectangles (i, j, width, height) that cover the cells, merged if cells touch, otherwise one per cell."""
-    if not joined:
-        return [(i, j, 1, 1) for i, j in sorted(cells)]
-    blocks = []
-    uncovered = set(cells)
-    while uncovered:
-        i, j = min(uncovered)
-        tall = 1
-        while (i, j + tall) in uncovered:
-            tall += 1
-        wide = 1
-        while all((i + wide, j + k) in uncovered for k in range(tall)):
-            wide += 1
-        uncovered -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
-        blocks.append((i, j, wide, tall))
-    return blocks
 
 
 def _name_missing_cells(axes: Axes, missing: dict[tuple[int, int], str], each: bool) -> None:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
 from calibration.described import as_paragraph, sentences
 from calibration.inference import blocks
 from calibration.inference.feedforward import Feedforward, constant_units, interval_95
-from calibration.inference.result import METHOD, CalibrationResult
+from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import feedforward_words, fit_words
 from mmrjax.errors import count_noun
@@ -29,12 +27,6 @@ def calibration_document(
 ) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
-    chi, about = found.chi_square, found.identifiability
-    estimated = "" if chi.tests_adequacy else catalogue.text("calibration.estimated")
-    facts = catalogue.note(
-        "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
-        chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
-    )  # fmt: skip
     search = Note(
         as_paragraph([found.starts.statement()]), "" if found.converged else "warn", "search", terminal=True
     )
@@ -54,14 +46,13 @@ def calibration_document(
             search,
             *run_tables.curve_warning(found.robot),
             *remarks(found.notes),
-            facts,
             catalogue.note("calibration.free"),
         ),
         (
             *_over_rows(found, sized),
             *([voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
-            Section("How sure", (*_shifts(found), *_certainty(found))),
+            Section("Noise", tuple(_noise(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
         brief=fit_words.brief_calibration(found),
@@ -96,7 +87,7 @@ def _errors(found: CalibrationResult) -> Table:
     return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)
 
 
-def _shifts(found: CalibrationResult) -> Iterable[Block]:
+def _noise(found: CalibrationResult) -> Iterable[Block]:
     if found.tied:
         ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in found.tied.items())
         yield Note(f"Tied: {'; '.join(ties)}.")
@@ -115,16 +106,6 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     along = {found.axis: "time [s]"} if found.axis else {}
     figure = catalogue.figure("calibration.residuals", table, panels, along)
     yield Section("Residuals against every condition", (figure,))
-
-
-def _certainty(found: CalibrationResult) -> Iterable[Block]:
-    weak = [
-        (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
-        for value, parts in found.identifiability.weak_directions()
-    ]
-    if weak:
-        yield catalogue.note("calibration.weak-note")
-        yield catalogue.table("calibration.weak", weak)
 
 
 def feedforward_document(found: Feedforward) -> Document:

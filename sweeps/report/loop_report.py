@@ -64,8 +64,7 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
     """Figure of the law that was found, on its readings. For logs or without a law: measured and simulated values."""
     if isinstance(found.detail, TimeStatistics):
         lines = _simulated_lines(found)
-        fits = fit_tables.range_of_fits(fit_tables.fits_of_runs(table, found.channels, lines), found.channels)
-        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement, more=fits)
+        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
     elif changes:
         name, change = next(iter(changes.items()))
         effect = next(e for e in found.effects if e.name == name)
@@ -223,18 +222,6 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
     ]
     yield Section("How certain the verdict is", tuple(blocks))
     yield Section("Before you use it", remarks(filter(None, notes)))
-    if found.resolved is not None:
-        d = found.resolved.to_json()
-        rows = [
-            (f"`{n}`", e["value"], e["sd"], e["unit"], "no" if e["held_by_prior"] else "yes")
-            for n, e in d["constants"].items()
-        ]
-        labels = {c.name: c.label for c in found.channels}
-        rms = "; ".join(f"{labels[c]} {e['before']:.2g} → {e['after']:.2g} %" for c, e in d["rms_percent"].items())
-        pairs = "; ".join(f"{a['a']} and {a['b']} ({a['correlation']:+.2f})" for a in d["alike"])
-        trade = catalogue.text("loop.alike", pairs) if pairs else ""
-        table = catalogue.table("loop.resolved_constants", rows)
-        yield Section("What the track model says", (table, catalogue.note("loop.resolved-errors", rms, trade)))
 
 
 def _sections(
@@ -341,30 +328,17 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         )
         for h in found.hidden
     ]  # fmt: skip
-    candidate_rows = [
-        (
-            f"**{', '.join(a.effects)}**" if a.leads else ", ".join(a.effects), a.rise_chi2, a.rms_sigma,
-            *a.by_kind.values(), a.lost,
-        )
-        for a in found.alternatives_held_out
-    ]  # fmt: skip
-    kinds = (
-        []
-        if not candidate_rows
-        else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
-    )
-    tables: dict[str, tuple[str, Sequence[Any], Sequence[str], Names]] = {
-        "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
-        "hidden": ("hidden", hidden, (), ()),
-        "held": ("alternatives_held_out", candidate_rows, kinds, ()),
-        "implausible": ("implausible", sizes, (), ()),
+    tables: dict[str, tuple[Sequence[Any], Names]] = {
+        "alternatives": (several, (curves if found.verdict in WITHOUT_NAME else "",)),
+        "hidden": (hidden, ()),
+        "implausible": (sizes, ()),
     }
-    if any(rows for _, rows, *_ in tables.values()):
+    if any(rows for rows, _ in tables.values()):
         yield catalogue.note("loop.definitions")
-    for above, (name, rows, more, values) in tables.items():
+    for name, (rows, values) in tables.items():
         if rows:
-            yield catalogue.note(f"loop.{above}-above", *values)
-            yield catalogue.table(f"loop.{name}", rows, *more)
+            yield catalogue.note(f"loop.{name}-above", *values)
+            yield catalogue.table(f"loop.{name}", rows)
 
 
 def _named(values: Mapping[str, float]) -> str:

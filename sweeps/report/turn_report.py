@@ -61,7 +61,6 @@ def turn_document(
         sections.append(Section("Over time", (catalogue.figure("turn.course", rows),)))
     elif turns is not None:
         sections.append(Section("Other turns", (catalogue.figure("turn.turns", turns, row),)))
-    assumed = catalogue.note("turn.grousers" if model == "track" else "turn.rigid")
     return Document(
         f"Turn of {run_headings(run)[0]}",
         turn_words.turn_answer(row, ended),
@@ -70,7 +69,7 @@ def turn_document(
             sides,
             *remarks([*(turn_words.turn_notes(robot, row) if going else []), *notes]),
         ),
-        (*sections, Section("What is assumed", (assumed,))),
+        tuple(sections),
     )
 
 
