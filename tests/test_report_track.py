@@ -128,8 +128,8 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
     kept = fidelities.get_fidelity("track").histories(robot, runs.conditions(robot), {"duration": 0.9, "step": 1e-4})
     batch = jax.device_get(kept)
     short = dataclasses.replace(batch, history=jax.tree.map(lambda x: x[:, :100], batch.history))
-    for name, shown, figures in (("whole", batch, {"history", "power", "ripple", "reactions"}),
-                                 ("short", short, {"history", "power"})):  # fmt: skip
+    for name, shown, figures in (("whole", batch, {"drive_chart", "history", "power", "ripple", "reactions"}),
+                                 ("short", short, {"drive_chart", "history", "power"})):  # fmt: skip
         table = {**simulation.condition_table(robot, runs), **simulation.ending_columns(robot, batch)}
         document = runs_report.runs_document(RobotFile(robot, "nominal"), "track", table, shown)
         path = page_renderer.write_report_page(tmp_path / name, document)

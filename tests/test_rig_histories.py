@@ -337,7 +337,7 @@ def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
     assert table[21]["time_s"] == "0.05"
     ends(
         mmrjax("compare table.csv --robot rig.toml --own-mass --out other"),
-        "--own-mass: table.csv holds time histories",
+        "--own-mass: table.csv contains time histories",
     )
     ends(
         mmrjax("compare table.csv --robot rig.toml --model track --out other"),

@@ -97,7 +97,7 @@ def test_unlike_sides_turn_as_those_that_are_driven_alike(tmp_path):
         turning_figures.turns_under_equal_commands(file.robot, 33.0).reading["yaw_rate"], rates, rtol=1e-9, atol=1e-12
     )
     assert abs(rates[0]) < 1e-9 and rates[1] > 0.01  # the left side's radius is the smaller
-    assert f"4W2T by {rates[1]:.3g} rad/s to the left" in file.remarks[0]
+    assert f"4W2T turns to the left at {rates[1]:.3g} rad/s" in file.remarks[0]
 
 
 def test_effects_of_a_file_say_that_they_are_of_one_side(tmp_path):
