@@ -29,9 +29,8 @@ from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
-from sweeps import cli, console, pages
+from sweeps import cli, console
 
-pages.FOR_PHONES = False  # figures once; browser tests draw them for phones too
 console.FIRST = 1e6  # that a command works depends on the time it takes: tests of what is said don't hear it
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the

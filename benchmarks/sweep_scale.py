@@ -121,13 +121,11 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         begin = time.perf_counter()
         scale.fetch_values(compiled(compiled.points(0)), 1)
         first = time.perf_counter() - begin
-        times, layout = scale.Times(), store_layout(config, job)
+        layout = store_layout(config, job)
         begin = time.perf_counter()
         store = SweepStore(folder / "s", {}, layout)
         store.begin()
-        scale.write_chunks(
-            store.write, job, scale.produce_chunks(compiled, range(len(job.blocks)), times), lambda _: None, times
-        )
+        scale.write_chunks(store.write, compiled, range(len(job.blocks)), lambda _: None)
         total = time.perf_counter() - begin
         statuses = command.points_by_status(store.done().values())
         store.close()
@@ -143,12 +141,6 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         "seconds": total,
         "points_per_s": job.plan.design.points / total,
         "first_chunk_with_compiling_s": first,
-        # three threads: one makes points; one waits for them and starts to compute (on processors, that includes all
-        # of the computing); one waits for results, fetches and writes
-        "points_s": times.points,
-        "compute_s": times.start + times.compute,
-        "transfer_s": times.transfer,
-        "write_s": times.write,
         "statuses": {name: count for name, count in statuses.items() if count},
         "peak_memory_GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
     }

@@ -4,16 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import laws, machines, settled, tables
 from worlds.machines import PAPER, ROLES, TRACKS, WHEELS
-from worlds.settled import readings
+from worlds.settled import CLIMBING, Instruments, readings, remainder
 from worlds.tables import READINGS, narrow
 
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import priors
-from mmrjax.model import params
+from mmrjax.model import paper_robots, params
+from tests.commands import read_json
 
 BUILDS = ((TRACKS,), (WHEELS,), ROLES)
 
@@ -256,3 +257,84 @@ def test_label_of_a_coverage_table_holds_every_truth():
     label = tables.case(w, ["churning"], 8.0, seed=1).label
     assert set(label["constants"]) == set(label["z"]) == {w.machine.public(n) for n in w.machine.free}
     assert any(n.startswith("crawler.") for n in label["z"]) and label["effects"][0]["amplitude"] != 0
+
+
+GRID = settled.table8(payloads=paper_robots.PAYLOADS_KG)
+
+
+CLEAN = readings(GRID, CLIMBING)[0]
+
+
+#: Channels that an effect of a balance may move, and the sign of the largest change at positive amplitude.
+MOVES = {
+    **{b: {"motor_speed": -1, "speed": -1} for b in ("supply", "electrical")},
+    **{b: {"total_current": 1, "motor_speed": -1} for b in ("motor", "gearbox", "track")},
+    "ground": {"total_current": 1, "motor_speed": -1, "speed": -1},
+    "mass": {"total_current": 1, "speed": -1},
+    "slip": {"speed": -1},
+    **{channel: {channel: 1} for channel in laws.CHANNELS},
+}
+
+
+@pytest.mark.parametrize("name", laws.FORMS)
+def test_every_effect_moves_its_channel_and_leaves_the_wanted_sigmas(name):
+    law = laws.FORMS[name]
+    term = dataclasses.replace(laws.draw(name, np.random.default_rng(8)), amplitude=law.size)
+    y, sound = readings(GRID, CLIMBING, [term])
+    change = (y / CLEAN - 1)[:, sound]
+    for k, channel in enumerate(laws.CHANNELS):
+        sign = MOVES[law.balance].get(channel)
+        if sign is not None:
+            largest = change[k][np.abs(change[k]).argmax()]
+            sign = -sign if name == "rolling_radius" else sign
+            assert abs(largest) > 1e-5 and (name == "supply_hunting" or np.sign(largest) == sign), channel
+        elif law.balance in ("slip", *laws.CHANNELS):  # no other channel moves at all
+            assert np.abs(change[k]).max() < 1e-12, channel
+    made = narrow([name], sigmas=8.0, seed=21)
+    (effect,) = made.label["effects"]
+    assert effect["sigmas"] == pytest.approx(8.0, rel=0.05)
+    assert made.label["sigmas_together"] == pytest.approx(effect["sigmas"], rel=1e-6)
+    assert len(made.table["slope_deg"]) == 90 - made.label["rows_lost"]
+
+
+def test_each_of_three_leaves_its_sigmas_beside_the_others():
+    (w,) = worlds("plain", 1)
+    made = tables.case(w, ["churning", "series_resistance", "ammeter_gain"], [8.0, 9.0, 10.0], seed=2)
+    assert [e["sigmas"] for e in made.label["effects"]] == pytest.approx([8, 9, 10], rel=0.05)
+    alone = [tables.case(w, [t.name], seed=2, amplitudes={t.name: t.amplitude}).label for t in made.terms]
+    assert all(a["effects"][0]["sigmas"] > e["sigmas"] for a, e in zip(alone, made.label["effects"], strict=True))
+    # the same by an explicit refit of everything but the first
+    columns = [w.slopes()]
+    for k in (1, 2):
+        column = tables._signature(w, made.terms, k)
+        columns.append((1e4 * column / np.linalg.norm(column))[:, None])
+    left = remainder(tables._signature(w, made.terms, 0), np.concatenate(columns, 1))
+    assert np.linalg.norm(left) == pytest.approx(8, rel=0.05)
+
+
+def test_clean_table_differs_from_its_physics_by_the_stated_noise():
+    cases = [narrow(seed=seed) for seed in range(20)]
+    left = np.concatenate([residuals(c) for c in cases], 1)
+    assert np.abs(left.std(1) - 1).max() < 0.08 and np.abs(left.mean(1)).max() < 0.1
+    shown = np.stack([cases[-1].table[n] for n in READINGS]) / np.array(Instruments().step)[:, None]
+    assert_allclose(shown, np.round(shown), atol=1e-6)
+
+
+def test_cases_are_reproducible_and_their_labels_tell_them_apart():
+    a, b, c = (narrow(["churning"], seed=s) for s in (4, 4, 5))
+    assert a.label == b.label and a.label != c.label
+    for name in a.table:
+        assert_array_equal(a.table[name], b.table[name])
+    clean = narrow(seed=1).label
+    assert clean["sigmas_together"] == 0.0 and clean["kind"] == "clean" and clean["effects"] == []
+    both = narrow(["brush_drop", "resonance_bump"], sigmas=10.0, seed=2).label
+    assert both["kind"] == "library+outside" and [e["class"] for e in both["effects"]] == ["brush_drop", ""]
+    assert all(e["sigmas"] == pytest.approx(10, rel=0.05) for e in both["effects"]) and both["sigmas_together"] > 10
+
+
+def test_table_and_label_are_separate_files_and_the_table_passes_the_input_checks(tmp_path):
+    narrow(["windage"], seed=9).write(tmp_path)
+    assert "windage" not in (tmp_path / "table.csv").read_text()
+    assert read_json(tmp_path / "label.json")["effects"][0]["name"] == "windage"
+    runs = records.read_runs(tmp_path / "table.csv")
+    assert len(runs) == 90 and runs.has("total_current_sd_A")

@@ -380,18 +380,7 @@ class TurnPart(Part):
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = option_field(None, "Duty of the left motor")
     duty_right: Duty | None = option_field(None, "Duty of the right motor")
-    speed_m_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Speed of the settled turn (m/s), with --yaw-rate"
-    )
-    yaw_rate_rad_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Yaw rate of the settled turn (rad/s), positive to the left"
-    )
     heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
-
-    @property
-    def demands(self) -> bool:
-        """True if the configuration states the turn itself and not the drive of each side."""
-        return self.speed_m_s is not None
 
     @property
     def turns(self) -> bool:
@@ -400,17 +389,13 @@ class TurnPart(Part):
 
     @model_validator(mode="after")
     def _of_both_sides(self) -> Self:
-        pairs = ("left_V", "right_V"), ("duty_left", "duty_right"), ("speed_m_s", "yaw_rate_rad_s")
+        pairs = ("left_V", "right_V"), ("duty_left", "duty_right")
         for left, right in pairs:
             if (getattr(self, left) is None) != (getattr(self, right) is None):
                 one, other = (left, right) if getattr(self, right) is None else (right, left)
                 raise PydanticCustomError("idle", f"`{one}` needs `{other}`; give both")
-        side_options = [one for one, _ in pairs if getattr(self, one) is not None]
-        if len(side_options) > 1:
-            raise PydanticCustomError(
-                "idle",
-                f"`{side_options[0]}` cannot be combined with `{side_options[1]}`; give one pair",
-            )
+        if self.left_V is not None and self.duty_left is not None:
+            raise PydanticCustomError("idle", "`left_V` cannot be combined with `duty_left`; give one pair")
         return self
 
 

@@ -179,7 +179,7 @@ def parse_settings(options: list[str]) -> dict[str, bool | float]:
     """
     table: dict[str, bool | float] = {}
     for option in options:
-        name, equals, value = option.partition("=")
+        name, _, value = option.partition("=")
         try:
             word = value.strip()
             table[name.strip()] = word == "true" if word in ("true", "false") else parse_number(word)
@@ -187,8 +187,6 @@ def parse_settings(options: list[str]) -> dict[str, bool | float]:
             raise BadConfiguration(
                 f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"
             ) from None
-        if not equals:
-            raise BadConfiguration(f"--set: got {option}; expected NAME=VALUE, such as motor.resistance=0.9")
     return table
 
 

@@ -5,13 +5,13 @@ import csv
 import numpy as np
 import pytest
 import worlds.histories
-from synthetic import SETTLED, table
+from synthetic import table
 from test_loop_command import mmrjax
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
 from calibration.inference.conduct import conduct_notes
-from calibration.inference.fit_notes import Remark, remarks_with_codes
+from calibration.inference.fit_notes import Remark
 from mmrjax.model import paper_robots, params
 
 CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
@@ -111,19 +111,3 @@ def test_refused_with_4_and_one_sentence(case, command, histories, tmp_path):
     answer = mmrjax(tmp_path, command, "runs.csv", "--out", "x")
     assert answer.code == 4 and REFUSED[case] in answer.err
     assert len(answer.err.strip().splitlines()) == 1 and not (tmp_path / "x").exists()
-
-
-def tenth(case):
-    """A clean table whose sds are stated ten times too small."""
-    columns = dict(case.table)
-    for name in columns:
-        columns[name] = columns[name] / 10 if "_sd_" in name else columns[name]
-    return Runs("runs.csv", columns)
-
-
-@pytest.mark.slow
-def test_loop_says_that_sds_are_ten_times_too_small():
-    found = SETTLED.discover(tenth(tables.narrow(seed=3)))
-    off = found.remarks[0]
-    assert off == Remark("noise_off", channel="", factor=off.factor, source="stated") and 9.0 < off.factor < 11.0
-    assert not remarks_with_codes(SETTLED.discover(table(tables.narrow(seed=3))).remarks, "noise_off")

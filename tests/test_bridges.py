@@ -96,12 +96,14 @@ def checked(kind, one_way, number):
     return numbers
 
 
+@pytest.mark.quick("robot-False", "dyno-True")
 @pytest.mark.parametrize("one_way", [False, True])
 @pytest.mark.parametrize("kind", ["robot", "dyno"])
 def test_every_run_with_a_limit_or_a_diode_is_solved(kind, one_way):
     checked(kind, one_way, 400)
 
 
+@pytest.mark.quick("True")
 @pytest.mark.parametrize("one_way", [False, True])
 def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
     """Along a change of limit and voltage together."""
@@ -128,6 +130,7 @@ def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
     assert (np.abs(slope[1][limited]) > 1).sum() > 20 and (slope[1][~limited] != 0).sum() > 20
 
 
+@pytest.mark.quick("False")
 @pytest.mark.parametrize("one_way", [False, True])
 def test_requirements_behind_a_limit_or_a_diode_are_those_of_a_bisection(one_way):
     """At points of an envelope as `check` and `size` evaluate them, limits from 1 to 3 A."""
@@ -176,6 +179,7 @@ def turned(one_way, number):
     return robot, axes, runs, found, limits, duties
 
 
+@pytest.mark.quick("True")
 @pytest.mark.parametrize("one_way", [False, True])
 def test_settled_turns_with_a_limit_or_a_diode_are_solved(one_way):
     _, _, runs, (travel, motion, _), limits, duties = turned(one_way, 20)

@@ -11,7 +11,6 @@ from test_loop_command import commanded, few_effects, mmrjax, starts_churning
 from test_settle import made as made_log
 from test_time_overlay import overlay
 
-from sweeps import pages
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.document import Document, Figure, Section
 from tests.commands import ROOT, text_file
@@ -59,13 +58,6 @@ FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p
 <div style="overflow:hidden;width:60px;white-space:nowrap">what is cut off at its end</div>
 <figure id="f"><svg width="100" height="50"><text x="70" y="20">beyond the edge</text></svg></figure>
 <script>console.error("no"); fetch("http://localhost:1234/x").catch(() => 0); undefinedThing()</script></body></html>"""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def for_phones():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "FOR_PHONES", True)
-        yield
 
 
 @pytest.fixture(scope="module")

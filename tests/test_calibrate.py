@@ -198,14 +198,6 @@ def test_a_configuration_without_rows_is_refused_where_named_and_left_out_where_
     assert names and all(n.startswith("6T2A.") for n in names)
 
 
-@pytest.mark.slow
-def test_a_constant_condition_is_said(measured):
-    flat = measured.where((measured["slope_deg"] == 10) | (measured["slope_deg"] == 5))
-    level = changed(flat, slope_deg=np.full(8, 5.0), supply_voltage_V=flat["supply_voltage_V"])
-    notes = quick(level.where(np.arange(8) % 2 == 0), noise="current=30%,motor_speed=9%,speed=9%").remarks
-    assert Remark("constant", column="slope_deg", value=5.0, alike="guides") in notes
-
-
 def test_repeats_that_differ_are_said_and_no_error(measured):
     twice = measured.where(np.r_[0:20, 3])
     current = twice["total_current_A"].copy()
@@ -331,24 +323,6 @@ def gaps(measured):
 @pytest.fixture(scope="module")
 def found_with_gaps(gaps):
     return calibrate(gaps, paper_robots.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
-
-
-@pytest.mark.slow
-def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
-    made = found_with_gaps
-    assert made.converged and (made.status == "converged").all()
-    assert made.notes[:2] == (
-        "total_current_A: 2 of 20 readings are missing (rows 3, 8)",
-        "motor_speed_rpm: no readings. Parameters that only this channel determines are not fitted",
-    )
-    assert {c: e.rows for c, e in made.errors_after.items()} == {"total_current": 18, "motor_speed": 0, "speed": 20}
-    assert made.noise["motor_speed"].source == "no readings"
-    assert made.chi_square.degrees_of_freedom == pytest.approx(38 - made.identifiability.leverage.sum())
-    assert made.identifiability.leverage[2, 0] == 0 and not made.identifiability.leverage[:, 1].any()
-    # the share of the speed is that of the misfit of the readings that are there
-    sigma = made.readings["speed"].sigma
-    assert np.sum(sigma**2) == pytest.approx(20 - made.identifiability.leverage[:, 2].sum(), rel=0.01)
-    jsonschema.validate(json.loads(json.dumps(made.to_json())), SCHEMA)
 
 
 @pytest.mark.slow

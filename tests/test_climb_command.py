@@ -1,7 +1,6 @@
 """The command `climb`: what it leaves, how it searches, and what it refuses."""
 
 import csv
-import re
 
 import jax.numpy as jnp
 import jsonschema
@@ -16,48 +15,6 @@ from sweeps.report.climb_report import footing_coordinates
 from tests.commands import ends, read_json, schema_of, text_file
 
 SCHEMA = schema_of("climb")
-
-REFUSED = {
-    "levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--levers-front", "30"],
-                                  r"4W2T has no levers; configurations with levers: 6T2A"),
-    "a derivative by levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--derivatives",
-                                                   "payload,levers_front_deg"],
-                                                  r"got levers_front_deg; expected adhesion, payload, voltage, obstacle_mm"),
-    "a lever below the ground": (["--step", "50", "--levers-front", "-30"],
-                                 r"levers front: at -30 deg they begin 72 mm below the ground; expected at least -8\.5"),
-    "an angle beyond the range": (["--step", "50", "--levers-rear", "190"],
-                                  r"--levers-rear: got 190 deg; expected -180 to 180 deg"),
-    "a stair without tread": (["--stairs", "170x0x3"], r"--stairs: got a tread of 0 mm; expected 10 to 5000 mm"),
-    "words for stairs": (["--stairs", "high"], r"--stairs: got high; expected RISExTREADxCOUNT"),
-    "a nose larger than its stair": (["--stairs", "100x290x2", "--nose", "60"], r"--nose: got 60 mm; expected less than"),
-    "a nose of a gap": (["--gap", "50", "--nose", "10"], r"--nose has an effect only with steps and stairs"),
-    "a nose of a terrain": (["--terrain", "t.csv", "--nose", "10"], r"--nose has an effect only with steps and stairs"),
-    "a nose in a search of gaps": (["--find", "gap", "--nose", "10"], r"--nose has an effect only with steps and stairs"),
-    "two obstacles": (["--step", "50", "--gap", "90"], r"--step and --gap are both given"),
-    "none": ([], r"no obstacle is given"),
-    "angles beside a sequence of them": (["--step", "50", "--sequence", "s.csv", "--levers-front", "30"],
-                                         r"s\.csv gives all angles"),
-    "a search of another kind": (["--find", "gap", "--step", "50"], r"--find gap cannot be combined with --step"),
-    "no such terrain": (["--terrain", "none.csv"], r"--terrain: got none\.csv, no such file"),
-    "a derivative by nothing": (["--step", "50", "--derivatives", "payload,motor.resistence"],
-                                r"got motor\.resistence; expected adhesion, payload, voltage, .*did you mean motor\.resistance"),
-    "a size that the terrain has not": (["--terrain", "t.csv", "--derivatives", "obstacle_mm"], r"got obstacle_mm; expected"),
-    "a bench": (["--step", "50", "--robot", "bench.toml"], r"climb: the robot's load is a shaft"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, case):
-    arguments, message = REFUSED[case]
-    if case == "a bench":
-        assert mmrjax("rig new bench.toml --kind bench")[0] == 0
-        message = r"climb: |bench\.toml"
-    (tmp_path / "s.csv").write_text("time_s,front_deg,rear_deg\n0,45,180\n")
-    (tmp_path / "t.csv").write_text("x_mm,z_mm\n0,0\n0,50\n")
-    code, _, err = mmrjax("climb", *arguments, "--out", "c")
-    assert code == 2 and err.count("\n") == 1, err
-    assert re.search(message, err), err
-    assert not (tmp_path / "c").exists()
 
 
 @pytest.mark.parametrize("header", ["x_mm,time_s,front_deg,rear_deg", "x_mm,front_deg,rear_deg,front_V,rear_V"])

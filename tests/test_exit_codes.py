@@ -1,11 +1,9 @@
 """One rule for exit codes: whatever the answer 0, and 3 where a solver failed. Documented for each command."""
 
-import dataclasses
 import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 import weakref
 
@@ -13,9 +11,6 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from calibration.data.input_errors import InputError
-from calibration.discovery import scales
-from mmrjax import WORKER
 from sweeps import cli
 from sweeps.pages import words
 from sweeps.points import run
@@ -104,15 +99,6 @@ def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
     signal.signal(signal.SIGINT, ignored)
     assert end.value.code == 130 and time.monotonic() - begun < 4 and sys.unraisablehook is hook
     assert capsys.readouterr().err == "mmrjax: interrupted; no run folder was written\n"
-
-
-def test_no_thread_outlives_a_refusal(monkeypatch, robot):
-    monkeypatch.setattr(scales, "_nominal_signals", lambda: time.sleep(0.3))
-    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))
-    with pytest.raises(InputError, match="refused"), scales.compute_nominal_ahead(robot):
-        assert any(t.name.startswith(WORKER) for t in threading.enumerate())
-        raise InputError("refused")
-    assert not any(t.name.startswith(WORKER) for t in threading.enumerate())
 
 
 def test_every_command_says_what_3_means_and_the_docs_have_its_words():

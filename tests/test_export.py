@@ -665,23 +665,11 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
     assert result["errors_percent"]["exported"]["motor_speed"] < 0.1  # heat at half of the stall torque
     assert {e["name"]: e["verdict"] for e in result["effects"]}["thermal_drift"] == "held"
     law = (folder / "LAW.md").read_text()
-    for heading in (
-        "How to use it",
-        "Equations",
-        "Constants",
-        "What this format holds",
-        "Conditions seen",
-        "Not tested",
-    ):
-        assert f"## {heading}" in law
-    assert "| `motor.resistance` | 1.7 | ohm |" in law
     equations, constants_ = law.split("## Equations")[1].split("## Constants")
     symbols = ("i_r", "C_m", "R_rot", "L_d", "M_df0", "K_fd", "M_rf0", "K_fr", "η_rm", "M_0", "K")
     for text in (equations, constants_):
         assert [s for s in symbols if not re.search(rf"\b{s}\b", text)] == []
     assert 'joint="wheel"' in (folder / "drive.xml").read_text()
-    assert "thermal_drift" in (folder / "report.html").read_text()
-    assert "python -m mujoco.viewer --mjcf=scene.xml" in (folder / "report.html").read_text()
     model = library.MjModel.from_xml_path(str(folder / "scene.xml"))
     data = library.MjData(model)
     library.mj_resetDataKeyframe(model, data, model.key("run").id)
@@ -694,13 +682,6 @@ def test_a_key_frame_of_runs_in_both_directions_moves():
     command, load = np.array([-24.0, -12.0, 12.0, 24.0, 6.0]), np.array([-2.0, -1.0, 1.0, 2.0, 0.5])
     chosen, torque = formats.middle_run(command, load)
     assert abs(chosen) == 12.0 and torque == chosen / 12
-
-
-def test_command_that_is_refused_leaves_nothing(mmrjax, rig):
-    code, _, error = mmrjax("export", rig, "--to", "mujoco", "--configuration", "leg", "--out", "out")
-    assert code == 2 and error.startswith("mmrjax: --configuration: got leg; the robot has no such configuration")
-    assert not (rig.parent / "out").exists()
-    ends(mmrjax("export", rig, "--to", "usd", "--out", "out"), "mujoco")
 
 
 def test_symbols_fold_numbers_and_keep_the_order_of_operations():

@@ -12,8 +12,8 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
 from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
-from sweeps.commands import feedforward_fit
-from sweeps.report import feedforward_report
+from sweeps.commands import calibrate as feedforward_fit
+from sweeps.report import calibration_report
 from tests.commands import read_json
 
 TESTS = ("quasistatic-forward", "quasistatic-reverse", "dynamic-forward", "dynamic-reverse")
@@ -155,7 +155,7 @@ def test_a_log_of_voltage_and_speed_has_two_plots_on_any_page():
     found = feedforward_fit.voltage_fit(runs)
     direct = fit_feedforward(dataclasses.replace(log, position=None))
     assert found.constants == pytest.approx(direct.constants, rel=1e-6)
-    quasistatic, dynamic, constants = feedforward_report.voltage_section(found).blocks
+    quasistatic, dynamic, constants = calibration_report.voltage_section(found).blocks
     assert (quasistatic.name, dynamic.name) == ("quasistatic", "dynamic")
     assert [row[1] for row in constants.rows] == list(found.constants.values())
     rest = records.Runs("rest.csv", columns | {"output_speed_rpm": 0.0 * log.velocity})

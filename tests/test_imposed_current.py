@@ -310,7 +310,7 @@ def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
         "configuration": np.full(5, "bench"), "motor_current_A": current, "motor_speed_rpm": speed,
         "simulated_motor_speed_rpm": speed + 1.0, "error_motor_speed_percent": np.ones(5),
     }  # fmt: skip
-    figure = comparison_figures.draw_errors_over_conditions(table, robot.channels, in_units=True)
+    figure = comparison_figures.draw_errors_over_conditions(table, robot.channels)
     assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
 
 

@@ -169,7 +169,7 @@ def test_errors_are_drawn_over_what_is_imposed_or_the_rows(tmp_path, column):
         rows[f"error_{channel.name}_percent"] = np.full(3, 10.0)
     rows.pop("simulated_motor_current_A" if column == "motor_current_A" else "", None)
     shown = tuple(c for c in shown if f"simulated_{c.column}" in rows)
-    fig = comparison_figures.draw_errors_over_conditions(rows, shown, in_units=True)
+    fig = comparison_figures.draw_errors_over_conditions(rows, shown)
     words = {"motor_current_A": "motor current [A]", "motor_speed_rpm": "motor speed [rpm]", None: "row"}
     assert fig.axes[-1].get_xlabel() == words[column]
 

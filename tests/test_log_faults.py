@@ -1,5 +1,6 @@
 """Logs with faults that no reader sees: one sentence each. Sound logs have none."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,17 +55,36 @@ def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words)
     assert words in text and column in text and len(text) <= 400
 
 
-@pytest.mark.parametrize(("kind", "make", "column", "length", "words"), [
-    ("servo", servo, "output_angle_deg", 360, "jumps by -3.* like an angle that wraps or .*; expected an angle that keeps"),
-    ("carriage", carriage, "position_mm", 50, "jumps by -4.* like a position that wraps or .*; expected a position that"),
-])  # fmt: skip
-def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path, kind, make, column, length, words):
+def wrapped(tmp_path, kind, make, column, length):
+    """A log as it is read, and the same log with an encoder that wraps."""
     log = make(np.random.default_rng(1))
     robot = written(tmp_path, kind, log)
-    records.read_runs(tmp_path / "log.csv", robot=robot)
+    yield records.read_runs(tmp_path / "log.csv", robot=robot)
     written(tmp_path, kind, {**log, column: log[column] % length})
+    yield records.read_runs(tmp_path / "log.csv", robot=robot)
+
+
+def test_a_position_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path):
+    words = "jumps by -4.* like a position that wraps or .*; expected a position that"
+    logs = wrapped(tmp_path, "carriage", carriage, "position_mm", 50)
+    assert next(logs).has("position_mm")
     with pytest.raises(BadData, match=words):
-        records.read_runs(tmp_path / "log.csv", robot=robot)
+        next(logs)
+
+
+@pytest.mark.parametrize("length", [360, 300])
+def test_an_angle_of_one_turn_keeps_counting(tmp_path, length):
+    logs = wrapped(tmp_path, "servo", servo, "output_angle_deg", length)
+    log = next(logs)
+    if length != 360:  # no turn
+        with pytest.raises(BadData, match=r"jumps by -29.* like an angle that wraps or "):
+            next(logs)
+        return
+    again = next(logs)
+    np.testing.assert_allclose(again["output_angle_deg"], log["output_angle_deg"], atol=1e-6)
+    assert [n for n in again.notes if n not in log.notes] == [
+        f"{again.source} row 254, output_angle_deg: wraps at 360 deg. The wraps are removed"
+    ]
 
 
 @pytest.mark.parametrize("step", [7.0, -2.0])
@@ -181,3 +201,46 @@ def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
     silent = Runs("log.csv", {**motor(), SPEED: np.full(600, np.nan)}).of(robot)
     (note,) = discover.missing_states_remarks(silent, robot)
     assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)
+
+
+@pytest.mark.parametrize(("levels", "converged"), [(6, False), (6, True), (5, False)])
+def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(robot, monkeypatch, levels, converged):
+    volts, told, kept = np.repeat(np.linspace(8, 24, levels), 60), [], []
+    noise = np.random.default_rng(0).standard_normal((2, len(volts)))
+    columns = {"configuration": np.full(len(volts), "bench"), "time_s": 0.01 * np.arange(len(volts)), VOLTS: volts}
+    columns |= {SPEED: 200 * volts + 8 * noise[0], "motor_current_A": 0.5 + volts / 20 + 0.03 * noise[1]}
+    runs = Runs("log.csv", columns | {"slope_deg": 0 * volts, "payload_kg": 0 * volts}).of(robot)
+    base = SimpleNamespace(space=SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(long=True))))
+    base.candidate = SimpleNamespace(converged=converged)
+
+    def keep(name, make):
+        kept.append(name)
+        return (SimpleNamespace(base=base), None) if name == "base" else make()
+
+    @dataclasses.dataclass
+    class Table:
+        at_first: tuple
+        runs: Runs
+        keep: object = None
+        progress: object = None
+
+        def trace(self, ahead):
+            assert ahead and self.keep("ranking", lambda: 1) == self.keep("search 0", lambda: 1) == 1
+            return discover.LoopStages("none", None, None, None)
+
+    monkeypatch.setattr(discover, "equations_of_log", lambda *_: None)
+    monkeypatch.setattr(discover, "_trace_readings", lambda *_: "readings")
+    given = discover.LoopInput(
+        runs, None, robot, *[None] * 4, keep=keep, progress=lambda note: told.append(describe(note)),
+        prepare=lambda runs, settled: Table(settled, runs),
+    )  # fmt: skip
+    found = given.trace()
+    if converged or levels < 6:
+        assert (found, kept, told) == ("readings", ["base"], [])
+        return
+    assert kept == ["base", "ranking", "settled search 0"]
+    table, notes = found.settled
+    assert told == [describe(note) for note in notes] and "no fit over time converges, so the fit uses" in told[0]
+    assert len(table) == levels and not table.sampled
+    again = discover.prepare_loop(table, robot, settled=notes)
+    assert {*notes} <= {*again.notes} and {*notes} <= {*again.at_first}

@@ -31,14 +31,13 @@ from calibration.discovery.result import (
     WorseChannel,
 )
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference.fit_notes import Remark
+from calibration.inference.fit_notes import Remark, remarks_with_codes
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words
 from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
-from sweeps.pages import page as page_room
-from sweeps.pages.figure_style import NARROW, figure_settings
+from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.fit_tables import Change
 from sweeps.report.terminal_renderer import print_document
@@ -101,7 +100,7 @@ def shown(tmp_path_factory):
 def written(folder, found):
     """The page of a result, without its figures: pages with them are those of `shown`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_room, "figure_as_svg", lambda figure: "<svg/>")
+        patch.setattr(page_renderer, "figure_as_svg", lambda figure: "<svg/>")
         return page_of(folder, found)
 
 
@@ -134,9 +133,6 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
         fall = got.found.chi2[0] - got.found.chi2[1]
         assert e.score == pytest.approx(fall, abs=0.1) or len(got.found.effects) > 1
-    assert got.text.count('id="definitions"') == 1
-    for heading in ("Lowers the misfit by:", "Family-wise p:", "Rise of χ²:", "Score:"):
-        assert got.page.text.count(heading) == 1
 
 
 @pytest.mark.slow
@@ -170,8 +166,8 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     """A stranger has to find the law, its band and whether the robot can be used before anything else."""
     got = shown("churning", capsys)
     head = got.text[: got.text.index('<nav id="contents"')]
-    assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
-        head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
+    assert [head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")] == sorted(
+        head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")
     )
     assert "May I use it for …" in head and "new law, 95 % band" in head
     with figure_settings():
@@ -260,7 +256,7 @@ def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
         left = ((simulated - seen.measured) / seen.sd)[rows]
         assert d["of_readings"][when] == pytest.approx(float(np.nansum(left**2)), rel=1e-9)
         assert d["of_readings"][when] < d[when]  # the rest is what parameters moved from their priors
-    assert f"{d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ², with priors" in got.page.text
+    assert f"readings {d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ²" in got.page.text
 
 
 def test_reading_that_weighs_most_is_named(shown, capsys):
@@ -279,7 +275,7 @@ def test_reading_that_weighs_most_is_named(shown, capsys):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, name):
+def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys, tmp_path, name):
     seen = shown(name, capsys)
     made, sd = seen.found, np.sqrt(np.diag(seen.found.posterior.covariance))  # of coordinates whose prior sd is 1
     of_posterior = {n for n, x in zip(made.posterior.coordinates, sd, strict=True) if x > HELD}
@@ -287,25 +283,14 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
     held = {n for n, p in seen.document["base_shift"].items() if p["held_by_prior"]}
     assert held == {n for n in made.held_by_prior if n in made.base_shift}
     assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
-    (note,) = [n for n in made.notes if n.startswith("these runs do not determine ")]
+    (note,) = remarks_with_codes(made.remarks, "held_by_prior")
     far = {n for n, p in made.base_shift.items() if abs(p.shift_after) > FAR}
     pairs = {n for pair in made.together for n in (pair.one, pair.other)}
-    assert note.removeprefix("these runs do not determine ").split(" (posterior")[0].split(", ") == [
-        n for n in made.held_by_prior if n not in far | pairs
-    ]
-    assert " ".join(note.split()) in seen.printed
-    together = " ".join(n for n in made.notes if n.startswith("these runs determine only combinations"))
-    assert far == {n.split()[0] for n in made.notes if " has an implausible value, " in n} and all(
-        n in together for n in pairs
-    )
-    head, *rows = seen.page.tables["base"]
-    said = {row[0]: row[head.index("determined")] for row in rows}
-    assert {n for n, answer in said.items() if answer == "no"} == held - pairs
-    assert {n for n, answer in said.items() if answer.startswith("only with ")} == pairs & set(said)
-    made.save(tmp_path)
-    assert f"do not determine {', '.join(made.held_by_prior)} (posterior" in (tmp_path / "robot.toml").read_text(
-        "utf-8"
-    )
+    assert list(note.names) == [n for n in made.held_by_prior if n not in far | pairs]
+    assert far == {remark.name for remark in remarks_with_codes(made.remarks, "far_from_prior")}
+    assert pairs == {
+        n for r in remarks_with_codes(made.remarks, "only_together") for p in r.pairs for n in (p.one, p.other)
+    }
 
 
 def resolved(found, p, outside=(), settled=True):
@@ -406,14 +391,3 @@ def test_a_run_that_is_different_is_checked_before_another_experiment():
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):
     resolved(shown("churning", capsys).found, 1e-6).save(tmp_path / "saved")
     assert (tmp_path / "saved/robot_track.toml").exists()
-
-
-def test_labels_of_many_groups_do_not_cover_each_other():
-    """Forty configurations on a phone were a black bar."""
-    speed, count = channels.find_channel("speed"), 40
-    table = {"configuration": np.array([f"t{k:02d}" for k in range(count)]), "supply_voltage_V": np.full(count, 12.0)}
-    table |= {f"residual_{when}_speed_sigma": np.zeros(count) for when in ("before", "after")}
-    with figure_settings(NARROW):
-        (axes,) = loop_figures.draw_residuals_before_after(table, (speed,), "named").axes
-    labels = [label.get_text() for label in axes.get_xticklabels()]
-    assert len(labels) == count and 10 <= len([*filter(None, labels)]) <= 20 and labels[0] == "t00, 12 V"

@@ -19,7 +19,7 @@ from calibration.inference.calibration import calibrate
 from calibration.inference.linearization import free_shape_parameter, shape_parameter_at, shape_scales
 from calibration.inference.observers import SettledRuns
 from calibration.inference.optimizers import observe_robot
-from mmrjax.effects import ALL, BY_NAME, UNNAMED
+from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
 
@@ -141,35 +141,6 @@ def test_comparison_can_fail(tmp_path):
     before, _ = jax.device_get(_swept(params.without_weak_types(robot), conditions))
     assert np.abs(written(robot)[0] / before - 1).max() > 0.02
     assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", list(UNNAMED))
-def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):
-    reading, again = curves(name)
-    assert_allclose(again, reading, rtol=1e-9)
-
-
-@pytest.fixture(scope="module")
-def curves(tmp_path_factory):
-    """Readings of the nominal robot with a discrepancy without a name, and of the same through its file."""
-    runs = table()
-    robot = own_mass.with_table_mass(paper_robots.nominal(), runs)
-    every = tuple(UNNAMED.values())
-    written = Written(runs, tmp_path_factory.mktemp("curves"), every)
-
-    def of(name):
-        with_it = robot_file.add_effects(robot, [name])
-        values = {f"effects.{name}.amplitude": 0.2 * _sd(UNNAMED[name])}
-        values |= {f"effects.{name}.y{k}": 0.3 * k for k in range(6) if name.startswith("curve")}
-        with_it = params.replace(with_it, values)
-        (present,) = with_it.effects
-        whole = tuple(present if e.name == name else e() for e in every)
-        fitted = dataclasses.replace(with_it, effects=whole)
-        reading, _ = jax.device_get(_swept(params.without_weak_types(fitted), runs.conditions(fitted)))
-        return reading, written(with_it)[0]
-
-    return of
 
 
 # --- what is said ---------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """What pages say of limits, scales and tables: what is judged, by which measure, and that nothing overruns."""
 
 import dataclasses
-import itertools
 import re
 
 import numpy as np
@@ -14,7 +13,6 @@ from calibration.data import runs as records
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
-from sweeps import pages
 from sweeps.pages import figure_style, power_figures, sweep_figures
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
@@ -97,40 +95,6 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
             assert (
                 0 < warning < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
             )
-
-
-def test_texts_of_a_narrow_figure_are_apart(monkeypatch):
-    """Names break at dots and panels grow for them, a map shows all its numbers or none, words make room."""
-    monkeypatch.setattr(pages, "FOR_PHONES", True)
-    names = [f"tracked_{k}.ground.friction.speed_static" for k in range(9)]
-    with figure_style.figure_settings(figure_style.NARROW):
-        fig, grid = figure_style.new_figure(1, 2, 1.5)
-        left, right = grid[0]
-        left.barh(range(9), np.arange(1.0, 10.0))
-        left.set_yticks(range(9), names)
-        left.text(3, 4, "one remark"), left.text(3, 4, "another remark")
-        image = right.imshow(np.eye(9))
-        right.set_xticks(range(9), names, rotation=60, ha="right")
-        for k in range(9):
-            right.text(k, 4, "-0.25", ha="center", va="center")
-        figure_style.colour_bar(fig, image, right, label="correlation")
-        labels = ["a legend that has many words in it", "and another that has as many"]
-        for label in labels:
-            left.plot([0, 1], label=label)
-        left.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
-        assert figure_style.legend_columns(labels, 2) == 1
-        figure_style.figure_as_svg(figure_style.fit_for_phones(fig))
-        shown = left.get_yticklabels()
-        boxes = sorted((label.get_window_extent() for label in shown), key=lambda box: box.y0)
-        assert all(a.y1 < b.y0 + 1 for a, b in itertools.pairwise(boxes))
-        for label, name in zip(shown, names, strict=True):
-            *broken, _ = lines = label.get_text().split("\n")
-            assert "".join(lines) == name and broken and all(line[-1] in "._" for line in broken)
-        assert not any(text.get_visible() for text in right.texts)
-        one, other = (text.get_window_extent() for text in left.texts)
-        assert one.y1 < other.y0 + 2 or other.y1 < one.y0 + 2
-        assert {label.get_rotation() for label in right.get_xticklabels()} == {90}
-        assert left.get_legend().get_window_extent().y0 > left.bbox.y1 and left.bbox.width > 0.3 * fig.bbox.width
 
 
 @pytest.mark.parametrize(("cells", "visible"), [(12, True), (40, False)])

@@ -70,7 +70,7 @@ def test_threads_have_the_precision_of_who_hands_them_work(single):
     mine = threading.get_ident()
     with precision.Threads(1) as threads:
         assert threads.submit(kind).result() == ("float32", True)
-        with precision.double_precision():
+        with jax.enable_x64(True):
             assert [*threads.map(lambda _: kind(), range(2))] == [("float64", True)] * 2
         assert threads.submit(kind).result() == ("float32", True)
 

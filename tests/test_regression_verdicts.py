@@ -1,6 +1,7 @@
 """Answers of the regression alone, on generated logs of one motor with six faults. Plain NumPy laws, no simulation."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -84,6 +85,7 @@ def answered(tmp_path_factory):
         )
         return discover.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
 
+    @functools.cache
     def space_of(**faults):
         runs = Runs("log.csv", log(**faults)).of(robot)
         sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
@@ -93,21 +95,32 @@ def answered(tmp_path_factory):
         space = space_of(**faults)
         return findings.rank_effects_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
 
-    of.space_of, of.input_of = space_of, input_of
+    @functools.cache
+    def windows_of(**faults):
+        """The candidate space of a log, its fit in weak form, and the problem of its windows with their rows."""
+        space = space_of(**faults)
+        fit = weak_form.fit_weak_form(space.bare, space.library.scored)
+        return (
+            space,
+            fit,
+            *windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width),
+        )
+
+    of.windows_of, of.input_of = windows_of, input_of
     return of
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("fault, family", [
     ({}, ""),
+    ({"forward": 0.3}, "loss torque that changes with direction"),
     ({"scale": 0.95}, "reading of motor speed that is the same share everywhere"),
     ({"sag": 0.1}, "voltage drop that changes with current"),
-    ({"forward": 0.3}, "loss torque that changes with direction"),
     ({"saturates": 0.01}, "loss torque that changes with load"),
     ({"sticks": 2.0}, "loss torque that changes with speed"),
 ])  # fmt: skip
 def test_the_mechanism_of_a_fault_leads(answered, fault, family):
     found = answered(**fault)
-    print(loop_words.ranking_lines(found), loop_words.regression_verdict(found))
     assert found.missing == bool(fault)
     assert not fault or found.effects[0].family == family
     assert family in loop_words.regression_verdict(found)
@@ -121,8 +134,8 @@ def test_a_delay_of_ten_rows_is_a_parameter_and_nothing_is_missing(answered):
 
 def test_a_held_voltage_that_swings_a_row_late_biases_nothing(answered):
     """A delay of one row had no derivative, and a reading before a step of the voltage shows the current before."""
-    space = answered.space_of(late=1, swings=True)
-    fit, coordinates = weak_form.fit_weak_form(space.bare, space.library.scored), space.coordinates.base
+    space, fit, *_ = answered.windows_of(late=1, swings=True)
+    coordinates = space.coordinates.base
     sd = np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian)))
     value, sds = coordinates.value(fit.z), np.asarray(coordinates.spread) * sd
     for name, truth in (("rig.delay", EVERY), ("motor.resistance", 0.9)):
@@ -133,9 +146,7 @@ def test_a_held_voltage_that_swings_a_row_late_biases_nothing(answered):
 
 def test_windows_fit_effects_as_least_squares_do(answered):
     """A log is a table of equations: residuals, slopes and signatures of its regression, and shapes between them."""
-    space = answered.space_of(forward=0.3)
-    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
-    posed, rows = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    space, fit, posed, rows = answered.windows_of(forward=0.3)
     observe, names = posed.observe, space.library.names
     table = active_set.candidate_space(
         posed, space.library.effects, {n: BY_NAME[n] for n in NAMES}, 4, SETTINGS.width
@@ -158,9 +169,7 @@ def test_windows_fit_effects_as_least_squares_do(answered):
 
 @pytest.mark.parametrize("fault", [{"rough": 0.3}, {"forward": 0.3}])
 def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_imitates_it(answered, fault):
-    space = answered.space_of(**fault)
-    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
-    posed, _ = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    space, _, posed, _ = answered.windows_of(**fault)
     linear = posed.observe.linear
     space = dataclasses.replace(
         space, bare=posed, equipped=dataclasses.replace(space.equipped, observe=posed.observe)
@@ -175,9 +184,7 @@ def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_im
 
 
 def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered):
-    space = answered.space_of(forward=0.3)
-    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
-    posed, _ = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    space, _, posed, _ = answered.windows_of(forward=0.3)
     linear = posed.observe.linear
     way = np.asarray(linear.signals.direction)
     column = np.asarray(linear.columns(linear.probed.index("track"), way[:, None] ** 2))[:, 0]
@@ -189,9 +196,7 @@ def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered
 
 def test_a_torque_that_changes_slowly_does_not_look_like_an_effect(answered):
     """As white noise of its windows, it gave an effect 3.0 sds."""
-    space = answered.space_of(seed=5, slow=0.01)
-    fit = weak_form.fit_weak_form(space.bare, space.library.scored)
-    posed, _ = windows.problem_of_windows(space.bare, fit, space.library.scored, lambda rows: {}, SETTINGS.width)
+    posed = answered.windows_of(seed=5, slow=0.01)[2]
     scores = np.abs(np.asarray(score_tests.score_tests(posed.observe.linear, ()).single))
     assert 0 < scores.max() < 2.0
 

@@ -24,7 +24,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import ROBOTS
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import compare
-from sweeps.pages import power_figures, sweep_figures, words
+from sweeps.pages import power_figures, words
 from sweeps.points import run
 from sweeps.report import comparison_report, page_renderer, runs_report, sweep_report
 from sweeps.report.comparison_report import Comparison
@@ -105,20 +105,10 @@ def test_extremes_are_those_of_the_settled_runs(small):
 
 
 @pytest.mark.slow
-def test_sweep_that_slides_everywhere_says_so(tmp_path):
-    runs = _runs("6T2A", (15.0, 33.0), (0.0, 4.0), (25.0, 30.0))
-    assert (runs["status"] == "slides").all()
-    _, page = _write(tmp_path, runs)
-    assert [row[:2] for row in Tables(page).tables["statuses"][1:]] == [["slides", "8"]]
-    assert drawn(page) == SWEEP_FIGURES
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [
         "line over slope",
-        "scattered",
         *(pytest.param(s, marks=pytest.mark.slow) for s in ("line over voltage", "large grid")),
     ],
 )
@@ -129,48 +119,11 @@ def test_other_grids_are_drawn(shape, tmp_path):
         "large grid": lambda: _runs(
             ("6T2A", "4W2T"), np.linspace(10, 36, 5), np.linspace(0, 20, 40), np.linspace(0, 20, 50)
         ),
-        "scattered": _scattered,
     }[shape]()
     path, page = _write(tmp_path, runs)
     assert drawn(page) == SWEEP_FIGURES
     assert f"<h1>Sweep of {len(runs['status']):,} runs</h1>" in page
     assert path.stat().st_size < 5e6
-
-
-def _scattered():
-    rng, n = np.random.default_rng(0), 600
-    return _table(
-        records.Runs(
-            "the test",
-            {
-                "configuration": np.where(rng.random(n) < 0.5, "6T2A", "4W2T"),
-                "supply_voltage_V": rng.uniform(10, 33, n),
-                "payload_kg": rng.uniform(0, 10, n),
-                "slope_deg": rng.uniform(-5, 20, n),
-            },
-        )
-    )
-
-
-def test_blocks_cover_each_cell_once():
-    rng = np.random.default_rng(1)
-    cells = {(int(i), int(j)) for i, j in rng.integers(0, 9, (40, 2))}
-    for joined in (True, False):
-        covered = [
-            (i + p, j + q)
-            for i, j, wide, tall in sweep_figures._cover_cells(cells, joined)
-            for p in range(wide)
-            for q in range(tall)
-        ]
-        assert sorted(covered) == sorted(cells)
-
-
-def test_runs_that_share_a_cell_of_a_map_are_shown_by_their_median():
-    rng = np.random.default_rng(3)
-    cell, values = rng.integers(0, 7, 40) * 2, rng.normal(size=40)
-    shown, medians = sweep_figures._medians(cell, values)
-    assert shown.tolist() == sorted(set(cell.tolist())) and len(set(np.bincount(cell)[shown] % 2)) == 2
-    assert_allclose(medians, [np.median(values[cell == k]) for k in shown], rtol=1e-15)
 
 
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):
@@ -255,7 +208,7 @@ def driven(robot, tmp_path_factory):
 @pytest.mark.slow
 def test_report_shows_the_runs_own_history_with_its_peak(driven):
     folder, page, batch = driven
-    assert drawn(page) == {"history", "slip", "power"} and outside(folder) == []
+    assert drawn(page) == {"history", "power"} and outside(folder) == []
     rows = Tables(page).tables["starts"][2:]
     assert [row[0] for row in rows] == ["6T2A, 33 V, 0 kg, 5°", "6T2A, 33 V, 0 kg, 25°", "4W2T, 0.3 V, 0 kg, 5°"]
     assert [row[1] for row in rows] == ["settled", "slides", "stands"]
@@ -271,7 +224,7 @@ def test_comparison_shows_its_rows_and_escapes_its_title(tmp_path):
     found = Comparison(table, summary, measured.channels, "a&b.csv", "steady", "<b>x.toml")
     page = page_renderer.write_report_page(tmp_path, comparison_report.comparison_document(found)).read_text()
     assert "<b>x.toml" not in page and "&lt;b&gt;x.toml" in page and "a&amp;b.csv" in page
-    assert drawn(page) == {"parity", "errors"} and outside(tmp_path) == []
+    assert drawn(page) == {"errors"} and outside(tmp_path) == []
     tables = Tables(page).tables
     assert [row[4] for row in tables["errors"][1:]] == [
         f"{cell['rms_percent']:.1f}" for cells in summary.values() for cell in cells.values()

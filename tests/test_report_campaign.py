@@ -84,16 +84,3 @@ def test_few_points_fill_few_bins():
     }
     histogram, *bands, _, _ = campaign_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
     assert [len(b.lines[0].get_xdata()) for b in bands] == [2, 6] and len(histogram.patches) == 6
-
-
-def test_a_share_by_few_points_is_said_only_above_its_chance_level():
-    """Of inputs without effect one in 100 has more, 16 points, each a value of its own, fill 6 bins."""
-    rng = np.random.default_rng(0)
-    x = rng.random((2000, 16))
-    found = [campaign_figures.variance_share(row, rng.standard_normal(16)) for row in x]
-    level = campaign_figures.variance_share_by_chance(x[0])
-    assert 0.003 < np.mean(np.array(found) > level) < 0.02 and level > 0.5
-    for output, said in ((rng.standard_normal(16), []), (x[0], ["% of the variance"])):
-        varied = {"x": campaign_figures.VariedQuantity(x[0], "x")}
-        axes = campaign_figures.draw_output_spread(output, "y", varied).axes[1]
-        assert [t.get_text()[-17:] for t in axes.texts] == said

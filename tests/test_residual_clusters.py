@@ -227,7 +227,6 @@ def test_histories_are_compared_by_the_means_of_their_runs():
     assert sum(map(bool, false)) <= 3
     found = find_residual_clusters(made(1, 4.0))
     assert [c.column for c in found] == ["wheel"] and sum(m.rows for m in found[0].levels) == runs_of
-    assert len(found[0].residual) == runs_of
 
 
 # --- tables ---------------------------------------------------------------------------------------------
@@ -267,7 +266,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     assert document["residual_clusters"][0]["statement"] == found.statement and found.statement in document["notes"]
     document = calibration_report.calibration_document(shifted, "nominal")
     page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")
-    assert found.statement in Tables(page).text and (tmp_path / "figures/clusters.svg").exists()
+    assert found.statement in Tables(page).text
 
 
 @pytest.mark.slow

@@ -202,33 +202,6 @@ def test_shaking_gear_says_what_does_not_settle(tmp_path):
     assert "Pitch has no single frequency" in result["statement"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--set", "running_gear.guide_reces=1e-4"), "guide_recess"),
-        (("--voltages", ""), "--voltages: got nothing; expected numbers such as 0,5,10"),
-        (("--voltages", "36:10:1"), "--voltages: got 36:10:1, which ends before it begins; expected first:last:step"),
-        (("--voltages", "24,24,33"), "--voltages: got 2 values; expected at least 5"),
-        (("--voltages", "0:30:5"), "--voltages: got 0; expected above 0 and up to 100"),
-        (("--payloads", "0,-1"), "--payloads: got -1.0; expected 0 to 300"),
-        (("--slope", "60"), "--slope: got 60.0; expected -45 to 45"),
-        (("--surface", "ice"), "surface"),
-        (("--duration", "0.2"), "--duration: got 0.2 s; expected at least 0.5 s"),
-        (("--configuration", "8W"), "--configuration: got 8W; the robot has no such configuration"),
-        (("--robot", "no.toml"), "no.toml"),
-        (("--set", "running_gear.lever_front=-1.5"), "lever_front"),
-        pytest.param((*SMALL[1:], "--step", "0.001", "--set", "running_gear.contact_stiffness=3e9"),
-                     "the largest stable step is", marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_is_refused_in_a_sentence_and_leaves_nothing(arguments, words, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert command(["resonance", *arguments, "--out", "map"]) == 2
-    said = capsys.readouterr().err
-    assert words in said and "Traceback" not in said
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_resolved_configuration_is_read_again(tracked):
     text = (tracked[0] / "config.resolved.toml").read_text()
     assert 'model = "track"' in text and "voltages_V = [24.0, 26.0" in text

@@ -165,75 +165,6 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
-REFUSED = {
-    "no voltage": ("bench", False, "simulate", r"--voltage: not given, and the robot's file has no motor\.voltage_l"),
-    "no speed": ("bench", True, "simulate", r"--motor-speed: not given, .* such as --motor-speed 3000"),
-    "voltage of an imposed speed": (
-        "bench", True, "simulate --voltage 12", r"--voltage: the motors' speed is imposed .* give --motor-speed",
-    ),
-    "speed of an imposed voltage": (
-        "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* give --voltage",
-    ),
-    "slope": ("bench", False, "simulate --voltage 9 --slope 5", r"--slope: slope, payload, mass and surface do not act on a shaft"),
-    "payload": ("linear", False, "simulate --voltage 9 --payload 1", r"--payload: slope, payload, mass"),
-    "mass": ("bench", False, "simulate --voltage 9 --mass 5", r"--mass: slope, payload, mass"),
-    "surface": ("bench", False, "simulate --voltage 9 --surface x", r"--surface: slope, payload, mass"),
-    "battery": ("bench", False, "simulate --battery", r"--battery: the robot's file has no battery"),
-    "battery of an imposed speed": ("bench", True, "simulate --battery", r"--battery: the motors' speed is imposed"),
-    "a pendulum's steady state": ("pendulum", False, "simulate --voltage 3", r"arm .* has no steady state"),
-    "a pendulum's profile": (
-        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm, which profiles do not cover",
-    ),
-    "an imposed speed's profile": (
-        "bench", True, "simulate --profile shuttle", r"--profile: the motors' speed is imposed on this robot",
-    ),
-    "a shaft's travel": (
-        "bench", False, "simulate --voltage 9 --profile shuttle", r"shuttle.*do not act on a shaft",
-    ),
-    "no axis": ("bench", False, "sweep", r"--voltages: not given, .* give it \[V\], such as --voltages 6,12,24"),
-    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not given, .* --motor-speeds 1000,2000"),
-    "axis of slopes": ("bench", False, "sweep --voltages 9 --slopes 0,5", r"--slopes: slope, payload, mass"),
-    "axis of voltages": ("wheeled", True, "sweep --voltages 9", r"--voltages: the motors' speed is imposed"),
-    "picture": ("bench", False, "render x.png --voltage 9", r"render: the robot's load is a shaft"),
-    "picture of an imposed speed": (
-        "wheeled", True, "render x.png --motor-speed 900", r"--model track: the motors' speed is imposed",
-    ),
-    "picture without inertia": (
-        "wheeled", False, "render x.png --voltage 9 --set rover.inertia=0",
-        r"--model track: rover\.inertia: got 0; expected the inertia",
-    ),
-    "running gear of a bench": (
-        "bench", False, "simulate --voltage 9 --model track", r"--model track: a shaft has no running gear",
-    ),
-    "resonance": ("bench", False, "resonance", r"resonance: the robot's load is a shaft"),
-    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft"),
-    "the paper's figures": ("bench", False, "reproduce", r"reproduce: the robot's load is a shaft"),
-    "steepest slope": (
-        "bench", False, "sensitivity --voltages 9 --outputs steepest_slope",
-        r"--outputs steepest_slope: the robot's load is a shaft, which has no ground",
-    ),
-    "a stance": (
-        "wheeled", False, "sensitivity --voltages 9 --outputs pitch",
-        r"--outputs pitch: the robot's file has no running_gear",
-    ),
-    "a pendulum's sensitivity": (
-        "pendulum", False, "sensitivity --voltages 3", r"--model steady: arm .* has no steady state",
-    ),
-    "sensitivity": ("bench", False, "sensitivity", r"--voltages: not given"),
-    "varied slope": (
-        "bench", False, "sensitivity --voltages 9 --vary slope_deg=0:5", r"--vary slope_deg: slope, payload",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_a_rig_does_not_have_is_refused_in_one_sentence(mmrjax, tmp_path, case):
-    kind, speed, arguments, message = REFUSED[case]
-    code, out, err = mmrjax(arguments, "--robot", of_kind(tmp_path, kind, speed))
-    assert code == 2 and re.search(message, err) and err.count("\n") == 1, err
-    assert words_of_others(out, err) == [] and "Traceback" not in err
-
-
 # --- what is imposed where nothing is stated -----------------------------------------------------------------------
 
 
@@ -272,13 +203,6 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
         code=0,
     )
     assert words_of_others(out, *left_in(tmp_path / "run")) == []
-    plan = tmp_path / "plan.toml"
-    plan.write_text(f'robot = "{rig.name}"\n[axes]\n"bench.loss_coulomb" = [0.05, 0.07]\n')
-    ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not given")
-    plan.write_text(f'robot = "{rig.name}"\n[axes]\nslope_deg = [0, 5]\n[conditions]\nmotor_speed = 100.0\n')
-    ends(mmrjax("sweep", plan), "plan.toml, slope_deg: slope, payload, mass and surface do not act on a shaft")
-    plan.write_text(f'robot = "{rig.name}"\n[axes]\nvoltage = [9, 12]\n')
-    ends(mmrjax("sweep", plan), "the robot's file imposes the motor speed")
 
 
 # --- measured tables ----------------------------------------------------------------------------------------------

@@ -546,13 +546,6 @@ def test_an_arm_is_simulated_over_time_alone():
         run.check_runs_bearable(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
 
 
-QUICK = {"starts": 2, "profiles": False, "blocks": ["speed", "voltage"]}
-
-
-def inside(found, true):
-    return {n: abs(p.value - true[n]) / p.sd for n, p in found.parameters.items() if n in true}
-
-
 def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     """Runs in mirror image show a curve in mirror image."""
     robot = vehicle(imposed="voltage", channels=("total_current", "motor_speed", "speed"))

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from worlds import rigs
 
 import mmrjax as mm
@@ -16,7 +17,8 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover, scales
 from mmrjax import effects
 from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
-from mmrjax.model import params
+from mmrjax.fidelities.steady import results_of_rows
+from mmrjax.model import paper_robots, params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
 from tests.commands import read_rig, read_table
@@ -45,6 +47,22 @@ def with_all(robot, library, share):
             low, high = shape.spec.bounds
             values[f"effects.{effect.name}.{shape.name}"] = low + 0.5 * (high - low)
     return params.replace(robot, {name: jnp.asarray(x) for name, x in values.items()})
+
+
+def test_signals_of_the_nominal_robot_in_the_file_are_those_of_its_equations():
+    robot, stored = scales._nominal_signals()
+    volts, slopes, payloads, configurations = (
+        axis.ravel()
+        for axis in np.meshgrid(
+            paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
+        )
+    )
+    conditions = mm.Conditions(configurations.astype(int), volts, slopes, payloads)
+    computed = results_of_rows(robot, conditions, rests=False)[1]
+    for field in dataclasses.fields(stored):
+        expected = getattr(computed, field.name)
+        if isinstance(expected, jnp.ndarray):
+            assert_allclose(getattr(stored, field.name), expected, rtol=1e-9, atol=1e-11, err_msg=field.name)
 
 
 def test_a_size_is_a_size_however_small():

@@ -61,12 +61,6 @@ def test_turns_are_on_level_ground():
         assert (len(np.unique(points["slope_deg"])) > 1) == (len(slopes) > 1)
 
 
-def test_a_turn_on_a_slope_is_refused_before_it_is_studied(mmrjax, tmp_path):
-    told = "--configurations", "6T2A", "--vary", "duty_left=0.4:0.8", "--slopes", "5", "--out", str(tmp_path / "s")
-    code, _, err = mmrjax("sensitivity", *told)
-    assert code == 2 and "got a slope of 5 deg for a robot that turns" in " ".join(err.split())
-
-
 def test_radius_is_that_of_the_centre_of_mass():
     ahead, aside, rate = np.array(
         [[0.3, 0.4, 1.0], [0.3, 0.0, -0.5], [-0.3, 0.0, 0.5], [0.0, 0.1, 2.0], [0.3, 0, 0]]

@@ -14,7 +14,6 @@ from worlds.settled import write_table
 from calibration.data import contradictions, rig_facts, robot_file, settling
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
-from calibration.data.settling import rolling_readings
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import InformationForecast
@@ -34,7 +33,7 @@ def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
 
 
 def settled(tmp_path, robot, **options):
-    return settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot), **options)
+    return settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot), robot, **options)
 
 
 def deviations(log, found):
@@ -212,7 +211,7 @@ BAD = {
     "never holds": (
         lambda c: c | {"supply_voltage_V": np.round(12 + 6 * np.sin(8 * c["time_s"]), 5)},
         r"no settled segment: the longest level has 0\.\d+ s \(rows \d+ to \d+\); expected at least 0\.3 s; "
-        r"use the log itself \(mmrjax loop LOG --robot RIG\), or hold each level longer or set a smaller --shortest",
+        r"use the log itself with loop, or hold each level longer or set a smaller --shortest",
     ),
     "no sign of the duty, levels repeated": (
         lambda c: (
@@ -294,7 +293,7 @@ def test_signs_and_units_that_cannot_be_are_said_with_rows_and_remedy(tmp_path, 
     changes, said = WRONG[case]
     robot = bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
     with pytest.raises(BadData, match=said):
-        settled(tmp_path, robot, rolling=rolling_readings(robot))
+        settled(tmp_path, robot)
 
 
 #: What a fit would say of a table, where none is made.
@@ -354,7 +353,8 @@ def test_a_shaft_that_stands_for_long_may_be_quick_for_a_while(moves):
     """Through zero from a small angle to a large one, by more than half a turn a sample, and with a wrong reading."""
     angle = np.concatenate([np.full(50, float(moves[0])), moves, np.full(50, float(moves[-1]))])
     columns = {"output_angle_deg": angle, "time_s": 0.01 * np.arange(len(angle)), "run_id": np.full(len(angle), "a")}
-    contradictions._check_wraps(records.Runs("log.csv", columns), "output_angle_deg")
+    runs = records.Runs("log.csv", columns)
+    assert contradictions.unwrap_angle(runs, "output_angle_deg") is runs
 
 
 def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
@@ -366,11 +366,11 @@ def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
 
 def test_signs_and_units_that_are_right_are_not_doubted(tmp_path):
     robot = bench(tmp_path, both_ways(), '"total_current", "motor_speed", "output_angle"')
-    assert len(settled(tmp_path, robot, rolling=rolling_readings(robot)).kept) == 4
+    assert len(settled(tmp_path, robot).kept) == 4
     text = (tmp_path / "rig.toml").read_text() + "[instruments.total_current]\nsigned = false\n"
     bench(tmp_path, both_ways(total_current_A=np.abs), '"total_current", "motor_speed", "output_angle"')
     robot = read_rig(tmp_path, text)
-    assert len(settled(tmp_path, robot, rolling=rolling_readings(robot)).kept) == 4
+    assert len(settled(tmp_path, robot).kept) == 4
 
 
 def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
@@ -471,9 +471,11 @@ def test_an_acceleration_that_takes_current_is_no_settled_run(tmp_path):
     heavy = acceleration_currents(robot)
     rate = 0.002 / 100 / 0.05 * np.pi / 30  # load's inertia at the motor over the torque constant, of an rpm a second
     assert heavy["bench"][2] == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
-    slow = {"bench": ("motor_speed", "total_current", 0.02, 1e-3)}
+    slow = robot_file.change_robot(
+        robot, {"bench.inertia": 0.02 / rate * float(robot.configurations["bench"].inertia)}, "a test"
+    )
     with pytest.raises(BadData, match=r"never settles: .* motor_speed still changes by 4\.\d+ %"):
-        settled(tmp_path, robot, inertia=slow)
+        settled(tmp_path, slow)
 
 
 def test_levels_that_are_held_again_widen_sds_by_what_they_differ_by(tmp_path):

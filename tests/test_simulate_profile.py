@@ -1,7 +1,6 @@
 """`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
 
 import csv
-import re
 
 import numpy as np
 import pytest
@@ -139,31 +138,6 @@ def test_battery_that_ends_in_the_mission_is_said(mmrjax, tmp_path):
 
 # --- what is refused ------------------------------------------------------------------------------------------------
 
-#: Profile and options, exit code, and the sentence.
-REFUSED = {
-    "mission.csv --model steady": (2, r"--profile has an effect only with --model drive; got steady"),
-    "mission.csv --model track": (2, r"got track"),
-    "mission.csv --duration 5": (2, r"--duration cannot be combined with --profile"),
-    "mission.csv --posterior 50": (2, r"--posterior cannot be combined with --profile"),
-    "mission.csv --slope 0": (2, r"--slope: mission.csv contains slope_deg too"),
-    "mission.csv --battery --discharge 2300": (2, r"--discharge: got 2300 mAh; the battery is empty at 2200 mAh"),
-    "petrol": (4, r"petrol: no such file and no packaged profile; .*patrol"),
-    "volts.csv --battery": (2, "--battery cannot be combined with volts.csv, which gives supply_voltage_V"),
-    "sides.csv --voltage 15": (2, r"voltage_left_V and voltage_right_V: got 20 V; the supply has 15 V"),
-    "sides.csv --battery": (2, r"--battery cannot be combined with sides.csv, which gives voltage_left_V; .* duty_left and duty_right"),
-    "sides.csv --set sides=1": (2, r"sides.csv drives the two sides differently: got a robot of 1 side; expected sides = 2"),
-    "sides.csv --left 10 --right 5": (2, r"--left cannot be combined with --profile"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("options", REFUSED)
-def test_what_does_not_go_with_a_profile_is_refused(mmrjax, tmp_path, options):
-    wanted, message = REFUSED[options]
-    code, out, err = mmrjax(f"simulate --out x --profile {options}")
-    assert (code, out) == (wanted, "")
-    assert re.search(message, err) and err.count("\n") == 1, err
-    assert not list(tmp_path.glob("x*"))
-
 
 # --- rows of the history --------------------------------------------------------------------------------------------
 
@@ -232,21 +206,3 @@ def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, tmp_path, done
     assert float(found.energy_Wh.sel(payload=0)) == pytest.approx(one["energy_Wh"], rel=1e-6)
     assert float(found.energy_Wh.sel(payload=8)) > one["energy_Wh"] and found.energy_Wh.attrs["units"] == "Wh"
     assert [STATUSES[int(k)] for k in found.status] == ["converged"] * 2 and found.flags.dtype == np.uint16
-
-
-BAD_PLANS = {
-    "an output of a run": (PLAN.replace('"energy_Wh"', '"slip"'), r"plan.toml, outputs: got slip;"),
-    "a condition twice": (PLAN + "slope_deg = [0, 5]\n", r"plan.toml, slope_deg: mission.csv contains it too"),
-    "another model": ('model = "steady"\n' + PLAN, r"profile has an effect only with model drive"),
-    "a duration": ("duration_s = 3\n" + PLAN, r"duration_s cannot be combined with profile"),
-    "no such profile": (PLAN.replace("mission.csv", "none.csv"), r"none.csv: no such file and no packaged profile"),
-    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv, which has a surface column"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BAD_PLANS)
-def test_wrong_plan_is_refused(mmrjax, tmp_path, case):
-    text, message = BAD_PLANS[case]
-    (tmp_path / "plan.toml").write_text(text)
-    code, _, err = mmrjax("sweep", "plan.toml", "--out", "y")
-    assert code in (2, 4) and re.search(message, err), err

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.parts import packaged_gearboxes, packaged_motors
-from calibration.sizing import chart, design_search, sheet
-from calibration.sizing.design import OBJECTIVES, build_robot, build_sizing_task, evaluate_design
+from calibration.sizing import design_search, sheet
+from calibration.sizing.design import build_robot, build_sizing_task, evaluate_design
 from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
@@ -208,17 +208,6 @@ def test_command_leaves_what_its_schema_says(folder):
 
 
 @pytest.mark.slow
-def test_chart_has_the_limits_of_the_robot(robot, asked):
-    """On the bench's surface adhesion ends at 14.6°. The required speed counts within its envelope alone."""
-    of = chart.margin_chart(robot, requirements_file.parse_requirements("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
-    steep = of.slope > 14.6
-    assert np.all(of.margin[steep] < 0) and chart.LIMITS[of.nearest[-1, 0]] in ("adhesion", "gearbox input speed")
-    assert of.margin.shape == (chart.POINTS, chart.POINTS) and np.isfinite(of.margin).all()
-    payload, slope = chart.chart_extent(asked)
-    assert payload == pytest.approx(1.6 * 8) and slope == pytest.approx(16)
-
-
-@pytest.mark.slow
 def test_what_no_parts_meet_is_left_out_and_said(robot):
     asked = requirements_file.parse_requirements(
         "speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml"
@@ -253,25 +242,3 @@ def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
         options_for_robot(robot),
     )
     assert all(d.rows for d in of.demands) and {d.requirement is None for d in of.demands} == {True, False}
-
-
-REFUSED = {
-    ("--objective", "price"): r"^mmrjax: --objective: got price; allowed: mass, energy, cost",
-    ("--pareto", "mass"): r"^mmrjax: --pareto: got mass; expected two different objectives",
-    (
-        "--pareto",
-        "mass,time",
-    ): r"^mmrjax: --pareto: got time; did you mean mass|^mmrjax: --pareto: got time; allowed: ",
-    ("--motors", "RE 31"): r"^mmrjax: --motors: got RE 31; ",
-    ("--starts", "0"): r"^mmrjax: --starts: got 0; ",
-}
-
-
-@pytest.mark.parametrize("given", REFUSED)
-def test_wrong_options_are_refused_in_a_sentence(given, tmp_path, capsys):
-    import re
-
-    assert command(["size", *given, "--out", tmp_path / "run"]) == 2
-    said = capsys.readouterr().err
-    assert re.match(REFUSED[given], said) and said.count("\n") == 1
-    assert not (tmp_path / "run").exists() and list(OBJECTIVES) == ["mass", "energy", "cost"]

@@ -9,7 +9,8 @@ from worlds import rigs
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
-from calibration.inference import foresight, priors, remarks
+from calibration.inference import calibration as fits
+from calibration.inference import foresight, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import Histories, SettledRuns
 from tests.commands import ends, read_rig, read_table
@@ -138,6 +139,6 @@ def test_what_lies_far_from_its_prior_is_not_said_to_be_held_by_it():
         parameters={"near": parameter(0.5), "far": parameter(-6.5)}, held_by_prior=("near", "far"), searched=None,
         together=(), undetermined=("near", "far"),
     )  # fmt: skip
-    said = list(remarks._parameter_remarks(found))
+    said = list(fits._parameter_remarks(found))
     assert [n.names for n in said if n.code == "held_by_prior"] == [("near",)]
     assert [(n.name, n.sds) for n in said if n.code == "far_from_prior"] == [("far", 6.5)]

@@ -132,6 +132,7 @@ def case(kind, robot, bench):
     return one, conditions, jax.jit(mapped)
 
 
+@pytest.mark.quick("tracked-True", "shaft-False")
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("kind", [*RUNS, "shaft"])
 def test_a_step_can_be_traced_by_every_transformation(kind, double, robot, bench):

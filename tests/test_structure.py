@@ -125,7 +125,8 @@ def figures_wait_for_the_page(path, tree):
         head = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
         rooms = {(".".join(name.split(".")[:3]), line) for name, line in names_imported(head, "sweeps.commands")}
         for name, line in rooms:
-            if name.startswith("sweeps.pages.") and not name.endswith("words"):
+            drawn = name.startswith("sweeps.pages.") and not name.endswith("words")
+            if drawn or name == "sweeps.report.page_renderer":
                 yield line, f"imports {name} at its head"
 
 
@@ -522,7 +523,10 @@ BAD = {
         "calibration/sensitivity/bad.py",
         "def f(x):\n    return g('one two three four five six')\ndef h(x):\n    raise BadData('no')",
     ),
-    "imports sweeps.pages.page at its head": ("sweeps/commands/bad.py", "from sweeps.pages.page import render"),
+    "imports sweeps.report.page_renderer at its head": (
+        "sweeps/commands/bad.py",
+        "from sweeps.report.page_renderer import x",
+    ),
     "calls something there": ("sweeps/bad.py", "def f(x):\n    there = x > 0\n    return x[there]"),
     "calls something of": ("mmrjax/bad.py", "def f(of):\n    return of"),
     "keeps state in threading.local": ("calibration/bad.py", "import threading\nX = threading.local()"),
@@ -546,7 +550,7 @@ GOOD = {
     "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",
     "sweeps/options.py": "X = option(help='6T2A or 4W2T')\nfrom calibration.discovery.discover import discover\n",
     "sweeps/paper/rows.py": "X = {'6T2A': ('total_current_A', 'speed_mm_s')}\n",
-    "sweeps/commands/late.py": "from sweeps.pages import words\ndef f():\n    from sweeps.pages import page\n",
+    "sweeps/commands/late.py": "from sweeps.pages import words\ndef f():\n    from sweeps.pages import figure_style\n",
     "sweeps/pages/words.py": "X = ['write 6T2A, or else 4W2T']\n",
 }
 

@@ -213,4 +213,4 @@ obstacle_mm = [60, 500]
     assert [row[0] for row in verdicts] == ["over", "over"] and "over" not in [row[1] for row in verdicts]
     assert (store["furthest_mm"][:, 0] > 60).all() and np.isfinite(store["energy_J"][:]).all()
     page = (tmp_path / "run/report.html").read_text("utf-8")
-    assert "Verdicts over what varies" in page and "gets over" in page and page.count("<svg") == 3
+    assert "gets over" in page and page.count("<svg") == 3

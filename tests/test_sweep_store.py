@@ -773,30 +773,6 @@ def test_size_of_a_store_is_what_it_takes(whole):
     assert 0.95 * taken < laid_out_of(CONFIG).size < 1.1 * taken
 
 
-REFUSED = {
-    "unknown output": ('outputs = ["currant"]\n' + CONFIG, [], r"plan.toml, outputs: got currant; did you mean"),
-    "output twice": ('outputs = ["slip", "slip"]\n' + CONFIG, [], "plan.toml, outputs: got slip twice"),
-    "output that varies": ('outputs = ["voltage"]\n' + CONFIG, [], "plan.toml, outputs: got voltage, which is varied"),
-    "unknown key": ("axis = 3\n" + CONFIG, [], "plan.toml, axis: no such key; did you mean axes?"),
-    "unknown storage": ('storage = "float16"\n' + CONFIG, [], "plan.toml, storage: got 'float16'"),
-    "zero shares": (CONFIG, ["--shard", "1/0"], "--shard: got 1/0; expected i/n with i from 1 to n"),
-    "share zero": (CONFIG, ["--shard", "0/3"], "--shard: got 0/3; expected i/n"),
-    "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
-    "unknown export": (CONFIG, ["--export", "xls"], "--export: got 'xls'; expected 'csv' or 'parquet'"),
-    "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: has an effect only with a grid given by options"),
-    "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml in addition to plan.toml"),
-    "axes are no table": ("axes = 3\nreport = false\n", [], "plan.toml, axes: got 3"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_sweeps_end_with_2_and_one_sentence_and_leave_nothing(sweep, tmp_path, case):
-    config, options, message = REFUSED[case]
-    _, out, err = ends(sweep("s", *options, config=config), message)
-    assert out == "" and err.count("\n") == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
-
-
 def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
     (tmp_path / "s.partial").mkdir()
     (tmp_path / "s.partial/thesis.txt").write_text("years of work")

@@ -120,24 +120,6 @@ def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance(robot
     assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
 
 
-def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
-    for command in ("simulate", "render a.png"):
-        code, _, err = mmrjax(command, "--battery", "--voltage", "15")
-        assert code == 2
-        assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
-    ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages cannot be combined with --battery")
-    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: has no effect on a battery")
-    (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
-    code, _, err = mmrjax("sweep plan.toml")
-    assert code == 2 and err.startswith("mmrjax: plan.toml: voltage has no effect on a battery")
-    (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
-    code, _, err = mmrjax("simulate --battery --runs runs.csv")
-    assert code == 4
-    assert err.startswith(
-        "mmrjax: runs.csv row 1, supply_voltage_V: got 24 together with --battery, whose charge sets"
-    )
-
-
 @pytest.mark.slow
 def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     ends(mmrjax("sweep --battery --slopes 0,5 --payloads 0,8 --out a"), code=0)
@@ -209,14 +191,9 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
 
 
 @pytest.mark.slow
-def test_a_run_may_last_a_day(mmrjax, robot):
+def test_a_run_may_last_a_day(robot):
     found = api.simulate(robot, api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
-    ends(mmrjax("simulate --model drive --duration 86401"), "86400")
-    ends(
-        mmrjax("simulate --model track --duration 3601"),
-        "--duration: got 3601; --model track allows at most 3600 s",
-    )
 
 
 def test_remarks_name_the_run_they_are_of(robot):

@@ -101,17 +101,6 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
     assert np.max(np.abs(data.qvel - end.v) / scale_v) < 1e-6
 
 
-@pytest.mark.slow
-def test_c_mujoco_shakes_alike():
-    """Set S at 33 V, 5 deg, 8 kg: 12 000 steps in which contacts open and close. Goal a fifth, found 1e-13."""
-    import shaking
-
-    found = shaking.native(33.0, 5.0, 8.0)
-    theirs, ours = found["std over mean"].values()
-    assert ours > 0.5 and theirs == pytest.approx(ours, rel=1e-6)
-    assert found["mean speed"]["C MuJoCo"] == pytest.approx(found["mean speed"]["MJX"], rel=1e-6)
-
-
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_mjcf_shows_a_robot_that_stands_on_its_ground(robot, name):
     """What MuJoCo's viewer draws at the keyframe: wheels touch the ground, pulleys leave room for the grousers."""

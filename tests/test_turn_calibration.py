@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from worlds import turning as world
+from worlds import turns
 from worlds.turns import NOISE, SDS, SHOWN
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.described import describe
 from calibration.inference import blocks, identifiability, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
+from calibration.inference.preparation import rows_to_fit
 from mmrjax.model import balances, channels
-from tests.commands import csv_text, text_file
+from tests.commands import csv_text, ends, text_file
 
-CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
 #: Duties of left and right side.
 DUTIES = (
@@ -129,22 +131,52 @@ def test_settled_turns_are_fitted_by_steady_alone(robot, of_world, model):
         SettledTurns.of(of_world, robot, model)
 
 
-def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
-    path = tmp_path / "history.csv"
-    lines = [
-        "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,time_s,yaw_rate_rad_s"
-    ]
-    lines += [f"6T2A,33,13.1,0,0,1,0.5,{0.1 * k},{-0.05 * k}" for k in range(12)]
+@pytest.fixture(scope="module")
+def log(robot, tmp_path_factory):
+    """A log of nine turns whose left side rubs more, and the turns."""
+    path, _ = turns.write(tmp_path_factory.mktemp("log"), "friction", 9, form=turns.log)
+    return records.read_runs(path, robot=robot), turns.rows("friction", 9, noise=0.0)
+
+
+def test_a_log_of_two_sides_is_fitted_at_its_settled_turns(log, robot):
+    """Their means are those that the readings approach."""
+    runs, truth = log
+    table, (note,) = rows_to_fit(runs, robot, 4000)
+    assert observers.observer_kind(table) is SettledTurns and len(table) == 9
+    for column in ("duty_left", "duty_right", "supply_voltage_V"):
+        assert_allclose(table[column], truth[column], rtol=1e-6)
+    for channel in table.channels:
+        z = (table[channel.column] - truth[channel.column]) / table[channel.sd_column]
+        assert np.abs(z).max() < 5
+        assert table[channel.sd_column].max() < 0.02 * np.abs(table[channel.column]).max()
+    assert describe(note).startswith(f"{runs.source}: a log of two sides is not fitted over time, so the fit uses")
+    assert note.runs == 9 and f"settled runs (9, {note.lasts:.3g} s in all)" in describe(note)
+    assert 0.5 < note.lasts / (9 * turns.HOLD * turns.EVERY) < 1
+    rpm = 30 / np.pi  # a ratio of the sides' speeds that is also one of units
+    columns = {**runs.columns, "motor_speed_right_rpm": runs["motor_speed_left_rpm"] / rpm}
+    assert len(rows_to_fit(dataclasses.replace(runs, columns=columns), robot, 4000)[0]) == 9
+
+
+def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp_path, mmrjax):
+    """Levels that are held again are no further operating points."""
+    runs, _ = log
+    few = runs.where(np.repeat([1, 1, 1, 0, 0, 0, 0, 0, 0], turns.HOLD) > 0)
+    again = {name: np.tile(x, 4) for name, x in few.columns.items()}
+    again["time_s"] = np.arange(len(again["time_s"])) * turns.EVERY
     with pytest.raises(
-        BadConfiguration, match=r"history.csv: logs of both sides .*mmrjax settle history.csv .* straight runs with"
+        BadData, match=r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 6 or"
     ):
-        calibrate(
-            records.read_runs(text_file(path, "\n".join(lines) + "\n"), robot=robot),
-            robot,
-            model="drive",
-            free=[f"6T2A.{LATERAL}"],
-            noise=NOISE,
-        )
+        rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
+    short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
+    with pytest.raises(
+        BadData, match=r"the longest level has .*; give one command for straight travel, or hold each"
+    ):
+        rows_to_fit(short, robot, 4000)
+    table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
+    for command in ("loop", "calibrate"):
+        run = mmrjax(command, str(table), "--robot", str(file), "--out", str(tmp_path / "out"))
+        ends(run, "too few operating points (3). Hold 6 or more different levels until all readings", code=4)
+        assert not [*tmp_path.glob("out*")]
 
 
 @pytest.mark.nightly

@@ -11,7 +11,7 @@ from pages import recorded
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadData
 from mmrjax.derived import requirements
 from mmrjax.derived import turning_figures as derived
 from mmrjax.errors import UsageError
@@ -19,10 +19,8 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.channels import SIDES
 from mmrjax.model.quantities import HEAT
-from sweeps import config, inputs
 from sweeps.commands import simulate
-from sweeps.commands import turn as turn_room
-from sweeps.pages import mission_figures, turn_figures
+from sweeps.pages import mission_figures
 from sweeps.pages.figure_style import figure_as_svg
 from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
@@ -61,64 +59,6 @@ def test_the_track_model_turns_and_leaves_its_path(tmp_path, mmrjax):
     assert 0.95 < float(row["guide_share"]) < 1
 
 
-@pytest.mark.slow
-def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
-    told = "--speed", "0.3", "--yaw-rate", "1", "--voltage", "24", "--no-report"
-    assert mmrjax("simulate", *told, "--out", str(tmp_path / "asked"))[0] == 0
-    (asked,) = rows(tmp_path / "asked/runs.csv")
-    assert float(asked["speed_mm_s"]) == pytest.approx(300.0, rel=1e-6)
-    assert float(asked["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
-    sides = [word for side in ("left", "right") for word in (f"--{side}", asked[f"motor_voltage_{side}_V"])]
-    assert mmrjax("simulate", *sides, "--no-report", "--out", str(tmp_path / "driven"))[0] == 0
-    (driven,) = rows(tmp_path / "driven/runs.csv")
-    assert float(driven["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
-    code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
-    assert code == 2
-    said = " ".join(err.split())
-    assert "take 18.1 V at one motor; the supply has 12 V, which gives about 0.1" in said
-    words = (
-        said.rpartition("about ")[0].split("about ")[1],
-        said.rpartition("about ")[2],
-    )  # "0.1 rad/s at ...", "0.1 m/s at"
-    less = [f"{0.99 * float(word.split()[0]):.4g}" for word in words]
-    for speed, rate in ((told[1], less[0]), (less[1], told[3])):
-        weak = "--speed", speed, "--yaw-rate", rate, "--voltage", "12", "--no-report"
-        assert mmrjax("simulate", *weak, "--out", str(tmp_path / f"at {rate}"))[0] == 0
-
-
-#: Of a robot that rolls as its motors turn: speed over voltage [m/(s V)], and its width [m].
-ROLLS, WIDE = 0.03, 0.5
-
-
-@pytest.mark.parametrize(
-    ("speed", "rate", "says"),
-    [
-        (0.3, 3.0, "need 35 V at one motor; the supply has 24 V, which gives about 1.68 rad/s at 0.3 m/s and "
-                   "no more than 2.88 rad/s when turning on the spot"),
-        (-0.6, 1.0, "need 28.3 V at one motor; .* about 0.48 rad/s at 0.6 m/s and about 0.47 m/s at 1 rad/s"),
-        (0.0, -9.0, "which gives no more than 2.88 rad/s when turning on the spot"),
-        (2.0, -0.5, "which gives about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s in straight travel"),
-    ],
-)  # fmt: skip
-def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, speed, rate, says):
-    """Which is kept of the demand, the other as much as the supply gives: v + B |ω| / 2 = ROLLS U."""
-
-    def rolling(robot, asked):
-        left, right = (np.ravel(getattr(asked, f"duty_{side}"))[0] for side in SIDES)
-        inner = np.concatenate([[min(left, right, key=abs)], max(left, right, key=abs) * turn_room.SHARES])
-        outer = np.full(len(inner), max(left, right, key=abs))
-        pair = (inner, outer) if abs(left) <= abs(right) else (outer, inner)
-        volts = np.ravel(asked.voltage)[0] * np.stack(pair)
-        reading = {"speed": ROLLS * volts.mean(0), "yaw_rate": ROLLS * (volts[1] - volts[0]) / WIDE}
-        return types.SimpleNamespace(result=types.SimpleNamespace(reading=reading)), asked
-
-    monkeypatch.setattr(turn_room, "_turns_to_compare", rolling)
-    robot, demand = paper_robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
-    runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.turn_columns(demand, {})})
-    with pytest.raises(BadConfiguration, match=f"{speed:g} m/s and {rate:g} rad/s .*{says}"):
-        turn_room._run_for_demand(robot, runs.conditions(robot), runs, demand)
-
-
 def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
     asked = types.SimpleNamespace(quantity=requirements.QUANTITIES["turning_radius_mm"])
     said = check_report.reached_value_text(types.SimpleNamespace(requirement=asked, value=None, status="not_settled"))
@@ -126,48 +66,6 @@ def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs()
     assert said != check_report.reached_value_text(
         types.SimpleNamespace(requirement=asked, value=None, status="stalled")
     )
-
-
-def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
-    speeds, rates = np.array([0.7, np.nan, 0.0]), np.array([0.0, np.nan, 3.0])
-    assert "friction falls with sliding" in turn_words.turn_not_found_reason(0.3, 1.0, speeds, rates)
-    assert "gives about" in turn_words.turn_not_found_reason(0.3, 2.0, speeds, rates)
-    assert "no turn settles" in turn_words.turn_not_found_reason(0.3, 2.0, np.full(3, np.nan), rates)
-
-
-REFUSED = {
-    "one side": (("--left", "33"), "--left needs --right"),
-    "volts and duties": (
-        ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
-        "--left cannot be combined with --duty-left",
-    ),
-    "speed alone": (("--speed", "0.3"), "--speed needs --yaw-rate"),
-    "volts and a demand": (
-        ("--left", "3", "--right", "1", "--speed", "0.3", "--yaw-rate", "1"),
-        "--left cannot be combined with --speed",
-    ),
-    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "give --duty-left and --duty-right"),
-    "track, one side": (("--left", "3", "--model", "track"), "--left needs --right"),
-    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left cannot be combined with --profile"),
-    "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
-    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "so it has no steady state"),
-    "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
-    "shaft": (("--left", "3", "--right", "1", "--robot", "SHAFT"), "the robot's load is a shaft"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
-def test_bad_turns_are_refused_in_a_sentence(tmp_path, mmrjax, case):
-    told, sentence = REFUSED[case]
-    one = tmp_path / "one.toml"
-    one.write_text('base = "nominal"\nsides = 1\n')
-    shaft = tmp_path / "shaft.toml"
-    mmrjax("rig new", str(shaft), "--kind", "bench")
-    told = [{"ONE": str(one), "SHAFT": str(shaft)}.get(word, word) for word in told]
-    code, _, err = mmrjax("simulate", *told, "--out", str(tmp_path / "run"))
-    assert code == 2
-    assert sentence in " ".join(err.split())
-    assert not (tmp_path / "run").exists()
 
 
 HEADER, SIDED = "configuration,supply_voltage_V,payload_kg,slope_deg,", "duty_left,duty_right"
@@ -221,59 +119,12 @@ def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, 
     assert simulate.motor_currents(paper_robots.nominal(), table) == pytest.approx([1.8])
 
 
-def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
-    path = tmp_path / "turns.csv"
-    path.write_text(f"{HEADER}{SIDED}\n6T2A,33,0,0,1,0.5\n")
-    for more in ((), ("--profile", "patrol", "--battery")):
-        ends(
-            mmrjax("simulate --runs", path, "--voltage", "4", "--mass", "12", *more),
-            "--voltage, --mass: not allowed with --runs",
-        )
-
-
-@pytest.mark.parametrize(
-    ("told", "said"),
-    [
-        ("motor_speed_left = 800", "motor_speed_left needs motor_speed_right too; give both"),
-        ("duty = 0.5", "duty cannot be combined with duty_left and duty_right"),
-    ],
-)
-def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
-    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", f"{told}\n[axes]"))
-    ends(mmrjax("sweep plan.toml --no-report --out run"), said)
-
-
-def test_a_robot_that_cannot_turn_is_refused_wherever_it_is_asked_to(tmp_path, mmrjax):
-    (tmp_path / "plan.toml").write_text(PLAN)
-    narrow = "--set", "6T2A.turning.width=0", "--no-report"
-    told = ("sweep", "plan.toml"), ("sensitivity", "--configurations", "6T2A", "--vary", "duty_left=0.5:1")
-    for words in told:
-        ends(mmrjax(*words, *narrow), "duty_left: the robot's file lacks 6T2A.turning.width [m]")
-
-
 def test_results_of_turns_show_both_sides():
     """Nothing is computed before it is asked for. Who travels straight has the columns of before."""
     robot, sides = paper_robots.nominal(), {"duty_left": 1.0, "duty_right": [0.5, -1.0]}
     turns, straight = (mm.simulate(robot, mm.Conditions("6T2A", voltage=33.0, **x)) for x in (sides, {}))
     assert {"yaw_rate", "motor_current_left", "motor_current_right"} <= {c.name for c in turns.channels}
     assert straight.channels == robot.channels
-
-
-def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
-    for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
-        ends(
-            mmrjax("simulate --surface ice", *more),
-            "--surface: got ice, for which no friction is known; allowed: linoleum",
-        )
-
-
-def test_a_sweep_refuses_turns_on_a_slope_which_have_no_steady_state(tmp_path, mmrjax):
-    (tmp_path / "plan.toml").write_text(PLAN.replace("[axes]", "slope_deg = 10\n[axes]"))
-    ends(
-        mmrjax("sweep plan.toml --no-report --out run"),
-        "duty_left -1: got a slope of 10 deg for a robot that turns",
-    )
-    assert not (tmp_path / "run").exists()
 
 
 SLOPING = {"slope_deg": 10.0, "yaw_rate_rad_s": -0.04}
@@ -400,7 +251,7 @@ def test_tables_have_no_negative_zero(robot):
 def test_a_path_between_places_that_turn_is_an_arc():
     """A quarter of a circle of 2 m, and a metre straight on, from three rows."""
     x, y, yaw = np.array([0.0, 2.0, 2.0]), np.array([0.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, np.pi / 2])
-    ahead, aside = turn_figures.path_arcs(x, y, yaw)
+    ahead, aside = mission_figures.path_arcs(x, y, yaw)
     assert_allclose(np.hypot(ahead[:-1], aside[:-1] - 2.0), 2.0, rtol=1e-12)
     assert np.max(np.diff(aside[:-1])) < 0.11 and (ahead[-1], aside[-1], len(ahead)) == (2.0, 3.0, 34)
 

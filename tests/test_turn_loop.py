@@ -14,6 +14,7 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.discovery.discover import build_candidate_space, discover, prepare_loop
 from calibration.inference import bases as bases_room
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
 from mmrjax.effects.curve import ordinate_weights
@@ -141,10 +142,13 @@ def test_command_finds_what_a_second_implementation_planted(tmp_path, mmrjax, ca
     assert found["verdict"] in ("named", "class") and FOUND[case] in members
 
 
-@pytest.mark.parametrize("case", ["voltage", "moment", "grip"])
-def test_what_a_second_implementation_planted_is_found(tmp_path, case):
-    """In the whole library, for which the command above has compiled."""
-    table, file = planted.write(tmp_path, case)
+@pytest.mark.parametrize(("case", "form"), [
+    ("voltage", planted.rows), ("moment", planted.rows), ("grip", planted.rows), ("friction", planted.log),
+])  # fmt: skip
+def test_what_a_second_implementation_planted_is_found(tmp_path, case, form):
+    """In the whole library, for which the command above has compiled. Of a log, its settled turns are used."""
+    table, file = planted.write(tmp_path, case, form=form)
     robot = mm.read_robot(str(file))
     found = discover(records.read_runs(table, robot=robot), robot, noise=planted.NOISE, replicates=250)
     assert found.verdict in ("named", "class") and FOUND[case] in {n for e in found.effects for n in e.members}
+    assert bool(remarks_with_codes(found.remarks, "settled_runs")) == (form is planted.log)

@@ -23,6 +23,7 @@ from sweeps.inputs import load_robot
 from sweeps.points import axes
 from sweeps.points.job import prepare_job
 from tests.commands import ends, read_rig
+from tests.pages import Tables
 
 MOTOR = "[motor]\ntorque_constant = 0.03\n{more}[gearbox]\nratio = 20\nefficiency_load = 0.8\n"
 BENCH = (
@@ -166,9 +167,8 @@ def test_commands_leave_out_what_is_unknown_and_say_so(mmrjax, tmp_path):
     (head, _) = (tmp_path / "run/runs.csv").read_text(encoding="utf-8").splitlines()
     columns = {"voltage_V", "power_supply_W", "efficiency_motor", "winding_settled_C", "permissible_time_s"}
     assert columns.isdisjoint(head.split(",")) and "power_motor_W" in head
-    assert "not known, as the robot's file does not state motor.resistance, " in " ".join(out.split())
-    page = (tmp_path / "run/report.html").read_text(encoding="utf-8")
-    assert "Not known, as the robot&#39;s file does not state motor.resistance, " in page
+    note = "cannot be computed: the robot's file does not give motor.resistance, "
+    assert note in " ".join(out.split()) and note in Tables((tmp_path / "run/report.html").read_text("utf-8")).text
 
 
 @pytest.mark.parametrize(("varied", "refused"), [({}, True), ({"motor.resistance": [0.5, 1.0]}, False)])

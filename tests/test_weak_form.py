@@ -236,6 +236,7 @@ def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
     assert found is not None and np.all(np.abs(found.z) < 4)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("imposed, every, seed", [("voltage", 0.005, 714), ("motor_current", 0.005, 739)])
 def test_noise_of_an_angle_alone_is_neither_an_inertia_nor_a_gain(tmp_path, imposed, every, seed):
     """Its derivatives contained that noise. Inertias were too small by 3 to 18 posterior sds, and a gain had 2.4 sds, on 25 000 rows 11."""

@@ -10,7 +10,20 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from calibration.data import Names, surfaces
-from calibration.data.columns import DRIVEN, DUTY, HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, WORDS, Column, Layout
+from calibration.data.columns import (
+    CURRENT,
+    DRIVEN,
+    DUTY,
+    HEADING,
+    SIDES,
+    SPEED,
+    SUPPLY,
+    TIME,
+    VOLTS,
+    WORDS,
+    Column,
+    Layout,
+)
 from calibration.data.input_errors import BadData, allowed_words, parse_number
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import channels, quantities
@@ -194,6 +207,8 @@ def check_header(
                 suggestion = "; the columns that drive the sides can be named under [columns]: " + ", ".join(
                     f'{volts} = "motor_{volts}"' for volts in VOLTS
                 )
+            elif column == SUPPLY and CURRENT in mapped_columns and not close:
+                suggestion = f'; record it, or set imposed = "motor_current" if {CURRENT} is commanded'
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{suggestion} (required: {', '.join(required)})"
                 + ("" if close else _advice_on_unknown_columns(strange, column))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -30,13 +32,13 @@ GAP = 5.0
 SELDOM = 0.02
 
 
-def check_contradictions(runs: Runs, robot: Robot) -> None:
-    """Rejects a table that contradicts itself or its robot.
+def check_contradictions(runs: Runs, robot: Robot) -> Runs:
+    """Rejects a table that contradicts itself or its robot. Returns it with angles that keep counting.
 
     Raises:
         BadData: a vehicle has no mass, the table has turns of a robot that cannot turn, or the sides are exchanged.
-            Also if the stated voltage cannot turn the motors at the imposed speed, an angle wraps or changes its
-            unit, or time goes back.
+            Also if the stated voltage cannot turn the motors at the imposed speed, a position wraps, an angle or a
+            position changes its unit, or time goes back.
     """
     _check_mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
@@ -53,7 +55,8 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
         _check_time_order(runs)
         for column in ("output_angle_deg", "position_mm"):
             if runs.has(column):
-                _check_wraps(runs, column)
+                runs = unwrap_angle(runs, column)
+    return runs
 
 
 def reason_without_stance(robot: Robot) -> str | None:
@@ -174,12 +177,13 @@ def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
     return np.nanmedian([padded[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 
 
-def _check_wraps(runs: Runs, column: str) -> None:
-    """Rejects an angle or a position that wraps or changes its unit. A position wraps at any length, so it also has
-    to jump against its motion.
+def unwrap_angle(runs: Runs, column: str) -> Runs:
+    """Removes the wraps of an angle at a turn. Rejects an angle or a position that jumps otherwise.
+
+    A position wraps at any length, so it also has to jump against its motion.
     """
-    readings, is_angle, unit = runs[column], column == "output_angle_deg", column.rpartition("_")[2]
-    one = "an angle" if is_angle else "a position"
+    readings, is_angle, unit = runs[column].copy(), column == "output_angle_deg", column.rpartition("_")[2]
+    one, note = "an angle" if is_angle else "a position", ""
     for name in np.unique(runs.run_names):
         run_rows = runs.in_order(name)
         run_rows = run_rows[np.isfinite(readings[run_rows])]
@@ -197,7 +201,11 @@ def _check_wraps(runs: Runs, column: str) -> None:
         jumps = np.flatnonzero(large)
         if jumps.size:
             row, time_steps = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
-            gap = time_steps[jumps[0]]
+            gap, is_turn = time_steps[jumps[0]], np.abs(np.abs(step) - 2 * TURN) <= UNUSUAL * usual
+            if is_angle and is_turn[jumps].all() and gap <= GAP * np.median(time_steps):
+                readings[run_rows] = np.unwrap(angle, period=2 * TURN)
+                note = f"{runs.source} row {row + 1}, {column}: wraps at {2 * TURN:g} {unit}. The wraps are removed"
+                continue
             why = f"like {one} that wraps or changes its unit; expected {one} that keeps counting"
             if gap > GAP * np.median(time_steps):
                 why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
@@ -205,3 +213,6 @@ def _check_wraps(runs: Runs, column: str) -> None:
                 f"{runs.source} row {row + 1}, {column}: jumps by {float(f'{step[jumps[0]]:.4g}'):g} {unit} from the "
                 f"sample before, {why}"
             )
+    if not note:
+        return runs
+    return dataclasses.replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))

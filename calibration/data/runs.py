@@ -187,7 +187,7 @@ def runs_of_arrays(
     headings = {m.column: m.shown for m in meanings if m is not None}
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
-        contradictions.check_contradictions(runs, robot)
+        runs = contradictions.check_contradictions(runs, robot)
         runs = drop_computed_torques(without_unread(runs, robot), robot)
     return runs
 

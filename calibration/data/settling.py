@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Columns
-from calibration.data.columns import LOAD, SPEED, TIME
+from calibration.data.columns import LOAD, SPEED
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied_drive, differs_from_row_before
 from calibration.data.input_errors import BadData
@@ -156,12 +156,17 @@ class Settled:
         """Stretches that are settled runs."""
         return tuple(s for s in self.stretches if not s.why)
 
+    @property
+    def points(self) -> int:
+        """Number of operating points: settled runs with different drives or conditions."""
+        step = DRIFT * float(np.max(np.abs(applied_drive(self.runs))))
+        return len({(round(s.imposed / step), *_point_of(self.runs, s)) for s in self.kept})
+
     def settled_runs(self) -> Runs:
         """Settled runs, in the form of a table from a file."""
-        columns = {**self.runs.columns, **self.table()}
-        count = len(self.kept)
-        columns = {name: x for name, x in columns.items() if len(x) == count and name not in (*TIME, "mode")}
-        return dataclasses.replace(self.runs, columns=columns, extras={}, log=None)
+        columns = self.table()
+        extras = {name: columns.pop(name) for name in self.runs.extras if name in columns}
+        return dataclasses.replace(self.runs, columns=columns, extras=extras, log=None)
 
     def table(self) -> Columns:
         """Settled runs as columns of a table of runs."""
@@ -194,12 +199,10 @@ def _digits(x: float, digits: int = 7) -> float:
 
 def settle_log(
     runs: Runs,
+    robot: Robot | None = None,
     *,
     shortest: float | None = None,
     drift: float = DRIFT,
-    inertia: Mapping[str, Inertia] | None = None,
-    rolling: Mapping[str, Mapping[str, float]] | None = None,
-    loop: str = "mmrjax loop LOG --robot RIG",
 ) -> Settled:
     """Returns the settled runs of a log.
 
@@ -214,21 +217,21 @@ def settle_log(
     * the scatter of stretches under the same conditions.
 
     Args:
+        robot: robot of the log. Stretches in which its acceleration takes more than `drift` of the current are
+            omitted, and units are checked with its ratios. None: without both.
         shortest: shortest stretch [s]. None: 0.3 s, and at least 20 samples.
         drift: largest change within a stretch, as a share of the mean.
-        inertia: by configuration. Stretches in which acceleration takes more than `drift` of the current are omitted.
-        loop: command that fits unsettled logs, for messages.
-        rolling: by configuration, readings of channels by name while the motors turn at 1 rad/s [unit of the column].
 
     Raises:
         BadData: time does not increase, a channel has a single value, there is no stretch, speeds or currents have no
             sign, or speeds or rates of angles are in other units than their columns state.
     """
-    result = _divide_log(runs, shortest, drift, inertia)
+    result = _divide_log(runs, shortest, drift, {} if robot is None else acceleration_currents(robot))
     if not result.kept:
-        raise BadData(_nothing_settled_message(result, loop))
+        raise BadData(_nothing_settled_message(result))
     _check_signs(result)  # from their own sds, because repeats with different signs widen the final ones
-    _check_units(result, rolling or {})
+    if robot is not None and not runs.turns:  # the sides of a turn have different speeds
+        _check_units(result, rolling_readings(robot))
     return dataclasses.replace(
         result,
         stretches=tuple(
@@ -241,7 +244,7 @@ def settle_log(
 def doubtful_sign(runs: Runs) -> str:
     """Reason to doubt the sign of a channel, from the settled stretches, empty without evidence."""
     try:
-        result = _divide_log(runs, None, DRIFT, None)
+        result = _divide_log(runs, None, DRIFT, {})
     except BadData:  # a log without a stretch
         return ""
     try:
@@ -251,7 +254,7 @@ def doubtful_sign(runs: Runs) -> str:
     return ""
 
 
-def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
+def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia]) -> Settled:
     """Stretches of a log with their means, before they are compared with each other."""
     if not runs.sampled:
         raise BadData(
@@ -278,7 +281,7 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
         _check_alive(runs, signal)
     stuck = {s.channel.name: _stuck_rows(s, rows_by_run) for s in signals}
     stretches = [
-        _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels
+        _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia) for level in levels
     ]
     scatter = _scatter_of(runs, stretches, signals, float(np.max(np.abs(drives))))
     return Settled(runs, tuple(stretches), signals, shortest, drift, tuple(gaps), scatter)
@@ -773,11 +776,10 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
 
 def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
     """Extra sd of each channel between stretches under the same conditions [unit], 0 with too few repeats."""
-    alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
     previous_key: tuple[object, ...] = ()
-    for s in sorted((s for s in found if not s.why), key=lambda s: (_brake_levels(runs, s), s.imposed)):
-        row_key = (_brake_levels(runs, s), *(runs[c][s.rows[0]] for c in alike))
+    for s in sorted((s for s in found if not s.why), key=lambda s: (_point_of(runs, s), s.imposed)):
+        row_key = _point_of(runs, s)
         if groups and row_key == previous_key and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
             groups[-1].append(s)
         else:
@@ -799,14 +801,15 @@ def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], l
     return scatter
 
 
-def _brake_levels(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
+def _point_of(runs: Runs, stretch: Stretch) -> tuple[object, ...]:
     """Levels of the brake torque in a stretch, and of each side's drive in a turn, in steps of `DRIFT` of the
-    largest.
+    largest, and its other conditions.
     """
     signals = (*(runs.of_sides if runs.turns else ()), *([runs[LOAD]] if runs.has(LOAD) else []))
-    return tuple(
+    levels = (
         round(float(np.mean(x[stretch.rows])) / (DRIFT * float(np.max(np.abs(x))))) if x.any() else 0 for x in signals
     )
+    return *levels, *(runs[c][stretch.rows[0]] for c in EXACT if runs.has(c))
 
 
 #: A mean has a sign if it is at least this far from zero [sds].
@@ -889,9 +892,9 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
                 )
 
 
-def _nothing_settled_message(found: Settled, loop: str) -> str:
-    """Message on a log without settled stretches: main reason and advice. `loop`: command that fits it."""
-    direct = "" if found.runs.turns else f"use the log itself ({loop}), or "
+def _nothing_settled_message(found: Settled) -> str:
+    """Message on a log without settled stretches: main reason and advice."""
+    instead = "give one command for straight travel" if found.runs.turns else "use the log itself with loop"
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
     whys = [s.why for s in found.stretches]
     why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
@@ -909,19 +912,19 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
             )
         return (
             f"{source}: no settled segment: the longest level has {longest_text} ({rows}); expected at least "
-            f"{least_text}; {direct}{cure}"
+            f"{least_text}; {instead}, or {cure}"
         )
     if why in ("settling", "accelerates"):
         return (
             f"{source}: never settles: at the end of its longest level ({rows}) {longest.channel or 'a channel'} "
-            f"still changes by {100 * longest.size:.2g} % (allowed: {100 * found.drift:g} %); {direct}hold each "
-            "level longer or set a larger --drift"
+            f"still changes by {100 * longest.size:.2g} % (allowed: {100 * found.drift:g} %); {instead}, or hold "
+            "each level longer or set a larger --drift"
         )
     if why == "unread":
         filled_shares = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
         return (
             f"{source}: no settled segment: no channel has enough readings ({filled_shares} of the rows); each level "
-            f"needs at least {FEWEST}; {direct}log them more often"
+            f"needs at least {FEWEST}; {instead}, or log them more often"
         )
     imposed = found.runs.layout.imposed_column
     message_of_reason = {

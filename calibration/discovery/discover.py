@@ -21,7 +21,6 @@ from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.data.thinning import used_rows
 from calibration.described import describe, report_in_words
 from calibration.discovery import findings, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
@@ -86,6 +85,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.observers.linear_rows import problem_of_readings
 from calibration.inference.observers.windows import Windows, problem_of_windows
+from calibration.inference.optimizers import CORES
 from calibration.inference.population import StoreStage, compute_without_storing
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.shown_states import MissingStates, state_plan_or_reason
@@ -172,20 +172,25 @@ def discover(
     if not is_double():
         raise BadConfiguration(f"discover: {SINGLE}")
     tell = report_in_words(progress)
-    ready = prepare_loop(
-        runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
-        forbidden=forbidden, rows=rows,
+    prepare = functools.partial(
+        prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed,
+        prefer=prefer, forbidden=forbidden, rows=rows,
     )  # fmt: skip
-    told, known = dataclasses.replace(ready, progress=tell, keep=keep), ready.noise
+    ready = prepare(runs)
+    told = dataclasses.replace(ready, progress=tell, keep=keep, prepare=prepare)
     for note in ready.at_first:
         tell(note)
     traced = keep("verdict", lambda: told.trace(ahead=True))
+    if traced.settled is not None:
+        ready = prepare(traced.settled[0], settled=traced.settled[1])
+        told = dataclasses.replace(ready, progress=tell, keep=keep)
+    known = ready.noise
     refuted = remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
     notes: Notes = tuple(n for n in ready.notes if n not in refuted)
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    threads = Threads(2)
+    threads = Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
     sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
@@ -241,6 +246,7 @@ class LoopInput:
         keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
         known: results for the same table with other sds.
         begin: fit of the base of a long log to its windows.
+        prepare: function from settled runs that replace a log, and a remark on them, to their input.
         others: open while later programs are compiled on other cores, see `later`. None if there is nothing to
             compile.
     """
@@ -261,6 +267,7 @@ class LoopInput:
     equations: CandidateSpace | None = None
     confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
     begin: Candidate | None = None
+    prepare: Callable[..., LoopInput] | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
@@ -284,7 +291,8 @@ class LoopInput:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[], begin=begin)
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
             if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
-                return _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
+                settled = None if screened.base.candidate.converged else self.trace_settled()
+                return settled or _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
@@ -317,17 +325,34 @@ class LoopInput:
         if self.equations is not None or other or (equations := equations_of_log(self)) is None:
             return None, None
 
-        def keep(name: str, make: Callable[[], Any]) -> Any:
-            """Stores a stage apart from the one of this name that simulates. Both have the same ranking."""
-            return self.keep(name if name == "ranking" else f"windows {name}", make)
-
         confirm = functools.partial(_best_simulated_size, self.space.with_room(self.known_room), self.settings)
         simulates = self.known is None or self.known_room
-        equations = dataclasses.replace(equations, keep=keep, confirm=confirm if simulates else None)
+        equations = dataclasses.replace(
+            equations, keep=self.kept_apart("windows"), confirm=confirm if simulates else None
+        )
         traced = equations.trace()
         slides = self.robot.has_ground and self.robot.rig.imposed == "voltage"  # which equations do not show
         begin = None if slides else _delayed_by_rows(self, traced.screened.base.candidate)
         return _confirm_by_simulation(self, equations, traced), begin
+
+    def trace_settled(self) -> LoopStages | None:
+        """Stages of the settled runs of a log that no fit describes. None if these are too few."""
+        if self.prepare is None:
+            return None
+        try:
+            runs, settled = preparation.settled_rows(self.runs.whole, self.robot, "unfitted")
+        except BadData:
+            return None
+        ready = self.prepare(runs, settled=settled)
+        for note in ready.at_first:
+            self.progress(note)
+
+        table = dataclasses.replace(ready, progress=self.progress, keep=self.kept_apart("settled"))
+        return dataclasses.replace(table.trace(ahead=True), settled=(runs, settled))
+
+    def kept_apart(self, word: str) -> StoreStage:
+        """Storage of stages apart from those of the log over time. Only the ranking has the same name."""
+        return lambda name, make: self.keep(name if name == "ranking" else f"{word} {name}", make)
 
     @property
     def known_room(self) -> Names:
@@ -381,13 +406,15 @@ def prepare_loop(
     prefer: str = FIT,
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
+    settled: Notes = (),
 ) -> LoopInput:
     """Prepares the input of the stages from the arguments of `discover`, and raises its errors.
 
     A campaign that needs only verdicts continues with `LoopInput.trace`, so it computes the same as the command.
+    `settled`: remark on settled runs that replace a log.
     """
     menu.check_forbidden(forbidden, robot)
-    runs = used_rows(runs, robot, rows)
+    runs, of_sides = preparation.rows_to_fit(runs, robot, rows)
     distinct, numbers, notes = remove_copies(runs)
     kind = observers.observer_kind(distinct)
     if len(distinct) < kind.fewest:
@@ -395,8 +422,7 @@ def prepare_loop(
             f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
-    with scales.compute_nominal_ahead(robot):
-        ready = preparation.prepare_input(distinct, robot, noise, stated)
+    ready = preparation.prepare_input(distinct, robot, noise, stated, settled=(*settled, *of_sides))
     for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
@@ -461,6 +487,7 @@ class LoopStages:
         missed: channels that the refit does not describe. For other verdicts than `undescribed`, with the error that
             remains after adding effects.
         unused: numeric columns that vary and have no role.
+        settled: settled runs that replace a log, and a remark on them.
     """
 
     verdict: str
@@ -478,6 +505,7 @@ class LoopStages:
     missed: tuple[MissedChannel, ...] = ()
     unused: Names = ()
     run: LogSimulation | None = None
+    settled: tuple[Runs, Notes] | None = None
 
     @property
     def members(self) -> tuple[Names, ...]:
@@ -780,12 +808,11 @@ def _trace_readings(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
     equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    apart = given.kept_apart("readings")
 
     def keep(name: str, make: Callable[[], Any]) -> Any:
-        """Stores a stage apart from the simulated one of this name."""
-        if name == "ranking":
-            return None if ranked else given.keep(name, make)
-        return given.keep(f"readings {name}", make)
+        """Stores a stage apart, except a second ranking."""
+        return None if ranked and name == "ranking" else apart(name, make)
 
     confirm = functools.partial(_smallest_confirmed, space, settings)
     table = dataclasses.replace(

@@ -10,11 +10,12 @@ one.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from importlib import resources
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,17 +24,17 @@ import numpy as np
 from calibration.data.effect_file import Library
 from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
-from mmrjax.compile.compiling import OVER_TIME, compiled
-from mmrjax.compile.precision import Threads, in_double
+from calibration.inference.operating import travel_of_rows
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
-from mmrjax.fidelities.steady import operating_signals, results_of_rows
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.balances import BALANCES, absent_balances, effects_sum
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
+#: Signals of the nominal robot under the conditions of Table 8.
+NOMINAL = resources.files("calibration") / "data" / "nominal_signals.csv"
 #: Reference quantity of each balance; terms are shares of it.
 WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
     "duty": lambda robot, s: s.duty,
@@ -99,7 +100,7 @@ def scale_library(robot: Robot, conditions: Conditions, library: Library, turned
         return library
     # of conditions that vary in time, those in the middle of each run
     steady = jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
-    signals = _operating_signals(robot, steady)
+    signals = travel_of_rows(robot, steady)[1]
     nominal, effect_signals = _nominal_signals()
     sized = {}
     for name, kind in library.items():
@@ -111,18 +112,6 @@ def scale_library(robot: Robot, conditions: Conditions, library: Library, turned
             (nominal, _signals_at_angle(effect_signals, kind)),
         )
     return sized
-
-
-@contextlib.contextmanager
-def compute_nominal_ahead(robot: Robot) -> Iterator[None]:
-    """Context manager that computes the nominal robot's signals for `scale_library` on another core.
-
-    It waits for them even after an error, because a process that ends while a thread works in XLA would abort.
-    """
-    with Threads(1) as core:
-        if not robot.rig.inherits:
-            core.submit(in_double(_nominal_signals))
-        yield
 
 
 def output_rotation(runs: Runs, robot: Robot) -> float:
@@ -153,26 +142,16 @@ def effect_applies(kind: type[Effect], robot: Robot) -> bool:
     return kind.balance != "sensor" or kind.channel in robot.rig.channels
 
 
-def _operating_signals(robot: Robot, conditions: Conditions) -> Signals:
-    return (
-        results_of_rows(robot, conditions)[1] if conditions.turns else _operating_signals_of_travel(robot, conditions)
-    )
-
-
-@functools.partial(compiled, options=OVER_TIME)
-def _operating_signals_of_travel(robot: Robot, conditions: Conditions) -> Signals:
-    return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
-
-
 @functools.cache
 def _nominal_signals() -> tuple[Robot, Signals]:
-    """The nominal robot and its signals under the conditions of Table 8."""
-    robot = params.without_weak_types(paper_robots.nominal())
-    axes = np.meshgrid(
-        paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
-    )
-    volts, slopes, payloads, configuration_index = (a.ravel() for a in axes)
-    return robot, _operating_signals(robot, Conditions(configuration_index.astype(int), volts, slopes, payloads))
+    """The nominal robot and its signals under the conditions of Table 8, from a file: they are the same for all rigs.
+
+    `tests/test_scaled_effects.py` compares the file with `results_of_rows`.
+    """
+    table = np.genfromtxt(NOMINAL.read_text("utf-8").splitlines(), delimiter=",", names=True)
+    columns: dict[str, Any] = {name: jnp.asarray(table[name]) for name in table.dtype.names or ()}
+    columns["configuration"] = columns["configuration"].astype(int)
+    return params.without_weak_types(paper_robots.nominal()), dataclasses.replace(Signals(), **columns)
 
 
 def _rms_size(x: object) -> float:

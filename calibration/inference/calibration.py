@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,6 @@ from calibration.data import Names, Priors, surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
-from calibration.data.thinning import used_rows
 from calibration.described import report_in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
@@ -36,16 +35,15 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
-from calibration.inference.population import GENERATIONS, LEAST, StoreStage, compute_without_storing
-from calibration.inference.preparation import PreparedInput, prepare_input
-from calibration.inference.problem import Problem
-from calibration.inference.remarks import calibration_remarks, row_numbers
+from calibration.inference.population import EDGE, GENERATIONS, LEAST, StoreStage, compute_without_storing
+from calibration.inference.preparation import PreparedInput, prepare_input, rows_to_fit
+from calibration.inference.problem import MARGIN, Problem
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
 from mmrjax.compile.precision import SINGLE, in_double, is_double
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import FLAGS, STATUSES
+from mmrjax.model.signals import DONE, FLAGS, STATUSES
 
 #: Members of a generation if parameters are free that `steady` does not read.
 POPULATION = 256
@@ -118,7 +116,7 @@ def calibrate(
     for name, (value, low) in counts.items():
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
-    runs, progress = used_rows(runs, robot, rows), report_in_words(tell)
+    (runs, settled), progress = rows_to_fit(runs, robot, rows), report_in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
     facts = observers.facts_of_fidelity(fidelity)
@@ -127,7 +125,7 @@ def calibrate(
     blocks = facts.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
     choose = functools.partial(_free_names, runs, observe, fidelity, free, fix)
-    ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose)
+    ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose, settled=settled)
     for note in (*ready.foreign, *ready.doubted):
         progress(note)
     base, of_product = _with_guide_priors(runs, ready, fidelity)
@@ -438,3 +436,63 @@ def _calibration_result(
         ),
     )
     return dataclasses.replace(result, remarks=(*result.remarks, *calibration_remarks(result)))
+
+
+#: Shift from the prior above which a remark calls the prior or the model wrong [prior sd].
+FAR = 3.0
+
+
+def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
+    """Remarks on noise, search, rows, parameters, limits and held-out blocks."""
+    shares = ((c.name, found.noise[c.name].estimated_percent) for c in found.channels)
+    if estimated := tuple((name, percent) for name, percent in shares if percent is not None):
+        yield Remark("estimated_noise", percent=estimated)
+    if not found.converged:
+        yield Remark("unsettled", names=found.undetermined)
+    if not found.profiled:
+        yield Remark("not_profiled")
+    if found.starts.agree < len(found.starts.cost):
+        yield found.starts.agreement
+    yield from (Remark("residual_cluster", cluster=c) for c in found.residual_clusters)
+    for k, word in enumerate(STATUSES):
+        if k not in DONE and np.any(found.status == word):
+            yield Remark("of_rows", rows=row_numbers(found.status == word), what=word)
+    yield from _parameter_remarks(found)
+    limited = found.adhesion_used > 1 - MARGIN
+    if limited.any():
+        yield Remark("of_rows", rows=row_numbers(limited), what="limited", share=MARGIN)
+    for configuration in found.robot.configurations:
+        friction = f"{configuration}.{priors.GUIDE_FRICTION}"
+        share = f"{configuration}.{priors.GUIDE_SHARE}"
+        if share in found.parameters:
+            yield Remark("product_alone", friction=friction, share=share, free=friction in found.parameters)
+    for kind, block_errors in found.held_out.items():
+        if block_errors.unreachable_rows:
+            yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
+    for kind, block_errors in found.held_out.items():
+        if not all(block.converged for block in block_errors.blocks.values()):
+            yield Remark("block_not_converged", kind=kind)
+
+
+def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
+    far_names = {
+        name for name, p in found.parameters.items() if abs(p.shift) > FAR
+    }  # these get a remark of their own
+    if near_prior := tuple(name for name in found.undetermined if name not in far_names):
+        yield Remark("held_by_prior", names=near_prior)
+    if pairs := found.together:
+        yield Remark("only_together", pairs=pairs)
+    for name, p in found.parameters.items():
+        if name in far_names:
+            yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="calibration")
+    for name, p in found.parameters.items():
+        if p.at_bound:
+            yield Remark("at_bound", name=name, side=p.at_bound)
+    for name, p in found.parameters.items() if found.searched is not None else ():
+        if EDGE < abs(p.shift) <= FAR and not p.at_bound:
+            yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="edge")
+
+
+def row_numbers(which: np.ndarray) -> tuple[int, ...]:
+    """Row numbers of a mask, counted from 1."""
+    return tuple(int(k) + 1 for k in np.flatnonzero(which))

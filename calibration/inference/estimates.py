@@ -24,7 +24,6 @@ from calibration.inference.result import (
     Estimate,
     HeldOutErrors,
     PriorSummary,
-    ProfileCurve,
     SteadyEstimate,
 )
 from calibration.inference.scans import Scan
@@ -70,14 +69,13 @@ def parameter_estimates(
     bound, fields = coordinates.beyond(z), params.parameters_by_name(base)
     estimates = {}
     for k, name in enumerate(coordinates.names):
-        interval, shift, is_open = linear[k], z[k] + Z95 * about.sd[k] * np.array([-1.0, 1.0]), (False, False)
+        interval, is_open = linear[k], (False, False)
         if profile is not None:
             interval = np.array([profile.low[k], profile.high[k]])
-            shift = np.interp(interval, profile.value[k], profile.z[k])
             is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
         if k in scans:
-            shift, is_open = np.array(scans[k].interval()), scans[k].open()
-            ends = [np.where(np.arange(len(z)) == k, x, point) for x in shift]
+            is_open = scans[k].open()
+            ends = [np.where(np.arange(len(z)) == k, x, point) for x in scans[k].interval()]
             interval = np.array([coordinates.value(end)[k] for end in ends])
         estimates[name] = Estimate(
             value=float(value[k]),
@@ -85,7 +83,6 @@ def parameter_estimates(
             interval=_float_pair(interval),
             interval_linear=_float_pair(linear[k]),
             interval_open=is_open,
-            interval_shift=_float_pair(shift),
             unit=coordinates.units[k],
             meaning=fields[name].spec.meaning,
             prior=PriorSummary(
@@ -99,7 +96,7 @@ def parameter_estimates(
             held_by_prior=bool(about.held_by_prior[k]),
             at_bound=SIDE_OF_BOUND[int(bound[k])],
             measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
-            profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),
+            profiled=profile is not None,
             with_steady=None
             if beside is None or other is None
             else SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),

@@ -12,11 +12,10 @@ from calibration.data import Names
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import DependentPair, Notes, remarks_with_codes
 from calibration.inference.identifiability import Identifiability, determined_together, posterior_of_coordinates
-from calibration.inference.preparation import prepare_input
+from calibration.inference.preparation import prepare_input, rows_to_fit
 from calibration.inference.problem import Problem
 from mmrjax import fidelities
 from mmrjax.model import params
@@ -90,7 +89,7 @@ def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be fitted.
     """
-    runs = used_rows(runs, robot, ROWS)
+    runs, settled = rows_to_fit(runs, robot, ROWS)
     ready = prepare_input(runs, robot)
     observe, robot, table_noise = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
@@ -123,7 +122,7 @@ def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
         for k, n in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(observation.status))
-    doubts = tuple(remarks_with_codes(ready.checked, *DOUBTS))
+    doubts = (*settled, *remarks_with_codes(ready.checked, *DOUBTS))
     priors_hold = [p.name for p in estimates if p.held]
     together = determined_together(
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from calibration.data import Names
-from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.fidelities.steady import results_of_rows, steady
-from mmrjax.model import channels, params
+from mmrjax.fidelities.steady import results_of_rows
+from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import Result, is_done
+from mmrjax.model.signals import Result, Signals, is_done
 
-#: Conditions are padded to a multiple of this, so that tables of similar size share compiled programs.
-PAD = 16
 #: Adhesion ratio at which no robot slides; the motors' load depends only weakly on the slip.
 GRIPPING = 20.0
 
@@ -34,26 +30,22 @@ def operating_readings(
         conditions: conditions of the runs, shape (runs,).
         names: names of the channels. None: those of the robot.
     """
-    runs = conditions.shape[0]
-    index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
-    mass = conditions.total_mass
-    if mass is None:
+    if not conditions.turns:  # the load of a turn is friction
+        gripping = jax.device_put(np.full(conditions.shape[0], GRIPPING))
+        conditions = dataclasses.replace(conditions, adhesion=gripping)
+    readings = travel_of_rows(robot, conditions, rests=conditions.held is not None)[0]
+    reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.channel_names(robot.channels)], 1)
+    return np.where(np.asarray(is_done(readings.status))[:, None], reading, np.nan)
+
+
+def travel_of_rows(robot: Robot, conditions: Conditions, rests: bool = False) -> tuple[Result, Signals]:
+    """Results and signals of steady travel, see `results_of_rows`.
+
+    The robot's own mass is stated in the conditions, so that tables with and without a mass share a program.
+    """
+    if not conditions.turns and conditions.total_mass is None:
         masses = np.asarray([float(c.mass) for c in robot.configurations.members])
         mass = masses[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
-    gripping, own_mass = jax.device_put((np.full(runs, GRIPPING), np.asarray(mass)))
-    posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
-    if conditions.turns:  # the load of a turn is friction
-        posed = conditions
-    padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
-    strong = params.without_weak_types(robot)
-    readings = results_of_rows(strong, padded)[0] if conditions.turns else _steady_results(strong, padded)
-    reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.channel_names(robot.channels)], 1)[
-        :runs
-    ]
-    moving = is_done(np.asarray(readings.status))[:runs]
-    return np.where(moving[:, None], reading, np.nan)
-
-
-@functools.partial(compiled, options=SELDOM)
-def _steady_results(robot: Robot, conditions: Conditions) -> Result:
-    return jax.vmap(lambda c: steady(robot, c))(conditions)
+        conditions = dataclasses.replace(conditions, total_mass=jax.device_put(mass))
+    rig = dataclasses.replace(robot.rig, begins=None)  # of histories
+    return results_of_rows(dataclasses.replace(robot, rig=rig), conditions, rests)

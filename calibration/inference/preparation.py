@@ -10,9 +10,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
 
-from calibration.data import Names, Priors, instruments, own_mass, rig_facts, surfaces
-from calibration.data.input_errors import BadConfiguration
+from calibration.data import Names, Priors, instruments, own_mass, rig_facts, settling, surfaces
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
+from calibration.data.thinning import used_rows
+from calibration.described import describe
 from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Notes, Remark
@@ -35,6 +37,35 @@ CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 DIFFERS = 0.2
 
 
+def rows_to_fit(runs: Runs, robot: Robot, most: int) -> tuple[Runs, Notes]:
+    """Rows that a fit uses, see `thinning.used_rows`. Of a log of two sides, its settled runs with a remark.
+
+    Raises:
+        BadData, BadConfiguration: as for `used_rows` and `settled_rows`.
+    """
+    runs = used_rows(runs, robot, most)
+    return settled_rows(runs.whole, robot, "sides") if runs.sampled and runs.turns else (runs, ())
+
+
+def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, Notes]:
+    """Settled runs of a log that is not fitted over time, and a remark on them.
+
+    Args:
+        why: reason, a key of `table_words.NOT_OVER_TIME`.
+
+    Raises:
+        BadData: they have fewer operating points than the loop needs rows, or as for `settling.settle_log`.
+    """
+    settled = settling.settle_log(log, robot)
+    source, runs, lasts, points = log.source, len(settled.kept), sum(s.lasts for s in settled.kept), settled.points
+    if points < (needed := observers.SettledRuns.fewest):
+        few = Remark(
+            "few_points", source=source, runs=runs, lasts=lasts, points=points, needed=needed, each=settled.shortest
+        )
+        raise BadData(describe(few))
+    return settled.settled_runs(), (Remark("settled_runs", source=source, why=why, runs=runs, lasts=lasts),)
+
+
 @dataclasses.dataclass(frozen=True)
 class PreparedInput:
     """A table and its robot, completed and checked before a fit.
@@ -49,7 +80,7 @@ class PreparedInput:
         checked: remarks on the table.
         begins: remarks on the beginnings of its runs.
         weighed: remarks on the masses that it states.
-        doubted: remarks on units that may be wrong.
+        doubted: remarks on settled runs that replace a log, and on units that may be wrong.
     """
 
     robot: Robot
@@ -72,6 +103,7 @@ def prepare_input(
     *,
     assume: bool = True,
     choose: Callable[[PreparedInput], Sequence[str]] = lambda prepared: (),
+    settled: Notes = (),
 ) -> PreparedInput:
     """Completes the robot from the table and checks both, before any fit.
 
@@ -80,6 +112,7 @@ def prepare_input(
         stated: parameter → (mean, sd) [SI], by the names that the user knows.
         assume: True to assume a usual sd for channels without one, False to let the fit estimate it.
         choose: function from the prepared input to the names of the free parameters.
+        settled: remark of `rows_to_fit`.
 
     Raises:
         BadData: the table contradicts itself, its robot or its model, see `checks.check_data`.
@@ -110,7 +143,7 @@ def prepare_input(
         foreign=tuple(inherited_friction_remarks(robot, priors)),
         checked=(*larger, *checked),
         begins=tuple(begins),
-        doubted=rig_facts.log_doubts(runs, as_stated),
+        doubted=(*settled, *rig_facts.log_doubts(runs, as_stated)),
     )
 
 

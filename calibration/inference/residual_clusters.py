@@ -82,9 +82,6 @@ class ResidualCluster:
         alike: other columns that explain nothing further about these residuals once this one is known.
         coarser: columns whose levels this one subdivides, with the share of the differences between its levels that
             they explain, if at least `MOSTLY`.
-        at: value of the column, or name of its level, in each row.
-        residual: simulated minus measured [unit], or that times the sign of the reading, shape (rows,). For histories
-            (runs,).
     """
 
     column: str
@@ -97,8 +94,6 @@ class ResidualCluster:
     p: float
     alike: Names
     coarser: tuple[tuple[str, float], ...]
-    at: np.ndarray
-    residual: np.ndarray
 
     @property
     def statement(self) -> str:
@@ -109,7 +104,7 @@ class ResidualCluster:
         """Entries of `find_residual_clusters` in result.json."""
         document = vars(self) | {"statement": self.statement}
         document |= {"coarser": [{"column": name, "share": share} for name, share in self.coarser]}
-        return {name: x for name, x in document.items() if name not in ("at", "residual")}
+        return document
 
 
 def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
@@ -513,7 +508,7 @@ def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, 
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
     signed = residual * np.sign(whole.simulated[counts, k]) if test.reversing else residual
     within = whole.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
-    words, correlation, places = _column_as_words(cells), None, cells
+    words, correlation = _column_as_words(cells), None
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _is_numeric(cells):
@@ -522,7 +517,6 @@ def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, 
         fine = np.isfinite(cells)
         correlation = float(spearmanr(cells[fine], signed[fine]).statistic)
     else:
-        places = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
         keys = sorted(
             set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _level_order(x[1]))
         )
@@ -541,8 +535,6 @@ def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, 
         p,
         alike,
         () if _is_numeric(cells) else _coarser_columns(whole, k, test.column, words, within, signed),
-        places,
-        signed,
     )
 
 

@@ -52,19 +52,6 @@ class PriorSummary:
 
 
 @dataclasses.dataclass(frozen=True)
-class ProfileCurve:
-    """Profile likelihood of one parameter: the objective minimised over all others.
-
-    Attributes:
-        value: value of the parameter, increasing [SI], shape (points,).
-        rise: rise of twice the objective above the optimum [σ²], shape (points,).
-    """
-
-    value: np.ndarray
-    rise: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True)
 class SteadyEstimate:
     """Value of a parameter at the optimum of the same problem with `steady`.
 
@@ -94,7 +81,6 @@ class Estimate:
         interval: 95 % interval, from the profile likelihood if there is one [unit].
         interval_linear: 95 % interval from the sd only [unit].
         interval_open: True for each end that lies beyond the last point of the profile.
-        interval_shift: ends of `interval`, as distances from the prior median [prior sds].
         unit, meaning: unit and meaning of the parameter.
         prior: prior of the parameter.
         shift: distance of the value from the prior median [prior sds].
@@ -102,7 +88,7 @@ class Estimate:
         held_by_prior: True if the data do not determine it, see `identifiability.held_by_prior`.
         at_bound: bound at which it is, `lower`, `upper` or None.
         measured_by_data: True if at least one reading depends on it.
-        profile: profile likelihood, None if not computed.
+        profiled: True if the interval is from a profile likelihood.
         with_steady: estimate with `steady`, None unless the search started there.
     """
 
@@ -111,7 +97,6 @@ class Estimate:
     interval: Interval
     interval_linear: Interval
     interval_open: tuple[bool, bool]
-    interval_shift: Interval
     unit: str
     meaning: str
     prior: PriorSummary
@@ -120,7 +105,7 @@ class Estimate:
     held_by_prior: bool
     at_bound: str | None
     measured_by_data: bool
-    profile: ProfileCurve | None = None
+    profiled: bool = False
     with_steady: SteadyEstimate | None = None
 
     def to_json(self) -> Json:
@@ -313,7 +298,7 @@ class CalibrationResult:
     @property
     def profiled(self) -> bool:
         """True if profile likelihoods were computed."""
-        return any(p.profile is not None for p in self.parameters.values())
+        return any(p.profiled for p in self.parameters.values())
 
     @property
     def held_by_prior(self) -> Names:

@@ -446,7 +446,8 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
     inside = np.unique(np.concatenate([w.rows.ravel() for w in cut]))
-    rows, course = jax.tree.map(lambda x: x[inside], rows), dataclasses.replace(course, cell=course.cell[inside])
+    rows = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[inside]), rows)
+    course = dataclasses.replace(course, cell=course.cell[inside])
     cut = [dataclasses.replace(w, rows=np.searchsorted(inside, w.rows)) for w in cut]
     limit = TENTH * float(np.median([time[inside][w.rows].max() for w in cut]))
     grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
@@ -466,14 +467,17 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
         factor = change[first][0].mean(0)  # (equations, 1 + z)
         acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
         unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
+        prompt_integrals = np.concatenate([_integrate_terms(plan, w, *fixed) for w in cut], 1)[acts]
+        weighted = {n: [_weigh_terms(plan, w, *x)[acts] for w in cut] for n, x in change.items()}
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            mean_changes = {n: (means[n] - prompt[n])[:, None, None] for n in change}
-            f, y = (fixed[k] + sum(mean_changes[n] * change[n][k] for n in change) for k in range(2))
-            all_integrals = np.concatenate([_integrate_terms(plan, w, f, y) for w in cut], 1)[
-                acts
-            ]  # (equations, windows, 1 + z)
+            all_integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
+            for n, x in weighted.items():
+                by_run = zip(x, cut, strict=True)
+                all_integrals += np.concatenate(
+                    [np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x) for x, w in by_run], 1
+                )
             all_integrals[..., 1:] -= all_integrals[..., :1] * growth
             all_integrals /= unit
             size = np.sqrt(np.mean(all_integrals[..., 0] ** 2, 1))
@@ -519,7 +523,8 @@ class WeakFormFit:
         plan, cut: channels that give the states, and the windows.
         centre, origin: prior mean, and coordinates of the terms.
         rows: points with states without noise.
-        smooth, read: terms there, and at the readings.
+        smooth: terms there.
+        read: terms f and y at the readings.
     """
 
     z: np.ndarray
@@ -533,7 +538,7 @@ class WeakFormFit:
     origin: np.ndarray
     rows: LogPoints
     smooth: EquationTerms
-    read: EquationTerms
+    read: tuple[Any, Any]
 
 
 def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakFormFit | None:
@@ -562,21 +567,22 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             _terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects)
         )  # one program for all of them
 
-    def whole(factors: list[np.ndarray], given: EquationTerms) -> np.ndarray:
+    def whole(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
         windows = zip(factors, cut, strict=True)
-        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in windows])
+        return np.concatenate([solve_triangular(x, window_errors(plan, w, *given), lower=True) for x, w in windows])
 
-    def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Function of the parameters that returns residuals and their derivatives.
+    def of(z: np.ndarray) -> Callable[..., np.ndarray]:
+        """Function of the parameters that returns residuals and their derivatives, and at last signatures.
 
         The covariance and the noise-free states (`with_smooth_states`) are computed once, at z."""
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
         terms_there = terms(smooth, z)
-        read, none = terms(rows, z), np.zeros(equations)
+        given, none = terms(rows, z), np.zeros(equations)
+        read = given.f, given.y  # the rest of a long log is large
         plain = [covariance_factor(plan, w, sd, terms_there, none) for w in cut]
         whitened_windows = [
             (
-                window_errors(plan, w, read)[:, 0],
+                window_errors(plan, w, read),
                 np.sum(x**2, 1),
                 np.tile(np.sum(w.weight**2 / w.steps, 1), equations),
             )
@@ -586,20 +592,20 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
         )
         unknown = disturbance_intensities(*by_equation)
-        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
-        offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
+        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut] if unknown.any() else plain
+        offset = whole(factors, read) - whole(factors, (terms_there.f, terms_there.y))
 
         states[:] = [centre, z, smooth, terms_there, read]
-        last: list[tuple[np.ndarray, np.ndarray]] = []
+        last: list[tuple[np.ndarray, np.ndarray, tuple[Any, Any]]] = []
 
-        def at(z: np.ndarray) -> np.ndarray:
+        def at(z: np.ndarray, signatures: bool = False) -> np.ndarray:
             if not last or np.any(last[0][0] != z):
-                factored = whole(factors, terms(smooth, z))
+                given = terms(smooth, z)
+                factored = whole(factors, (given.f[..., None], given.y[..., None]), given.by_z)
                 factored[:, 0] += offset
-                rest = np.zeros((len(z), factored.shape[1]))
-                rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))
-                last[:] = [(z.copy(), np.concatenate([factored, rest]))]
-            return last[0][1]
+                rest = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
+                last[:] = [(z.copy(), np.concatenate([factored, rest]), given.by_effects)]
+            return whole(factors, last[0][2]) if signatures else last[0][1]
 
         return at
 
@@ -608,34 +614,32 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
     if DELAY in coordinates.names:  # windows without jumps may not show it
         k = coordinates.names.index(DELAY)
         centre[k] = (late - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
-    z, size = centre, len(centre)
+    z = centre
     try:
         for _ in range(ROUNDS):
             terms_at_fit = of(z)
             regression = least_squares(
-                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1 : size + 1], method="lm",  # noqa: B023
+                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1:], method="lm",  # noqa: B023
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
             step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
             z, terms_after_step = z + step, terms_at_fit(z + step)
-            if np.abs(terms_after_step[:, 1 : size + 1] @ step).max() < SETTLED:
+            if np.abs(terms_after_step[:, 1:] @ step).max() < SETTLED:
                 break
+        signatures = terms_at_fit(z, True)
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    count = len(terms_after_step) - size
     return WeakFormFit(
-        z, terms_after_step[:, 0], terms_after_step[:, 1 : size + 1], terms_after_step[:count, size + 1 :], count,
-        plan, cut, *states,
-    )  # fmt: skip
+        z, terms_after_step[:, 0], terms_after_step[:, 1:], signatures, len(signatures), plan, cut, *states
+    )
 
 
-def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.ndarray:
-    """Errors of the equations in a run's windows, with their derivatives and signatures, shape (windows, 1 +
-    coordinates + instances).
+def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np.ndarray:
+    """Errors of the equations in a run's windows, or their derivatives, from pairs of terms f and y, shape (windows,
+    columns of all pairs).
     """
-    term_arrays = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
-    integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in term_arrays], 2)
-    return integrals.reshape(-1, integrals.shape[2])
+    integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in terms], -1)
+    return np.concatenate(integrals)
 
 
 def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -643,6 +647,13 @@ def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarra
     slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
     integral = functools.partial(np.einsum, "wk,wk...->w...")
     return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
+
+
+def _weigh_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Terms at each point of a run's windows with their weights, shape (equations, windows, length, ...)."""
+    slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
+    weigh = functools.partial(np.einsum, "wk,wk...->wk...")
+    return np.stack([weigh(w.weight, f[w.rows, k]) + weigh(slope, y[w.rows, k]) for k, slope in slopes])
 
 
 def derivative_weights(plan: StatePlan, w: RunWindows, equations: int) -> list[np.ndarray]:

@@ -37,15 +37,6 @@ if TYPE_CHECKING:
         WorseChannel,
     )
 
-#: χ² from which on its digits are not printed [σ²].
-LARGE = 1e5
-
-
-def misfit_text(chi2: float) -> str:
-    """A χ² or a difference of two: `8088`, and `1e+08` where digits would say nothing."""
-    return f"{chi2:.0f}" if abs(chi2) < LARGE else f"{chi2:.0e}"
-
-
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
@@ -566,20 +557,17 @@ def _score_words(test: loop_notes.NameTest) -> str:
     return f"{test.effect} scores {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ{less})"
 
 
-#: Evidence against a single effect: short, and in words.
+#: Evidence against a single effect.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{beside}, where chance alone reaches {0.needed:.1f} σ"),
-    "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
-    "row": ("row {0.row}", "depends on row {0.row} alone"),
-    "run": ("run {0.row}", "explains no more than {changed} ({0.root_changed:.1f} σ)"),
-    "blocks": ("blocks", "is chosen again in only {again:.0f} % of the fits without one block"),
-    "larger": ("size", "explains less than {larger} at an implausible size"),
-    "remains": ("equation", "leaves an error in its own equation"),
-    "form": ("its form", "changes in size{spread} over {over_variable} ({0.varies:.1f} σ)"),
-    "noise": (
-        "noise",
-        "is only {0.offset:.1%} of readings whose noise is not stated (--noise)",
-    ),
+    "chance": "explains {0.root:.1f} σ{beside}, where chance alone reaches {0.needed:.1f} σ",
+    "curve": "is a worse explanation than a smooth curve in its place",
+    "row": "depends on row {0.row} alone",
+    "run": "explains no more than {changed} ({0.root_changed:.1f} σ)",
+    "blocks": "is chosen again in only {again:.0f} % of the fits without one block",
+    "larger": "explains less than {larger} at an implausible size",
+    "remains": "leaves an error in its own equation",
+    "form": "changes in size{spread} over {over_variable} ({0.varies:.1f} σ)",
+    "noise": "is only {0.offset:.1%} of readings whose noise is not stated (--noise)",
 }
 
 
@@ -595,7 +583,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     }
     doubts |= {"over_variable": bases.variable_in_words(test.over)}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
-    *first, last = [DOUBTS[d][1].format(test, **doubts, again=100 * test.again) for d in test.fails]
+    *first, last = [DOUBTS[d].format(test, **doubts, again=100 * test.again) for d in test.fails]
     return f"{', '.join(first)} and {last}" if first else last
 
 
@@ -619,14 +607,6 @@ def support_sentence(found: DiscoveryResult) -> str:
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
 
-def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """In a few words, what speaks against the name of an effect, empty where it is established."""
-    if found.support is None or is_established(found, effect):
-        return ""
-    test = found.support.test_of(effect.name)
-    return ": ".join(["tentative", *([", ".join(DOUBTS[d][0].format(test) for d in test.fails)] if test else [])])
-
-
 #: Reasons why an effect is not plausible.
 RULED_OUT = {
     "power": "{0.name} would supply power instead of losing it",
@@ -638,24 +618,6 @@ RULED_OUT = {
 def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
     """Reason why each effect is not plausible."""
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
-
-
-def sentence_on_ruled_out_effects(found: DiscoveryResult) -> str:
-    """Effects that explain the data at least as well but are ruled out by size or sign, empty for none."""
-    candidates, same = found.implausible, found.settings.same
-    if found.verdict not in WITHOUT_NAME:
-        better = tuple(a for a in candidates if a.rise_chi2 < -same)
-        candidates = better or tuple(a for a in candidates if a.rise_chi2 <= same)
-    if not candidates or found.verdict in ("none", "undescribed"):
-        return ""
-    first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
-    subject = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
-    more = first.rise_chi2 < -found.settings.same
-    gain = f"{misfit_text(-first.rise_chi2)} σ² more than {subject}" if more else f"as much as {subject}"
-    are = "are" if len(first.effects) > 1 else "is"
-    return (
-        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out only by size or sign: {first.why}."
-    )
 
 
 # --- beside names ---------------------------------------------------------------------------------------

@@ -133,6 +133,9 @@ def sentence_on_implausible_readings(
     return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, and the robot's file"
 
 
+#: Reasons for fitting the settled runs of a log.
+NOT_OVER_TIME = {"sides": "a log of two sides is not fitted over time", "unfitted": "no fit over time converges"}
+
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "unmeasured": lambda name: (
@@ -182,6 +185,15 @@ SAID: dict[str, str | Callable[..., str]] = {
     "thinned": (
         "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time. Change this with "
         "--rows, or use settle, which takes all"
+    ),
+    "settled_runs": lambda source, why, runs, lasts: (
+        f"{source}: {NOT_OVER_TIME[why]}, so the fit uses the means of its settled runs ({runs}, {lasts:.3g} s in "
+        "all). They do not show inertias, delays or the start"
+    ),
+    "few_points": (
+        "{source}: a log of two sides is not fitted over time, and its settled runs ({runs}, {lasts:.3g} s in all) "
+        "have too few operating points ({points}). Hold {needed} or more different levels until all readings are "
+        "steady for {each:.2g} s. For straight travel, give one command instead of two"
     ),
     "thinned_table": (
         "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers refer to "

@@ -23,6 +23,7 @@ from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Cont
 from mmrjax.climbing.lever_drives import LeverDrive, LeverStep, lever_drive, step_levers
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SMALL, compiled
+from mmrjax.fidelities.drive import current_after
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
@@ -33,8 +34,8 @@ from mmrjax.model.signals import GRAVITY, Signals, State
 from mmrjax.model.track_friction import Track
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
 from mmrjax.numerics.one_sided import value_and_slope
-from mmrjax.undercarriage.half_robot import contact_damping, current_after
 from mmrjax.undercarriage.running_gear import RunningGear
+from mmrjax.undercarriage.side_contacts import contact_damping
 
 #: Verdicts of a climb; the last two: its time ended while it was still moving, and numbers that are not finite.
 VERDICTS = OVER, TIPS, STALLS, SLIDES, HANGS, UNFINISHED, FAILED = range(7)

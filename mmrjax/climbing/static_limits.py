@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from mmrjax.climbing import resting_posture
 from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Posture, SideOutline
@@ -249,30 +248,6 @@ def posture_limits(robot: Robot, conditions: Conditions) -> StaticLimits:
         length=lies.length,
         height=lies.height,
     )
-
-
-@jax.jit
-def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[StepLimit, Array]:
-    def at(pair: Array) -> tuple[StepLimit, Array]:
-        conditions_there = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
-        side = resting_posture.side_outline(robot, conditions_there)
-        return find_highest_step(side), jnp.asarray(
-            resting_posture.rest_on_slope(side, conditions_there.slope, 0.0).margin
-        )
-
-    return jax.lax.map(at, angles, batch_size=256)
-
-
-def steps_over_lever_angles(
-    robot: Robot, conditions: Conditions, front_deg: Float[np.ndarray, " n"], rear_deg: Float[np.ndarray, " m"]
-) -> tuple[StepLimit, Float[Array, "n m"]]:
-    """Highest step for each pair of lever angles [deg], for one run, and the tipping margin at rest.
-
-    The margin is on the slope of the run [m] (see `Posture`). Leaves have shape (n, m, ...).
-    """
-    pairs = np.stack(np.meshgrid(front_deg, rear_deg, indexing="ij"), -1)
-    step_heights = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
-    return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), step_heights)
 
 
 @jax.jit

@@ -11,7 +11,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -40,16 +40,6 @@ def is_double() -> bool:
 def in_trace(*arguments: Any) -> bool:
     """True if some of these are tracers, or if JAX is tracing a function here."""
     return has_tracer(arguments) or isinstance(jax.device_put(np.zeros(())), jax.core.Tracer)
-
-
-@contextlib.contextmanager
-def double_precision() -> Iterator[None]:
-    """Context in which JAX computes in double precision in this thread."""
-    if is_double():
-        yield
-        return
-    with jax.enable_x64(True):
-        yield
 
 
 def in_double(function: Callable[P, T]) -> Callable[P, T]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 
@@ -30,6 +31,7 @@ from mmrjax.model.signals import (
     Signals,
     State,
 )
+from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.numerics.rosenbrock import Unknowns, error_norm, step_longest
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES
@@ -409,6 +411,24 @@ def _standstill_cautions(robot: Robot, conditions: Conditions) -> list[str]:
         f"rows {rows}: computed from a rolling start. From standstill, the robot does not settle within "
         f"{TIME_SETTLED:g} s, sliding at μ_d"
     ]
+
+
+def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: Signals) -> Scalar:
+    """Motor current after one step [A]: exponential Euler, exact for a winding at constant speed.
+
+    L dI/dt = U_left(I). I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
+    constant (0.2 ms) is of the order of the step, so the winding's own decay is integrated exactly. U_left'
+    comes from the balances and includes a battery or an effect that changes the slope.
+    """
+
+    def left(current: Scalar) -> Scalar:
+        total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
+        shifted = dataclasses.replace(signals, current=current, total_current=total)
+        return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
+
+    voltage, slope = value_and_slope(left, signals.current)
+    z = step * slope / signals.inductance
+    return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
 
 
 FIDELITY = Fidelity(

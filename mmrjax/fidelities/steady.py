@@ -249,12 +249,13 @@ def operating_state(robot: Robot, conditions: Conditions) -> tuple[Signals, Arra
 
 
 def _state_at_unknowns(
-    robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True
+    robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True, rests: bool = True
 ) -> tuple[Signals, Array, Array, Vector]:
     """`operating_state` at given unknowns, and the residuals of the balances there.
 
     Args:
         stands: True to test whether a run beyond the limit of adhesion slides or stands. False: it `slides`.
+        rests: True for static equilibrium in the signals of a robot at rest. False: they are those of the search.
     """
     detached = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
@@ -275,7 +276,7 @@ def _state_at_unknowns(
             else exceeds_adhesion
         )
         status = jnp.where(exceeds_adhesion, jnp.where(is_sliding, SLIDES, STALLED), status)
-    if conditions.motor_speed is None:
+    if rests and conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
         stands_still &= ~_is_held(conditions) | (sense * unknowns[2] <= 1e-9)  # friction leaves the clamp nothing
         static = standing_signals(robot, _clamped_conditions(conditions, 0.0)[0], state)
@@ -362,11 +363,11 @@ def _solve_run(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Arr
 
 
 def _results_at_unknowns(
-    robot: Robot, conditions: Conditions, unknowns: Unknowns, found: Bool[Array, ""]
+    robot: Robot, conditions: Conditions, unknowns: Unknowns, found: Bool[Array, ""], rests: bool = True
 ) -> tuple[Result, Signals, Unknowns]:
     if conditions.turns:
         return circling.turn_results(robot, conditions, unknowns, found)
-    signals, status, _, residual = _state_at_unknowns(robot, conditions, tuple(unknowns), found, stands=False)
+    signals, status, _, residual = _state_at_unknowns(robot, conditions, tuple(unknowns), found, False, rests)
     return result_of_signals(robot.within(conditions.configuration), signals, status), signals, jnp.stack(residual)
 
 
@@ -379,14 +380,20 @@ IMPLICIT = ImplicitSolution(_solve_run, _results_at_unknowns)
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192, 256)
 
 
-def results_of_rows(robot: Robot, conditions: Conditions) -> tuple[Result, Signals]:
-    """Results and signals of the rows of a table, with each half as a separate program."""
-    robot, rows = params.without_weak_types(robot), conditions.shape[0]
-    size = next((s for s in SIZES if s >= rows), rows + -rows % SIZES[-1])
-    index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
-    padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)
-    results = _shown_rows(robot, padded, *_solved_rows(robot, padded))
-    return jax.tree.map(lambda x: x[:rows], results)
+def results_of_rows(robot: Robot, conditions: Conditions, rests: bool = True) -> tuple[Result, Signals]:
+    """Results and signals of the rows of a table, with each half as a separate program.
+
+    Args:
+        rests: True for static equilibrium in the signals of rows at rest. False: a smaller program.
+    """
+    robot, rows, parts = params.without_weak_types(robot), conditions.shape[0], []
+    # Straight travel is computed quickly, so that every table can share one program.
+    size = next((s for s in SIZES if s >= rows and conditions.turns), SIZES[-1])
+    for part in np.arange(rows + -rows % size).reshape(-1, size):
+        index = np.where(part < rows, part, 0)
+        padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)  # noqa: B023
+        parts.append(_shown_rows(robot, padded, *_solved_rows(robot, padded), rests))
+    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:rows]), *parts)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -395,8 +402,11 @@ def _solved_rows(robot: Robot, conditions: Conditions) -> tuple[Float[Array, "ro
 
 
 @functools.partial(compiled, options=SELDOM)
-def _shown_rows(robot: Robot, conditions: Conditions, unknowns: Array, found: Array) -> tuple[Result, Signals]:
-    return jax.vmap(lambda *row: IMPLICIT.shown(robot, *row)[:2])(conditions, unknowns, found)
+def _shown_rows(
+    robot: Robot, conditions: Conditions, unknowns: Array, found: Array, rests: bool
+) -> tuple[Result, Signals]:
+    show = functools.partial(_results_at_unknowns, robot, rests=rests)
+    return jax.vmap(lambda *row: show(*row)[:2])(conditions, unknowns, found)
 
 
 def _run_batch(

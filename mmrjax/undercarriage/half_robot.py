@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mmrjax.fidelities.drive import current_after
 from mmrjax.fidelities.rest import STARTS, is_at_rest, status_with_slip, travel_direction, voltage_at_rest
 from mmrjax.fidelities.result import result_of_signals, travel_status
 from mmrjax.fidelities.steady import steady
@@ -39,12 +40,11 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solve_factorised
 from mmrjax.numerics.newton import root
-from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
 from mmrjax.undercarriage.belt import BeltPath, belt_runs
 from mmrjax.undercarriage.contact_sums import LinearizedSums
 from mmrjax.undercarriage.mjcf import mjx
-from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions
+from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions, contact_damping
 
 #: Coordinates of half a robot, or their velocities or forces.
 Coordinates = Float[Array, " 5"]
@@ -194,24 +194,6 @@ def armature_inertia(run: HalfRobotSystem, signals: Signals) -> Scalar:
     return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
 
 
-def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: Signals) -> Scalar:
-    """Motor current after one step [A]: exponential Euler, exact for a winding at constant speed.
-
-    L dI/dt = U_left(I). I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
-    constant (0.2 ms) is of the order of the step, so the winding's own decay is integrated exactly. U_left'
-    comes from the balances and includes a battery or an effect that changes the slope.
-    """
-
-    def left(current: Scalar) -> Scalar:
-        total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
-        shifted = dataclasses.replace(signals, current=current, total_current=total)
-        return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
-
-    voltage, slope = value_and_slope(left, signals.current)
-    z = step * slope / signals.inductance
-    return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
-
-
 def damping_matrix(
     run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, at: ContactState, pulled: ContactPull
 ) -> Float[Array, "5 5"]:
@@ -231,20 +213,6 @@ def damping_matrix(
     none = jnp.zeros_like(losses[0])
     diagonal = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
     return contact_damping(along, off, pulled.force, at.force, rises, at.damped) + diagonal
-
-
-def contact_damping(
-    along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], pulled: Array, force: Array, rises: Array,
-    damped: Array,
-) -> Float[Array, "n n"]:  # fmt: skip
-    """Damping matrix of the contacts, see `damping_matrix`.
-
-    `along` and `off`: their speeds along and normal to the ground per v. `pulled`: friction force [N]. `force`:
-    normal force [N]. `rises`: derivative of friction with sliding speed. `damped`: decrease of the normal force per
-    rate of the gap.
-    """
-    pushes = (pulled / jnp.maximum(force, 1e-9))[:, None] * along + off
-    return (along.T * rises) @ along + (pushes.T * damped) @ off
 
 
 def _explicit_step(

@@ -261,3 +261,17 @@ def lever_tips(gear: RunningGear, conditions: Conditions) -> list[tuple[Scalar, 
         (side * (gear.wheelbase / 2 + gear.lever_length * jnp.cos(angle)), gear.lever_length * jnp.sin(angle))
         for side, angle in zip((1.0, -1.0), lever_angles(gear, conditions), strict=True)
     ]
+
+
+def contact_damping(
+    along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], pulled: Array, force: Array, rises: Array,
+    damped: Array,
+) -> Float[Array, "n n"]:  # fmt: skip
+    """Damping matrix of the contacts, see `damping_matrix`.
+
+    `along` and `off`: their speeds along and normal to the ground per v. `pulled`: friction force [N]. `force`:
+    normal force [N]. `rises`: derivative of friction with sliding speed. `damped`: decrease of the normal force per
+    rate of the gap.
+    """
+    pushes = (pulled / jnp.maximum(force, 1e-9))[:, None] * along + off
+    return (along.T * rises) @ along + (pushes.T * damped) @ off

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import re
+from importlib import resources
+
+import numpy as np
+
+from calibration.data import contents, robot_file
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.runs import Runs
 from calibration.inference import priors
 from calibration.inference.calibration import calibrate as run
+from calibration.inference.feedforward import UNITS, DriveLog, Feedforward, Tolerances, fit_feedforward
+from mmrjax.model.channels import EVERY
 from sweeps import config as configuration
-from sweeps.commands import feedforward_fit
 from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
@@ -18,7 +29,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
     fit without a block did not converge, or the solver failed for a row.
     """
     if config.feedforward is not None:
-        return feedforward_fit.execute(config, beside)
+        return _execute_feedforward(config, beside)
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     prior_options = priors.parse_priors(config.prior)
@@ -33,7 +44,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
             profiles=config.profiles, blocks=config.hold_out, tell=heard,
         )  # fmt: skip
         result.save(folder.results(), config.robot, folder.tables)
-        report = calibration_report.calibration_document(result, config.robot, feedforward_fit.voltage_fit(runs))
+        report = calibration_report.calibration_document(result, config.robot, voltage_fit(runs))
         document = print_report(report, brief=not beside.verbose)
         settled = result.converged and all(b.converged for h in result.held_out.values() for b in h.blocks.values())
         manifest = {"seed": result.seed, "statuses": result.counts}
@@ -45,3 +56,95 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
             page=document,
             runs=runs,
         )
+
+
+#: Names of signals with the battery voltage.
+BATTERY = re.compile(r"batt\w*volt", re.IGNORECASE)
+#: Columns of a velocity and its position. The first pair with readings is fitted.
+PAIRS = (("output_speed_rpm", "output_angle_deg"), ("speed_mm_s", "position_mm"))
+ROTOR = "motor_speed_rpm", ""
+
+
+def _execute_feedforward(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
+    """Fits the constants, prints them and writes a run folder. Returns the exit code, 0."""
+    if has_robot := config.robot != "nominal":
+        robot = load_robot(config).robot
+    else:
+        with resources.as_file(resources.files("calibration.data") / "rigs" / "feedforward.toml") as path:
+            robot = robot_file.read_robot(path)
+    file = contents.inspect_source(beside.data)
+    columns = config.columns or ("sysid" if file.preset == "sysid" else None)
+    runs = read_runs(beside.data, robot, columns=columns, measured=True, series=True)
+    log = drive_log(runs, config.unit, as_logged=(columns or "").startswith("sysid"))
+    battery = [x for s in file.signals if BATTERY.search(s.path) for x in (s.least, s.greatest)]
+    log = dataclasses.replace(log, battery=np.array(battery) if battery else None)
+    tolerances = Tolerances(
+        config.position_error, config.velocity_error, config.effort_V, config.period_s, config.measurement_delay_s
+    )
+    fit = fit_feedforward(log, config.feedforward or "", tolerances)
+    with open_folder("calibrate", config, robot, beside, runs) as folder:
+        folder.write_json("feedforward.json", fit.to_json())
+        folder.write_table("windows.csv", fit.windows)
+        page = print_report(calibration_report.feedforward_document(fit))
+        note = "the rig of this log" if has_robot else "a rig that reads this log"
+        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=page, runs=runs)
+
+
+def voltage_fit(runs: Runs) -> Feedforward | None:
+    """Constants of a log of voltage and speed. None for other data, or with too little motion."""
+    if runs.sampled and runs.layout.imposed == "voltage":
+        with contextlib.suppress(BadData):
+            return fit_feedforward(drive_log(runs))
+    return None
+
+
+def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:
+    """Readings of a log, with positions in a given unit. None: the unit of the first pair of channels.
+
+    Args:
+        as_logged: True for a log of SysId, which has its own units. `unit` is their name.
+
+    Raises:
+        BadData: the log has no time, or neither velocity nor position.
+        BadConfiguration: an angle has a unit of length, or a length that of an angle.
+    """
+
+    factors = {channel.column: channel.factor for channel in EVERY}
+
+    def reading(column: str) -> np.ndarray | None:
+        if not runs.has(column):
+            return None
+        values = runs[column] * factors[column]
+        return values if np.isfinite(values).any() else None
+
+    for pair in (*PAIRS, ROTOR):
+        velocity, position = map(reading, pair)
+        if velocity is not None or position is not None:
+            break
+    else:
+        raise BadData(
+            f"{runs.source}: no velocity and no position; expected output_speed_rpm, output_angle_deg, "
+            "speed_mm_s, position_mm or motor_speed_rpm, or --columns sysid"
+        )
+    unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
+    if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
+        raise BadConfiguration(f"--unit: got {unit}, but the log has {pair[0]}; expected a unit of that position")
+    size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
+    if not runs.sampled:
+        raise BadData(f"{runs.source}: no time; expected a column time_s")
+    order = np.concatenate(list(runs.rows_by_run().values()))
+    duty = runs["duty"] if runs.has("duty") else 1.0
+    voltage = np.asarray(runs["supply_voltage_V"] * duty, float)
+
+    def ordered(values: np.ndarray | None, size: float) -> np.ndarray | None:
+        return None if values is None else values[order] / size
+
+    return DriveLog(
+        runs.run_names[order],
+        np.asarray(runs["time_s"], float)[order],
+        voltage[order],
+        ordered(position, size),
+        ordered(velocity, size),
+        ordered(reading("motor_current_A"), 1.0),
+        unit=unit,
+    )

@@ -21,7 +21,6 @@ from sweeps.pages import words
 from sweeps.points import imposed
 from sweeps.report import check_report
 from sweeps.report.check_report import CheckResult, requirement_limit, worst_corner_text
-from sweeps.report.words import posture_words
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
@@ -52,7 +51,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as report:
             outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(report))
-            result = CheckResult(demands, robot, outcomes, posture_words.of_requirements(robot, outcomes))
+            result = CheckResult(demands, robot, outcomes)
         _write_folder(folder, config, result)
         document = print_report(
             check_report.check_document(result, capabilities.displayed_name(file), config.changes), file

@@ -24,14 +24,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     column_options = [] if config.columns is None else ["--columns", config.columns]
     loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *column_options])
-    settled = settling.settle_log(
-        runs,
-        shortest=config.shortest_s,
-        drift=config.drift,
-        inertia=settling.acceleration_currents(robot),
-        rolling=settling.rolling_readings(robot),
-        loop=loop,
-    )
+    settled = settling.settle_log(runs, robot, shortest=config.shortest_s, drift=config.drift)
     few_runs_sentence = settle_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
         folder.write_table("settled.csv", settled.table())

@@ -11,7 +11,6 @@ from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.parts import packaged_motors
 from calibration.described import report_in_words
 from calibration.sizing import sheet
-from calibration.sizing.chart import MarginChart, chart_extent, margin_chart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size_robot as search
 from sweeps import capabilities
@@ -54,12 +53,7 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
                 if sizing.best is None
                 else sheet.check_requirements(best, requirements, changes=False, tell=report_in_words(heard))
             )
-            charts: tuple[MarginChart, ...] = ()
-            if config.report:
-                heard("charts of limits")
-                robots = (robot,) if sizing.best is None else (best, robot)
-                charts = tuple(margin_chart(r, requirements, chart_extent(requirements)) for r in robots)
-        result = SizeResult(requirements, robot, sizing, objectives, outcomes, charts)
+        result = SizeResult(requirements, robot, sizing, objectives, outcomes)
         _write_folder(folder, config, result)
         document = print_report(
             size_report.size_document(result, capabilities.displayed_name(file)),

@@ -214,11 +214,9 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions) ->
     points_before = total - sum(job.blocks.count(k) for k in chunks_left)
     if points_before:
         print_message(f"{store.partial}: resumes after {points_before:,} of {total:,} points")
-    times = scale.Times()
     try:
         with progress_bar(total, quiet=False, done=points_before, rate=True) as advance:
-            chunks = scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance)
-            scale.write_chunks(store.write, job, chunks, advance, times)
+            scale.write_chunks(store.write, scale.Compiled(job), chunks_left, advance)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise

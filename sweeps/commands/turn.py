@@ -7,17 +7,14 @@ from typing import Any
 
 import jax
 import numpy as np
-import scipy.optimize
 
 from calibration.data import Columns, Json, sides
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.table import Runs
 from mmrjax import fidelities
 from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, RunBatch
-from mmrjax.fidelities.rest import voltage_at_rest
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
@@ -28,7 +25,7 @@ from sweeps.console import progress_bar, report_stage
 from sweeps.inputs import load_robot, one_run
 from sweeps.points import imposed, run, scale
 from sweeps.report import turn_report
-from sweeps.report.words import posture_words, turn_words
+from sweeps.report.words import posture_words
 from sweeps.store import open_folder, print_report
 
 #: Duties of the inner side for which settled turns are shown, as shares of the outer side's duty.
@@ -59,12 +56,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         run.check_runs_bearable(robot, conditions, config)
         turn_channels = channels.channels_named((*robot.rig.channels, *SHOWN))
         readings = tuple(c for c in turn_channels if c.settled or not settled)
-        stages = 2 + config.demands
-        if config.demands:
-            with report_stage(1, stages, "duties of the demanded turn"):
-                conditions, runs = _run_for_demand(robot, conditions, runs, config)
         if settled:
-            with report_stage(stages - 1, stages, "settled turns over the duties of the inner side"):
+            with report_stage(1, 2, "settled turns over the duties of the inner side"):
                 batch, swept = _turns_to_compare(robot, conditions)
             turns = {
                 **{name: np.asarray(getattr(swept, name)) for name in SIDES},
@@ -77,7 +70,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             assert fidelity.histories is not None  # of `drive` and `track`
             slow = fidelity.facts.slow
             with (
-                report_stage(stages - 1, stages, "the turn over time", slow),
+                report_stage(1, 2, "the turn over time", slow),
                 progress_bar(1, quiet=not slow) as advance,
             ):
                 report_share = scale.share_counter(advance, 1)
@@ -89,7 +82,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         columns = {name: np.asarray(values) for name, values in first_run.columns.items()}
         table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first_run), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
-        with report_stage(stages, stages, "posture"):
+        with report_stage(2, 2, "posture"):
             postures = posture_words.posture_of_runs(robot, runs, conditions)
         notes = []
         if postures is not None:
@@ -98,71 +91,6 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
         document = turn_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
         return run.write_run_folder(folder, config, result, print_report(document, file))
-
-
-#: Search for a demanded turn: initial ratio of effective to real track width. Initial loads, as shares of the faster
-#: side's voltage, tried in turn. Tolerance [m/s]. Most voltages tried from each.
-WIDER, LOADED, NEAR, TRIED = 2.0, (0.1, 0.05, 0.2, 0.4), 1e-7, 100
-
-
-def _run_for_demand(
-    robot: Robot, asked: Conditions, runs: Runs, config: configuration.Simulate
-) -> tuple[Conditions, Runs]:
-    """Run whose duties give the demanded speed and yaw rate in a settled turn.
-
-    Raises:
-        BadConfiguration: no duties give them, or the supply voltage is too low.
-    """
-    chassis = robot.configurations[str(runs.configurations_named(robot)[0])]
-    width = float(chassis.turning.width)
-    assert config.speed_m_s is not None and config.yaw_rate_rad_s is not None  # both are stated
-    speeds_wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
-
-    def driven(volts: np.ndarray) -> Conditions:
-        """Voltage of an external supply. A battery determines its own."""
-        supply_voltage = max(supply, float(np.abs(volts).max()))
-        left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / supply_voltage, supply_voltage))
-        voltage = asked.voltage if config.battery else source
-        return dataclasses.replace(asked, voltage=voltage, duty_left=left, duty_right=right)
-
-    def off(volts: np.ndarray) -> np.ndarray:
-        reading = _turns_to_compare(robot, driven(volts))[0].result.reading
-        speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
-        return np.array([speed, 0.5 * width * turn]) - speeds_wanted
-
-    def at_full_voltage() -> tuple[np.ndarray, np.ndarray]:
-        """Speeds and yaw rates of settled turns with the full supply voltage on the faster side, from straight travel
-        to turning on the spot.
-        """
-        faster = np.abs(belts) == np.abs(belts).max()
-        faster &= np.cumsum(faster) == 1  # two at a time, on the spot
-        reading = _turns_to_compare(robot, driven(np.where(faster, np.sign(belts) * supply, 0.0)))[0].result.reading
-        return np.asarray(reading["speed"])[1:], np.asarray(reading["yaw_rate"])[1:]
-
-    alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
-    supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
-    belts = speeds_wanted[0] + WIDER * speeds_wanted[1] * np.array([-1.0, 1.0])
-    turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
-    for share in LOADED:
-        first_guess = turning + share * np.abs(turning).max() * np.sign(belts)
-        solution = scipy.optimize.root(off, first_guess, options={"maxfev": TRIED})
-        volts = solution.x
-        if np.abs(solution.fun).max() < NEAR:  # not NaN
-            break
-    else:
-        volts = np.full(2, np.inf)
-    if not np.abs(volts).max() <= supply:
-        demand = f"{config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s"
-        source = f"the {'battery' if config.battery else 'supply'} has {supply:.3g} V"
-        why = (
-            f"{demand} need {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
-            else f"no settled turn with {demand} was found"
-        )  # fmt: skip
-        reaches = turn_words.turn_not_found_reason(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())
-        raise BadConfiguration(f"--speed, --yaw-rate: {why}; {source}, {reaches}")
-    duties = volts / supply
-    columns = {**runs.columns, **dict(zip(SIDES, duties[:, None], strict=True))}
-    return driven(volts), dataclasses.replace(runs, columns=columns)
 
 
 def _end_of_run(history: History | None) -> dict[str, float] | None:
@@ -193,7 +121,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     columns: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
         return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}
-    if config.left_V is None or config.right_V is None:  # duties for a demand are found later
+    if config.left_V is None or config.right_V is None:  # only a heading is stated
         return columns | {name: 1.0 for name in SIDES}
     larger_voltage, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
     if supply is not None and supply < larger_voltage:

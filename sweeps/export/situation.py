@@ -217,8 +217,7 @@ def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     if runs.sampled:
         from calibration.data import settling
 
-        numbers = settling.acceleration_currents(robot), settling.rolling_readings(robot)
-        runs = settling.settle_log(runs, inertia=numbers[0], rolling=numbers[1]).settled_runs()
+        runs = settling.settle_log(runs, robot).settled_runs()
     is_joint_configuration = runs.configurations_named(robot) == joint.configuration
     if not is_joint_configuration.any():
         raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs in the exported configuration")

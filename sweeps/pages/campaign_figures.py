@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
@@ -22,8 +21,6 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
-    add_corner_note,
-    colour_bar,
     new_figure,
 )
 from sweeps.points.climbs import SIZE
@@ -78,9 +75,6 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         quantiles = np.array([np.quantile(output[bin_index == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(middles, quantiles[:, 1], color=BLUE)
-        shares = variance_share(values, output)
-        if shares > variance_share_by_chance(values):
-            add_corner_note(axes, f"{100 * shares:.0f} % of the variance")
         axes.set(xlabel=varied[name].label, ylabel=label)
         _set_ticks(axes.xaxis, varied[name])
     if len(names) == 2:
@@ -154,16 +148,6 @@ def variance_share(values: np.ndarray, output: np.ndarray) -> float:
     return float(np.sum(count * (mean - output.mean()) ** 2) / len(output) / total) if total > 0 else 0.0
 
 
-def variance_share_by_chance(values: np.ndarray) -> float:
-    """Share of the variance between the bins of a quantity without effect that is exceeded in 1 of 100 samples [-].
-
-    For normal outputs this share has a beta distribution. It is 0 for a single bin, and 1 if every value has its own
-    bin.
-    """
-    within, between = len(values) - (bin_count := len(np.unique(bin_values(values)[0]))), bin_count - 1
-    return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
-
-
 def _set_ticks(axis: Axis, varied: VariedQuantity) -> None:
     if varied.words:
         axis.set_ticks(range(len(varied.words)), labels=list(varied.words))
@@ -185,7 +169,7 @@ def _draw_map(
     for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
         cells.flat[number] = np.median(values)
     mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    colour_bar(fig, mesh, axes, label=f"median {label}")
+    fig.colorbar(mesh, ax=axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label)
     _set_ticks(axes.xaxis, one)
     _set_ticks(axes.yaxis, other)

@@ -1,4 +1,4 @@
-"""Figures of a comparison with measured runs: parity, and errors over each condition."""
+"""Figures of fits: errors over each condition, and the voltage plots of feedforward constants."""
 
 from __future__ import annotations
 
@@ -10,91 +10,29 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
+from calibration.inference.feedforward import Feedforward
 from mmrjax.model.channels import Channel
-from sweeps.export.comparison import NATIVE, ExportComparison
-from sweeps.export.joint import channels_of
 from sweeps.pages.figure_style import (
     BLUE,
-    FAINT,
     INK,
     LOOKS,
-    VERMILION,
-    add_corner_note,
-    axis_label,
+    ORANGE,
     configuration_looks,
     new_figure,
 )
 
 
-def draw_export_readings(compared: ExportComparison) -> Figure:
-    """Readings of the exported drive over those of the reference, a panel for each channel."""
-    situation = compared.situation
-    channel_places = [(k, c) for k, c in enumerate(channels_of(situation.joint)) if c.name in compared.errors[NATIVE]]
-    reference = situation.measured if situation.is_measured else situation.native
-    fig, grid = new_figure(1, max(len(channel_places), 1), 3.4)
-    for axes, (k, channel) in zip(grid[0], channel_places, strict=False):
-        size = 1 / channel.factor
-        reference_readings = reference[:, k] * size
-        ends = np.nanmin(reference_readings), np.nanmax(reference_readings)
-        axes.plot(ends, ends, color=FAINT, lw=1)
-        if situation.is_measured:
-            axes.plot(
-                reference_readings, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native"
-            )
-        axes.plot(reference_readings, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
-        axes.set_xlabel(f"{compared.reference}: {channel.label} [{channel.unit}]", color=INK)
-        axes.set_ylabel(f"{channel.label} [{channel.unit}]", color=INK)
-        axes.legend(loc="upper left", frameon=False)
-    return fig
-
-
-def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) -> Figure:
-    """Simulated over measured, one panel a channel. A reading that is missing is not drawn.
-
-    Args:
-        band: True to shade ±5 %.
-    """
-    fig, grid = new_figure(1, len(channels), 3.6)
-    look = configuration_looks(table["configuration"])
-    for axes, channel in zip(grid[0], channels, strict=True):
-        measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
-        is_paired = np.isfinite(measured) & np.isfinite(simulated)
-        ends = (
-            np.concatenate([measured[is_paired], simulated[is_paired]]) if is_paired.any() else np.array([0.0, 1.0])
-        )
-        low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
-        span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
-        if band:
-            axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
-        axes.plot(span, span, color="#666666", lw=0.9)
-        for kind, (colour, marker) in look.items():
-            pick = is_paired & (table["configuration"] == kind)
-            if pick.any():
-                _draw_dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
-        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
-        axes.set_xlim(*span)
-        axes.set_ylim(*span)
-        if not is_paired.any():
-            add_corner_note(axes, "no row has both numbers")
-    if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
-        grid[0, 0].legend(loc="lower right")
-    if band:
-        add_corner_note(grid[0, 0], "band: ±5 %")
-    return fig
-
-
 def draw_errors_over_conditions(
     table: Columns,
     channels: Sequence[Channel],
-    in_units: bool = False,
     beside: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Error (35) of each channel over each condition, or over the row number if no condition varies.
+    """Simulated minus measured for each channel over each condition that varies, or over the row number.
+
+    A band shows two standard deviations of the readings if they are known.
 
     Args:
-        beside: columns in addition to conditions, with their headings, for errors in units.
-        in_units: True for errors in the unit of the channel, with a band of two sds if known, over conditions that
-            vary.
+        beside: columns in addition to conditions, with their headings.
     """
     errors_by_condition = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
@@ -103,21 +41,17 @@ def draw_errors_over_conditions(
     conditions = {
         c: words for c, words in errors_by_condition.items() if c in table and f"simulated_{c}" not in table
     }
-    if in_units:
-        conditions |= beside or {}
-        varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
-        conditions = varied or dict(list(conditions.items())[:1])
+    conditions |= beside or {}
+    varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
+    conditions = varied or dict(list(conditions.items())[:1])
     if not conditions:
         conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
     look = configuration_looks(table["configuration"])
     for row, channel in zip(grid, channels, strict=True):
-        error = table[f"error_{channel.name}_percent"]
-        half = 5.0
-        if in_units:
-            error = table[f"simulated_{channel.column}"] - table[channel.column]
-            sd = table.get(channel.sd_column, np.array([np.nan]))
-            half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
+        error = table[f"simulated_{channel.column}"] - table[channel.column]
+        sd = table.get(channel.sd_column, np.array([np.nan]))
+        half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
         for axes, (condition, words) in zip(row, conditions.items(), strict=True):
             axes.axhspan(-half, half, color="#eef3ee", zorder=0)
             axes.axhline(0, color="#666666", lw=0.9)
@@ -133,7 +67,7 @@ def draw_errors_over_conditions(
                 axes.set_xlabel(words)
                 if levels.size <= 8:
                     axes.set_xticks(levels)
-        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit if in_units else '%'}]")
+        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit}]")
     for axes in grid[0]:
         if axes.get_legend_handles_labels()[0] and len(look) <= LOOKS:
             axes.legend(loc="best")
@@ -144,3 +78,38 @@ def draw_errors_over_conditions(
 def _draw_dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
     """Readings of a configuration as dots, rasterised if there are many."""
     axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)
+
+
+def quasistatic(found: Feedforward) -> Figure:
+    """Voltage minus kA·a over velocity, for windows of the quasistatic tests."""
+    w, k = found.windows, found.constants
+    slow = w["quasistatic"] if w["quasistatic"].any() else np.ones(len(w["velocity"]), bool)
+    voltage = w["voltage_V"] - k["kA"] * w["acceleration"]
+    fig, axes = _points(w["velocity"][slow], voltage[slow], f"velocity [{found.unit}/s]", "V - kA·a [V]")
+    for sign in (-1, 1):
+        v = w["velocity"][slow & (w["direction"] * sign > 0)]
+        if len(v):
+            ends = np.array([0.0, v[np.argmax(np.abs(v))]])
+            axes.plot(ends, k["kV"] * ends + sign * k["kS"] + k.get("kG", 0.0), color=ORANGE)
+    return fig
+
+
+def dynamic(found: Feedforward) -> Figure:
+    """Voltage minus kS and kV·v over acceleration."""
+    w, k = found.windows, found.constants
+    voltage = w["voltage_V"] - k["kV"] * w["velocity"] - k["kS"] * w["direction"]
+    a = w["acceleration"]
+    fig, axes = _points(a, voltage, f"acceleration [{found.unit}/s²]", "V - kS - kV·v [V]")
+    ends = np.array([a.min(), a.max()])
+    axes.plot(ends, k["kA"] * ends + (k.get("kG", 0.0) if found.mechanism == "elevator" else 0.0), color=ORANGE)
+    return fig
+
+
+def _points(x: np.ndarray, y: np.ndarray, along: str, up: str) -> tuple[Figure, Axes]:
+    fig, grid = new_figure(1, 1, 3.2)
+    axes = grid[0, 0]
+    axes.axhline(0, color=INK, lw=0.6)
+    axes.plot(x, y, ".", ms=4, color=BLUE)
+    axes.set_xlabel(along)
+    axes.set_ylabel(up)
+    return fig, axes

@@ -45,8 +45,6 @@ from sweeps.report.settle_report import IMPOSED
 SEGMENT, COHERENT = 256, 0.7
 #: Fewest rows of a run for a frequency response.
 SHORTEST = 32
-#: Most points of a line in a figure, in pairs of the smallest and largest of equally many samples.
-POINTS = 3000
 
 
 def draw_settled_log(found: Settled) -> Figure:
@@ -68,7 +66,7 @@ def draw_settled_log(found: Settled) -> Figure:
     ]
     fig, grid = new_figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
-        axes.plot(*_decimate_line(clock[order], values[order]), color=FAINT, lw=0.8)
+        axes.plot(clock[order], values[order], color=FAINT, lw=0.8, rasterized=len(order) > 3000)
         for s in found.stretches:
             ends = clock[s.rows[0]], clock[s.rows[-1]]
             if s.why:
@@ -79,17 +77,6 @@ def draw_settled_log(found: Settled) -> Figure:
         axes.set_ylabel(label, color=INK)
     grid[-1, 0].set_xlabel("time [s], recordings one after the other")
     return fig
-
-
-def _decimate_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line with fewer points that looks the same: the smallest and largest sample of each group."""
-    size = -(-2 * len(x) // POINTS)
-    if size <= 2:
-        return x, y
-    groups = [slice(k, k + size) for k in range(0, len(x), size)]
-    with np.errstate(all="ignore"):
-        ends = [(np.nanmin(y[g]), np.nanmax(y[g])) if np.isfinite(y[g]).any() else (np.nan, np.nan) for g in groups]
-    return np.repeat([x[g][0] for g in groups], 2), np.ravel(ends)
 
 
 INRUSH = 0.04  # s, shown enlarged
@@ -230,125 +217,31 @@ def draw_starts(shown: list[StartRun], current_title: str = "total current", spe
 
 
 def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
-    end_time, peak = float(start.time[-1]), float(start.current.max())
+    peak = float(start.current.max())
     run = start.current[start.time > start.starting]
     run = run[len(run) // 20 :] if len(run) > 20 else start.current
     top = max(1.75 * float(run.max()), 0.1)
-    cut = peak > top
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
-    axes.set(
-        xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3))
-    )
+    low = min(0.0, 1.1 * float(start.current.min()))
+    axes.set(xlim=(0, start.time[-1]), ylim=(low, top if peak > top else 1.3 * max(peak, 1e-3)))
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _shade_stages(axes, start)
-    if cut:
+    if peak > top:
         add_corner_note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
-    during = (start.time > start.starting) & (start.time < start.slipping)
-    middle = float(np.median(start.current[during])) if during.any() else 0.0
-    if (
-        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * end_time
-        and start.gets_under_way
-    ):
-        label_time = (start.starting + start.slipping) / 2
-        axes.annotate(f"{middle:.2f} A", (label_time, middle), xytext=(0, 5), textcoords="offset points", ha="center")
-    crest = start.current[last_samples(start.time)].max()
-    axes.annotate(
-        f"{start.ended[0]:.2f} A", (0.98 * end_time, crest), xytext=(0, 5), ha="right", textcoords="offset points"
-    )
 
 
 def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
-    end_time, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
-    axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
-    axes.plot(start.time, start.speed, color=colour)
-    axes.set(xlim=(0, end_time), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
-    axes.set_ylabel("speed [mm/s]")
+    top = max(float(start.theoretical.max()), 1.0)
+    axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4, label=r"$V_{x\,teor}$ (shafts)")
+    axes.plot(start.time, start.speed, color=colour, label="$V_x$ (robot)")
+    axes.set(xlim=(0, start.time[-1]), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top))
+    axes.set(xlabel="time [s]", ylabel="speed [mm/s]")
     _shade_stages(axes, start)
-    axes.text(0.02 * end_time, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
-    if 0 < start.settled < end_time and start.gets_under_way:
-        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
-        text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
-        axes.text(start.settled + 0.02 * end_time, 0.1 * start.speed[-1], text, fontsize=8.5)
-    # Right of the line at t' if it is next to the curve, otherwise right of the curve.
-    half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
-    has_room = 0 < start.settled < 0.5 * end_time and start.gets_under_way
-    label_place = (start.settled if has_room else start.time[half], start.speed[half])
-    label_offset = (6, 6) if has_room else (6, -12)
-    axes.annotate(
-        "$V_x$ (robot)", label_place, xytext=label_offset, textcoords="offset points", color=colour, fontsize=8.5
-    )
+    if 0 < start.settled < start.time[-1] and start.gets_under_way:
+        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":", label=f"t' = {start.settled:.2f} s")
+    axes.legend(loc="lower right")
     if start.status not in words.SETTLED:
         add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
-
-
-def draw_slip(shown: list[StartRun]) -> Figure:
-    """One row for each run: V_x and V_x_teor until after the start, and the slip (33).
-
-    The slip's mean is drawn over each stage and over t'. For a run that ends backward, backward is drawn positive.
-    """
-    fig, grid = new_figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
-    look = configuration_looks(start.configuration for start in shown)
-    for (speeds, slip), start in zip(grid, shown, strict=True):
-        speeds.set_title(f"{start.name}\nspeeds{', backward positive' if start.sense < 0 else ''}")
-        slip.set_title("slip")
-        if start.stages is None:
-            add_corner_note(speeds, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
-            continue
-        colour = look[start.configuration][0]
-        end_time = float(start.time[-1])
-        upto = (
-            min(1.6 * max(start.settled, start.slipping, 0.02 * end_time), end_time)
-            if start.gets_under_way
-            else end_time
-        )
-        speeds.fill_between(start.time, start.speed, start.theoretical, color=colour, alpha=0.15, lw=0)
-        speeds.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
-        speeds.plot(start.time, start.speed, color=colour)
-        top = max(float(start.theoretical.max()), 1.0)
-        speeds.set(xlim=(0, upto), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
-        speeds.set_ylabel("speed [mm/s]")
-        for words_of, curve, colour_of, place in (
-            (r"2  $V_{x\,teor}$", start.theoretical, INK, (0, 5)), ("1  $V_x$", start.speed, colour, (0, -14)),
-        ):  # fmt: skip
-            t = 0.78 * upto
-            speeds.annotate(
-                words_of, (t, float(np.interp(t, start.time, curve))), xytext=place, textcoords="offset points",
-                color=colour_of, fontsize=9, ha="center",
-            )  # fmt: skip
-        _shade_stages(speeds, start)
-        rolling = np.abs(start.theoretical) > 1e-3 * top
-        share = 100 * (1 - start.speed / np.where(rolling, start.theoretical, np.nan))
-        slip.plot(start.time, share, color=colour)
-        slip.set(xlim=(0, upto), ylim=(min(0.0, *np.clip(share[rolling], -20, 0)) if rolling.any() else 0.0, 125))
-        slip.set(xlabel="time [s]", ylabel="slip s [%]")
-        _shade_stages(slip, start)
-        if start.gets_under_way:
-            _draw_slip_means(speeds, slip, start, upto)
-        if start.status not in words.SETTLED:
-            add_corner_note(slip, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
-    return fig
-
-
-def _draw_slip_means(speeds: Axes, slip: Axes, start: StartRun, upto: float) -> None:
-    """Marks t' and draws the mean slip of each stage as a level."""
-    assert start.stages is not None
-    for axes in (speeds, slip):
-        if 0 < start.settled < upto:
-            axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
-    if 0 < start.settled < upto:
-        text = f"t' = {start.settled:.3g} s\ns over t' = {100 * start.stages.over_settling:.1f} %"
-        speeds.annotate(text, (start.settled, 0), xytext=(4, 8), textcoords="offset points", fontsize=8.5)
-    bounds = start.stages.bounds
-    for left, right, mean in zip(bounds[:-1], bounds[1:], start.stages.slip, strict=True):
-        if right <= left or left >= upto or not np.isfinite(mean):
-            continue
-        right = min(right, upto)
-        slip.hlines(100 * mean, left, right, color=INK, lw=1.2, ls="--")
-        if right - left > 0.15 * upto:
-            slip.annotate(
-                f"mean {100 * mean:.1f} %", (right, 100 * mean), xytext=(-3, 4), textcoords="offset points",
-                ha="right", fontsize=8.5,
-            )  # fmt: skip
 
 
 def _shade_stages(axes: Axes, start: StartRun, scale: float = 1.0) -> None:

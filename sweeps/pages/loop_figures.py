@@ -1,4 +1,4 @@
-"""Figures of the loop: residuals before and after, the score ladder, defects, laws."""
+"""Figures of the loop: residuals before and after, defects, laws."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from calibration.data.courses import applied_drive
-from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.bases import place_in_words
@@ -23,17 +21,14 @@ from sweeps.pages.figure_style import (
     GREEN,
     INK,
     ORANGE,
-    SKY,
     configuration_looks,
-    is_narrow,
     new_figure,
     outer_legend,
 )
 from sweeps.report.fit_tables import Change
-from sweeps.report.run_tables import UNITS, imposed_column
+from sweeps.report.run_tables import imposed_column
 
-#: Most effects on the ladder.
-RUNGS = 20
+#: Label and unit of the error of each equation, and the variable over which it is drawn, with its label.
 DEFECT_WORDS = {
     "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
     "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
@@ -60,96 +55,21 @@ CONDITION_WORDS = {
 }
 
 
-#: Letters of labels that fit side by side below a figure, and most labels there.
-ABREAST, NAMED = 110, 36
-
-
 def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every reading in sigmas, before and after. Runs are grouped by configuration and voltage."""
-    own_column = imposed_column(table)
-    beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
-    order = np.lexsort((*(table[c] for c in beside), table[own_column], table["configuration"]))
+    """Residual of every reading in sigmas, before and after, over the number of the row."""
     fig, grid = new_figure(len(channels), 1, 1.8 * len(channels), sharex=True)
-    levels = np.unique(table[own_column]).size
-    few = levels <= 8 or own_column == "supply_voltage_V"  # otherwise grouped only by configuration
-    names_configurations = not few or np.unique(table["configuration"]).size > 1
-    groups = [
-        ", ".join(
-            [str(table["configuration"][k])] * names_configurations
-            + [f"{table[own_column][k]:g} {UNITS[own_column]}"] * few
-        )
-        for k in order
-    ]
-    edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
-    x = np.arange(len(order))
     for axes, channel in zip(grid[:, 0], channels, strict=True):
-        before = table[f"residual_before_{channel.name}_sigma"][order]
-        after = table[f"residual_after_{channel.name}_sigma"][order]
+        before, after = (table[f"residual_{when}_{channel.name}_sigma"] for when in ("before", "after"))
         axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
         axes.axhline(0, color=FAINT, lw=0.8)
         if verdict == "none":
-            axes.plot(x, before, "o", ms=4.5, color=BLUE, label="the fitted model")
+            axes.plot(table["row"], before, "o", ms=4.5, color=BLUE, label="the fitted model")
         else:
-            axes.plot(x, before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
-            axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with the effects found")
-        for edge in edges:
-            axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
+            axes.plot(table["row"], before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
+            axes.plot(table["row"], after, "o", ms=4, color=BLUE, label="after: with the effects found")
         axes.set_ylabel(f"{channel.label} [σ]")
     outer_legend(grid[0, 0], "upper left")
-    starts = [0, *edges]
-    step = -(-len(starts) // (NAMED // 2 if is_narrow() else NAMED))
-    group_labels = [groups[a] if k % step == 0 else "" for k, a in enumerate(starts)]
-    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], group_labels,
-                           rotation=90 if sum(len(word) + 2 for word in group_labels) > ABREAST else 0)  # fmt: skip
-    grid[-1, 0].grid(axis="x", visible=False)
-    varied = own_column == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
-    words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
-    grouping = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
-    grid[-1, 0].set_xlabel(f"runs, in each group {grouping}, band: ±2σ of the instruments")
-    return fig
-
-
-#: Most histories whose residual is drawn, and samples over which it is averaged.
-RUNS_SHOWN, AVERAGED = 8, 5
-
-
-def _range_text(x: np.ndarray) -> str:
-    low, high = np.min(x), np.max(x)
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
-def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Residual of every history over time in sigmas, before and after. One column for each run, with samples as dots
-    and their running mean as a line. `table` has the rows of `runs`.
-    """
-    names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
-    count = len(channels)
-    fig, grid = new_figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
-    whens = [("before", ORANGE)] if verdict != "none" else []
-    whens += [("after", BLUE)]
-    for column, name in enumerate(names):
-        run_rows = runs.in_order(name)
-        for axes, channel in zip(grid[:, column], channels, strict=True):
-            axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
-            axes.axhline(0, color=FAINT, lw=0.8)
-            for when, colour in whens:
-                y = table[f"residual_{when}_{channel.name}_sigma"][run_rows]
-                axes.plot(table["time_s"][run_rows], y, ".", ms=3, color=colour, alpha=0.35)
-                if len(y) >= AVERAGED:
-                    smooth = np.convolve(y, np.ones(AVERAGED) / AVERAGED, "valid")
-                    edge = AVERAGED // 2
-                    axes.plot(table["time_s"][run_rows][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
-            if column == 0:
-                axes.set_ylabel(f"{channel.label} [σ]")
-        first_row = run_rows[0]
-        grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first_row]} {_range_text(table[imposed_column(table)][run_rows])} "
-            f"{UNITS[imposed_column(table)]}"
-            + (f" {_range_text(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
-        )  # fmt: skip
-        grid[-1, column].set_xlabel("time [s]")
-    words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
-    fig.suptitle(f"{words}, line: mean of {AVERAGED} samples, band: ±2σ of the instruments", fontsize=8.5)
+    grid[-1, 0].set_xlabel("row, band: ±2σ of the instruments")
     return fig
 
 
@@ -185,52 +105,6 @@ def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], ve
 
 #: Most lags of a correlation with the input [samples].
 LAGS = 20
-
-
-def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
-    """Correlation of each residual with the input at lags of samples, over all runs, before and after."""
-    fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
-    rows_of_runs = list(runs.rows_by_run().values())
-    applied = applied_drive(runs)
-    largest_lag = min(LAGS, min(map(len, rows_of_runs)) - 1)
-    lags = np.arange(-largest_lag, largest_lag + 1)
-    centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
-    for axes, channel in zip(grid[0], channels, strict=True):
-        limit = 2 / np.sqrt(len(table["time_s"]))
-        axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
-        for when, colour in (("before", ORANGE), ("after", BLUE))[verdict == "none" :]:
-            sums, squares = np.zeros(len(lags)), np.zeros(2)
-            for rows in rows_of_runs:
-                residual = centred(table[f"residual_{when}_{channel.name}_sigma"][rows])
-                drive = centred(applied[rows])
-                sums += np.correlate(residual, drive, "full")[len(rows) - 1 + lags]
-                squares += residual @ residual, drive @ drive
-            axes.plot(lags, sums / max(np.sqrt(squares.prod()), 1e-300), "o-", ms=3, lw=1, color=colour, label=when)
-        axes.set(title=channel.label, xlabel="residual after the input [samples]")
-    grid[0, 0].set_ylabel("correlation with the input")
-    grid[0, 0].legend(loc="best")
-    return fig
-
-
-def draw_effect_scores(found: DiscoveryResult) -> Figure:
-    """Score of every effect at the base fit, with the threshold that noise rarely exceeds."""
-    rungs = found.scores[:RUNGS]
-    effect_names = {e.name for e in found.effects}
-    alike = {n for e in found.effects for n in e.members} - effect_names
-    fig, grid = new_figure(1, 1, 1.1 + 0.24 * len(rungs))
-    axes = grid[0, 0]
-    root = [np.sqrt(r.score) for r in rungs]
-    colours = [BLUE if r.name in effect_names else SKY if r.name in alike else "#c9c9c9" for r in rungs]
-    axes.barh(range(len(rungs)), root, color=colours, height=0.72)
-    level = found.before.kinds["single"].threshold
-    axes.axvline(level, color=ORANGE, lw=1.6)
-    axes.text(level, -0.6, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
-    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({place_in_words(r.balance)})" for r in rungs])
-    axes.set_ylim(len(rungs) - 0.4, -1.8)
-    axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: misfit that the effect alone explains at a plausible size [σ]")
-    axes.set_title("blue: found, light blue: indistinguishable from a found effect")
-    return fig
 
 
 #: Share of a variable's range over which the change by an effect is averaged to measure its smoothness.

@@ -1,16 +1,16 @@
-"""Figures of missions: speed, slope, current, duty, temperatures and charge over time, and uses of energy."""
+"""Figures of missions and turns: readings over time, both sides, the path, and what other turns take."""
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.integrate import cumulative_trapezoid
 
 from calibration.data import Columns, Json
 from mmrjax.model.channels import SIDES
-from mmrjax.model.energy import SINKS
-from sweeps.pages import words
+from mmrjax.model.robot import Robot
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -18,21 +18,15 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     PURPLE,
-    SKY,
     VERMILION,
     add_corner_note,
-    legend_columns,
     new_figure,
 )
 from sweeps.points.imposed import UNLIMITED
 
+_SIDE_COLOURS = (("left", BLUE), ("right", VERMILION))
 #: Units of a time axis: shortest mission [s], size [s], name.
 _TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
-#: Colours of uses of energy.
-_COLOURS = {
-    "battery": INK, "other": FAINT, "driver": FAINT, "winding": VERMILION, "motor": ORANGE, "gearbox": PURPLE,
-    "track": BLUE, "sliding": SKY, "rolling": SKY, "lift": GREEN,
-}  # fmt: skip
 
 
 def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
@@ -73,7 +67,7 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
 
 
 def draw_sides(rows: Columns) -> Figure:
-    """Current and duty of each side, and the yaw rate, over time.
+    """Current of each side, its duty or motor speed, and the yaw rate, over time.
 
     Args:
         rows: rows of history.csv of one run with sides.
@@ -82,12 +76,19 @@ def draw_sides(rows: Columns) -> Figure:
     span = float(rows["time_s"][-1])
     _, size, unit = next(t for t in _TIMES if span >= t[0])
     time = rows["time_s"] / size
-    for side, color in (("left", BLUE), ("right", VERMILION)):
+    column, factor, label = ("duty_{}", 100.0, "duty [%]") if "duty_left" in rows else (
+        "motor_speed_{}_rpm", 1.0, "motor speed [rpm]"
+    )  # fmt: skip
+    for side, color in _SIDE_COLOURS:
         grid[0, 0].plot(time, rows[f"motor_current_{side}_A"], color=color, lw=1.0, label=side)
-        grid[1, 0].plot(time, 100 * rows[f"duty_{side}"], color=color, lw=1.0)
+        grid[1, 0].plot(time, factor * rows[column.format(side)], color=color, lw=1.0)
     grid[2, 0].plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
-    for axes, label in zip(grid[:, 0], ("current of a motor [A]", "duty [%]", "yaw rate [rad/s]"), strict=True):
-        axes.set_ylabel(label)
+    for axes, text in zip(grid[:, 0], ("current of a motor [A]", label, "yaw rate [rad/s]"), strict=True):
+        axes.set_ylabel(text)
+    later = [rows[f"motor_current_{side}_A"][time > 0.1 * time[-1]] for side in ("left", "right")]
+    limit = 2.5 * float(np.nanmax(np.abs(np.concatenate(later)), initial=0.1))
+    low, high = grid[0, 0].get_ylim()
+    grid[0, 0].set_ylim(max(low, -limit), min(high, limit))
     grid[0, 0].legend(ncols=2, fontsize=8)
     grid[-1, 0].set(xlabel=f"time [{unit}]", xlim=(0, time[-1]))
     return fig
@@ -106,7 +107,7 @@ def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
 def _draw_legend(axes: Axes, *others: Axes) -> None:
     handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
     labels = [str(h.get_label()) for h in handles]
-    axes.legend(handles, labels, loc="upper center", ncols=legend_columns(labels), fontsize=8)
+    axes.legend(handles, labels, loc="upper center", ncols=len(labels), fontsize=8)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for the label
 
@@ -220,32 +221,82 @@ def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
         add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
 
 
-def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> Figure:
-    """Energy of one run by use, in the order of the chain [Wh], and its share of the energy drawn [%].
+#: A path bends by no more between two points that are drawn [rad].
+BEND = 0.05
+
+
+def _draw_outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float, color: str) -> None:
+    """The robot from above: its contact lines, a bar between them and an arrow pointing ahead."""
+    length = float(robot.running_gear.wheelbase)
+    width = float(robot.configurations[str(row["configuration"])].turning.width)
+    ahead, sideways = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    middle = np.array([x, y])
+    for side in (0.5, -0.5):
+        ends = [middle + side * width * sideways + s * length * ahead for s in (0.5, -0.5)]
+        axes.plot([-e[1] for e in ends], [e[0] for e in ends], color=color, lw=3.5, solid_capstyle="round")
+    tip = middle + 0.5 * length * ahead
+    axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})
+
+
+def _set_plan_axes(axes: Axes) -> None:
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("to the right of the start [m]", color=INK)
+    axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
+
+
+def path_arcs(
+    x: np.ndarray, y: np.ndarray, yaw: np.ndarray
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """A path between places, each stretch at a speed and yaw rate of its own: an arc. Steps of a run may be long.
 
     Args:
-        run: row of the run in runs.csv.
+        x, y: places [m].
+        yaw: there, counted on over a turn [rad], shape (rows,).
     """
-    energy = float(run["energy_drawn_Wh"])
-    source = "drawn from the battery's charge" if on_battery else "drawn from the supply"
-    bars: list[tuple[str, float, str]] = [(source, energy, INK)]
-    for name in SINKS:
-        bars.append((words.sink_labels(on_ground)[name], float(run[f"energy_to_{name}_Wh"]), _COLOURS[name]))
-    bars.append(("kinetic energy at the end", float(run["energy_stored_Wh"]), FAINT))
-    bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
-    bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(energy, 1e-12)]
-    fig, grid = new_figure(1, 1, 0.9 + 0.34 * len(bars))
+    place, yaw_changes = x + 1j * y, np.diff(yaw)
+    pieces = np.ceil(np.abs(yaw_changes) / BEND).clip(1, 100).astype(int)
+    k = np.repeat(np.arange(len(pieces)), pieces)
+    share = (np.arange(len(k)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[k]
+    bent = np.where(pieces[k] > 1, yaw_changes[k], BEND)  # else share is 0 and any will do
+    between = place[k] + np.diff(place)[k] * np.expm1(1j * share * bent) / np.expm1(1j * bent)
+    path_points = np.append(between, place[-1])
+    return path_points.real, path_points.imag
+
+
+def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
+    """The path of a run over time from above, with the robot at its start, at its end and in between."""
+    finite = np.isfinite(x)
+    x, y, yaw = x[finite], y[finite], yaw[finite]
+    fig, grid = new_figure(1, 1, 4.6)
     axes = grid[0, 0]
-    bar_positions = np.arange(len(bars), dtype=float)
-    widths = np.array([bar[1] for bar in bars])
-    axes.barh(bar_positions, widths, height=0.7, color=[bar[2] for bar in bars])
-    for y, (_, width, _) in zip(bar_positions, bars, strict=True):
-        share = f" ({100 * width / energy:.1f} %)" if energy > 0 else ""
-        axes.text(max(width, 0.0), y, f"  {width:.3g} Wh{share}", va="center", fontsize=8.5)
-    axes.set_yticks(bar_positions, [bar[0] for bar in bars], fontsize=9)
-    axes.invert_yaxis()
-    axes.grid(False, axis="y")
-    axes.axvline(0, color="#666666", lw=0.8)
-    low = min(0.0, float(widths.min()))
-    axes.set(xlabel="energy [Wh]", xlim=(1.1 * low, 1.22 * float(widths.max())))
+    ahead, aside = path_arcs(x, y, yaw)
+    axes.plot(-aside, ahead, color=BLUE)
+    for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
+        _draw_outline(axes, robot, row, x[k], y[k], yaw[k], color)
+    _set_plan_axes(axes)
+    return fig
+
+
+def draw_yaw_rates(turns: Columns, row: Json) -> Figure:
+    """Currents of both sides and power over the yaw rate of settled turns. The requested turn is marked."""
+    fig, grid = new_figure(1, 2, 3.4)
+
+    def rate(motion: Json) -> np.ndarray:
+        # On the spot the curvature is without limit, the yaw rate is not.
+        return np.asarray(motion["yaw_rate_rad_s"], float)
+
+    other_turns = {name: np.asarray(values)[1:] for name, values in turns.items()}
+    order = np.argsort(rate(other_turns))
+    for side, color in _SIDE_COLOURS:
+        column = f"motor_current_{side}_A"
+        grid[0, 0].plot(rate(other_turns)[order], other_turns[column][order], color=color, label=side)
+        grid[0, 0].plot(rate(row), float(row[column]), marker="o", color=color, ls="none")
+    grid[0, 0].set_ylabel("current of a motor [A]", color=INK)
+    grid[0, 0].legend()
+    grid[0, 1].plot(rate(other_turns)[order], other_turns["power_supply_W"][order], color=INK)
+    grid[0, 1].plot(rate(row), float(row["power_supply_W"]), marker="o", color=INK, ls="none")
+    grid[0, 1].set_ylabel("power of the supply [W]", color=INK)
+    for axes in grid[0]:
+        axes.axhline(0, color=FAINT, lw=0.8)
+        axes.set_xlabel("yaw rate, positive to the left [rad/s]", color=INK)
     return fig

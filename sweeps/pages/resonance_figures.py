@@ -20,9 +20,6 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
-    colour_bar,
-    is_narrow,
-    legend_columns,
     new_figure,
 )
 from sweeps.report.resonance_report import ResonanceResult, ripple_percent
@@ -62,7 +59,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
         is_inside, last = at_end <= top, place
         place = fastest if is_inside else fastest * 0.985 * top / at_end
-        if last - place < (0.08 if is_narrow() else 0.03) * fastest and not is_inside:
+        if last - place < 0.03 * fastest and not is_inside:
             break  # labels and lines would overlap
         axes.annotate(
             f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if is_inside else (0, -2),
@@ -85,9 +82,8 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
     heading = f"{found.configuration}: {parts.name} pass every {parts.travel / MM:.4g} mm of travel"
     axes.set_title(heading)
-    labels = axes.get_legend_handles_labels()[1]
     axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=legend_columns(labels, 3), handletextpad=0.2,
+        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, handletextpad=0.2,
         columnspacing=1.2,
         title="a run's strongest line, larger for more ripple (sd / mean):", title_fontsize=8.5, alignment="center",
     )  # fmt: skip
@@ -154,4 +150,4 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     remarks += [kinds] if kinds else []
     axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():
-        colour_bar(axes.figure, mesh, axes, pad=0.01, aspect=8, label="sd / mean [%]")
+        axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")

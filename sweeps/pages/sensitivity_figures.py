@@ -1,4 +1,4 @@
-"""Figures of a sensitivity study: who decides what, tornadoes, heat maps over conditions."""
+"""Figures of a sensitivity study: share of every input in every output, and tornadoes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.sensitivity.replicates import IntervalEstimate
 from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, legend_columns, new_figure
+from sweeps.pages.figure_style import BLUE, INK, VERMILION, new_figure
 from sweeps.pages.words import short_name
 
 #: Most inputs in a figure, and most operating points in a tornado.
@@ -84,89 +83,3 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     axes[0, 0].set_yticks([-p for p in range(len(top))], [short_name(found.names[i]) for i in top], fontsize=8.5)
     axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)
     return fig
-
-
-def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
-    """Indices over all points with their 95 % intervals, and the share of each input at every point."""
-    share = study.overall_share
-    order = np.argsort(-share, kind="stable")
-    leading = [k for k in order[:SHOWN] if share[k] >= NEGLIGIBLE]
-    top = np.array(leading or order[:1], int)  # all may be negligible
-    fig, axes = new_figure(1, 2, 1.0 + 0.3 * max(len(top), 3), width_ratios=(1.0, 1.7))
-    left, right = axes[0]
-    _draw_index_bars(left, study, found, top)
-    _draw_shares_over_points(right, study, found, top)
-    return fig
-
-
-#: Names of indices in legends, and their colours.
-_WORDS = {
-    "first": ("alone (first order)", BLUE), "total": ("with others (total)", ORANGE),
-    "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
-}  # fmt: skip
-
-
-def _draw_index_bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
-    estimates: dict[str, IntervalEstimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
-    estimates = estimates or {"": None}
-    height = 0.8 / len(estimates)
-    for j, (key, estimate) in enumerate(estimates.items()):
-        bar_places = -np.arange(len(top)) + 0.4 - height * (j + 0.5)
-        if estimate is None:
-            ax.barh(
-                bar_places, study.overall_share[top], color=BLUE, height=height, label="share of the linear variance"
-            )
-            continue
-        words, colour = _WORDS[key]
-        scale = study.row.factor if key == "mean_absolute_effect" else 1.0
-        value = estimate.value[top] / scale
-        ends = np.stack([estimate.value - estimate.low, estimate.high - estimate.value])[:, top] / scale
-        ax.barh(bar_places, np.maximum(value, 0.0), color=colour, height=0.9 * height, label=words)
-        ax.errorbar(
-            value, bar_places, xerr=np.maximum(ends, 0.0), fmt="none", ecolor=INK, elinewidth=0.9, capsize=1.5
-        )
-    ax.set_yticks(-np.arange(len(top)), [short_name(found.names[k]) for k in top], fontsize=8.5)
-    ax.set_xlim(left=0)
-    unit = "" if study.row.unit_shown == "-" else f" [{study.row.unit_shown}]"
-    ax.set_xlabel(
-        f"effect over the 95 % range{unit}" if "mean_absolute_effect" in estimates else "share of the variance [-]"
-    )
-    ax.grid(axis="y", visible=False)
-    columns = legend_columns(ax.get_legend_handles_labels()[1], 2)
-    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=7.5)  # no bar here
-
-
-def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
-    points = found.points
-    names = np.array(list(map(str, points.configuration)))
-    kinds = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    order = np.lexsort((points.payload, points.imposed[1], points.slope_deg, np.array([kinds[n] for n in names])))
-    _draw_heat_map(ax, study.share[order][:, top].T, 24)
-    ax.set_yticks([])
-    ticks, labels = [], []
-    word, own_values, unit = points.imposed
-    along, levels, mark = (
-        ("slope", points.slope_deg, "°") if points.has_ground else (f"{word} [{unit}]", own_values, "")
-    )
-    for kind in kinds:
-        point_rows = np.flatnonzero(names[order] == kind)
-        if point_rows[0]:
-            ax.axvline(point_rows[0] - 0.5, color="white", linewidth=4)
-        for level in np.unique(levels[order][point_rows]):
-            of_level = point_rows[levels[order][point_rows] == level]
-            ticks.append(of_level.mean())
-            labels.append(f"{level:g}{mark}")
-            if of_level[0] != point_rows[0]:
-                ax.axvline(of_level[0] - 0.5, color="white", linewidth=1.5)
-        ax.text(point_rows.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
-    ax.set_xticks(ticks, labels, fontsize=8.5)
-    other = ((word, own_values, unit), ("payload", points.payload, "kg"))
-    inner = [
-        f"{word} {_range_text(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1
-    ]
-    within_words = f", within each {' and '.join(inner)}" if inner else ""
-    ax.set_xlabel(f"{along}{within_words}, grey: no index there", fontsize=8.5)
-
-
-def _range_text(values: np.ndarray) -> str:
-    return f"{values.min():g}-{values.max():g}"

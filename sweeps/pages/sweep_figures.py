@@ -8,13 +8,12 @@ import numpy as np
 from matplotlib import colormaps, colors
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from calibration.data import Columns, Json
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
-from sweeps.pages.figure_style import FAINT, INK, add_corner_note, axis_label, colour_bar, new_figure
+from sweeps.pages.figure_style import INK, add_corner_note, axis_label, new_figure
 from sweeps.report.run_tables import UNITS, imposed_column, reading_text
 
 _PANELS = 3  # most voltages drawn for a configuration
@@ -31,16 +30,11 @@ def on_ground(runs: Columns) -> bool:
 def panels_by_imposed(voltages: np.ndarray, column: str) -> list[tuple[str, np.ndarray]]:
     """Panels of a figure by imposed quantity: a title and a mask for each of at most three panels.
 
-    Up to three voltages each have a panel. A grid with more has panels for the lowest, a middle and the highest. If
-    nearly every run has its own voltage, the panels are thirds of the range.
+    Up to three voltages each have a panel. A grid with more has panels for the lowest, a middle and the highest.
     """
     if np.isnan(voltages).all():
         return [("battery", np.ones(len(voltages), bool))]
     levels, unit = np.unique(voltages), UNITS[column]
-    if levels.size > _PANELS and 4 * levels.size > voltages.size:
-        bounds = np.linspace(levels[0], levels[-1], _PANELS + 1)
-        third = np.clip(np.searchsorted(bounds, voltages, side="right") - 1, 0, _PANELS - 1)
-        return [(f"{bounds[k]:.3g} to {bounds[k + 1]:.3g} {unit}", third == k) for k in range(_PANELS)]
     if levels.size > _PANELS:
         levels = levels[[0, levels.size // 2, -1]]
     return [(f"{v:.4g} {unit}", voltages == v) for v in levels]
@@ -54,8 +48,8 @@ def runs_with_number(runs: Columns, channel: Channel) -> np.ndarray:
 def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     """One channel over slope and payload, a panel for each voltage and configuration.
 
-    With a single slope or payload the panels are lines over the other. A cell that did not settle is hatched
-    and names the reason. Several runs in one cell are shown by their median.
+    With a single slope or payload the panels are lines over the other. A cell that did not settle is grey and
+    names the reason.
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
     volts = panels_by_imposed(runs[imposed_column(runs)], imposed_column(runs))
@@ -74,7 +68,7 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
             axes.set(xlabel="slope [°]", ylabel="payload [kg]")
     from matplotlib.cm import ScalarMappable
 
-    bar = colour_bar(fig, ScalarMappable(norm, "viridis"), grid, shrink=0.8, pad=0.01)
+    bar = fig.colorbar(ScalarMappable(norm, "viridis"), ax=grid, shrink=0.8, pad=0.01)
     bar.set_label(axis_label(channel))
     return fig
 
@@ -86,26 +80,11 @@ def _draw_map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, no
         return
     slopes, at_slope = np.unique(runs["slope_deg"][index], return_inverse=True)
     payloads, at_payload = np.unique(runs["payload_kg"][index], return_inverse=True)
-    cell, has_number = at_payload * slopes.size + at_slope, runs_with_number(runs, channel)[index]
-    if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
-        x, y, values = (runs[column][index] for column in ("slope_deg", "payload_kg", channel.column))
-        colours = values[has_number]
-        axes.scatter(x[has_number], y[has_number], c=colours, cmap="viridis", norm=norm, s=8, rasterized=True)
-        for status in np.unique(runs["status"][index][~has_number]):
-            pick = ~has_number & (runs["status"][index] == status)
-            axes.plot(
-                x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short_status(str(status))
-            )
-        if not has_number.all():
-            axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
-        return
+    has_number = runs_with_number(runs, channel)[index]
     image = np.full((payloads.size, slopes.size), np.nan)
-    has_median, medians = _medians(cell[has_number], runs[channel.column][index][has_number])
-    image.flat[has_median] = medians
-    cells, first = np.unique(cell, return_index=True)
-    unshown = ~np.isin(cells, has_median)
-    j, i = np.divmod(cells[unshown], slopes.size)
-    missing = dict(zip(zip(i.tolist(), j.tolist(), strict=True), runs["status"][index[first[unshown]]], strict=True))
+    image[at_payload[has_number], at_slope[has_number]] = runs[channel.column][index][has_number]
+    places = zip(at_slope[~has_number].tolist(), at_payload[~has_number].tolist(), strict=True)
+    missing = dict(zip(places, runs["status"][index][~has_number], strict=True))
     axes.imshow(image, origin="lower", aspect="auto", cmap="viridis", norm=norm, interpolation="nearest")
     labelled = slopes.size <= _CELLS and payloads.size <= _CELLS
     if labelled:
@@ -113,38 +92,10 @@ def _draw_map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, no
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
             axes.text(i, j, reading_text(image[j, i], channel), color=ink, fontsize=7.5, **_INSIDE)
-    for i, j, wide, tall in _cover_cells(set(missing), joined=not labelled):
-        axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
+    axes.set_facecolor("#d9d9d9")  # behind cells without a number
     _name_missing_cells(axes, missing, labelled)
     _set_ticks(axes.set_xticks, slopes)
     _set_ticks(axes.set_yticks, payloads)
-
-
-def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cells and the median of the values in each."""
-    order = np.lexsort((values, cell))
-    cells, begin, count = np.unique(cell[order], return_index=True, return_counts=True)
-    ranked = values[order]
-    return cells, 0.5 * (ranked[begin + (count - 1) // 2] + ranked[begin + count // 2])
-
-
-def _cover_cells(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
-    """Rectangles (i, j, width, height) that cover the cells, merged if cells touch, otherwise one per cell."""
-    if not joined:
-        return [(i, j, 1, 1) for i, j in sorted(cells)]
-    blocks = []
-    uncovered = set(cells)
-    while uncovered:
-        i, j = min(uncovered)
-        tall = 1
-        while (i, j + tall) in uncovered:
-            tall += 1
-        wide = 1
-        while all((i + wide, j + k) in uncovered for k in range(tall)):
-            wide += 1
-        uncovered -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
-        blocks.append((i, j, wide, tall))
-    return blocks
 
 
 def _name_missing_cells(axes: Axes, missing: dict[tuple[int, int], str], each: bool) -> None:

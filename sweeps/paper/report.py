@@ -6,15 +6,13 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns, Json, runs
+from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
 from calibration.inference import simulation_errors
 from mmrjax.model.paper_robots import ROBOTS
-from mmrjax.model.paper_tables import TRACKED, WHEELED
-from mmrjax.model.quantities import MM, RPM
+from mmrjax.model.paper_tables import TRACKED
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import gear_figures, words
@@ -106,7 +104,6 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
         row_blocks = (
             catalogue.note("paper.row-by-row", raised),
             _paper_rows_table(nominal),
-            catalogue.note("paper.reasons"),
         )
         yield Section("The paper compared with itself, row by row", row_blocks, "rows-table")
         starts = data.simulate_starts(robot)
@@ -196,21 +193,14 @@ def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows]
     return Section("Against the bench", tuple(blocks), "bench")
 
 
-def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
-    """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
-    current = table["total_current_A"]
-    back_emf = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
-    return robot.sides * (table["supply_voltage_V"] - back_emf) / current
-
-
 def _paper_rows_table(rows: data.PaperRows) -> Block:
-    """The 20 rows: bench, the paper's simulation, three variants of the nominal robot, and letters for the reasons
-    of differences. Wheeled rows appear a second time with the robot's own mass.
+    """The 20 rows: bench, the paper's simulation and three variants of the nominal robot. Wheeled rows appear a
+    second time with the robot's own mass.
     """
     table, own_mass = rows.conditions, rows.weighed["total_mass_kg"]
     own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))
     by_row = []
-    for k, letters in enumerate(row_reasons(ROBOTS["nominal"](), rows)):
+    for k in range(len(table)):
         names = ("configuration", "supply_voltage_V", "total_mass_kg", "slope_deg")
         has_other_mass = abs(own_mass[k] - table["total_mass_kg"][k]) > 0.05
         for first, mass in ((True, table["total_mass_kg"][k]), (False, own_mass[k]))[: 1 + has_other_mass]:
@@ -223,41 +213,13 @@ def _paper_rows_table(rows: data.PaperRows) -> Block:
                 cells += [bench, paper, plain] if first else [""] * 3
                 cells += [found if np.isfinite(found) else "no number"]
                 cells += [error_cell(float(simulation_errors.relative_error(found, x))) for x in (paper, bench)]
-            by_row.append((*cells, " ".join(letters) if first else ""))
+            by_row.append(cells)
     heads = []
     for c in data.channels_of_paper():
         form, group = f"{{:.{max(c.resolution - 1, 0)}f}}", f"{c.label} [{c.unit}]"
         heads += [Column(word, form=form, group=group) for word in ("bench", "paper", "own", "raised")]
         heads += [Column(f"Δ {word}", form="{:+.1f}", group=group) for word in ("paper", "bench")]
     return catalogue.table("paper.rowtable", by_row, *heads)
-
-
-def row_reasons(nominal: Robot, rows: data.PaperRows) -> Iterator[list[str]]:
-    """Letters of `paper.reasons` in the catalogue, for each row of the nominal robot."""
-    table = rows.conditions
-    raised, weighed = (data.stack_channels(t) for t in (rows.raised, rows.weighed))
-    resistance = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
-    for k in range(len(table)):
-        wheeled = table["configuration"][k] == WHEELED
-        following = (table["slope_deg"] == table["slope_deg"][k] + 5) & (
-            (table["configuration"] == table["configuration"][k])
-            & (table["supply_voltage_V"] == table["supply_voltage_V"][k])
-        )
-        creep = rows.raised["theoretical_speed_mm_s"][k] * rows.raised["slip"][k]
-        radius = float(nominal.configurations[str(table["configuration"][k])].radius) / float(nominal.gearbox.ratio)
-        creep_paper = rows.paper[k, 1] * RPM * radius / MM - rows.paper[k, 2]
-        current = rows.paper[k, 0]
-        holds = {
-            "A": rows.plain["status"][k] == "slides",
-            "M": wheeled and abs(rows.weighed["total_mass_kg"][k] - table["total_mass_kg"][k]) > 0.05,
-            "W": wheeled and abs(weighed[k, 0] - current) > 0.03 * current,
-            "G": not wheeled and abs(raised[k, 0] - current) > 0.01 * current,
-            "E": resistance[k] > 1.1 * float(nominal.motor.resistance),
-            "B": raised[k, 1] > 1.03 * rows.measured[k, 1],
-            "N": following.any() and rows.paper[following, 1][0] > rows.paper[k, 1],
-            "S": creep_paper > 1.5 * creep + 2,
-        }
-        yield [letter for letter, does in holds.items() if does]
 
 
 def _variants(name: str, rows: dict[str, data.PaperRows]) -> Columns:

@@ -20,7 +20,6 @@ from sweeps.pages.figure_style import (
     VERMILION,
     add_corner_note,
     label_line_end,
-    legend_columns,
     new_figure,
 )
 from sweeps.pages.words import displayed_robot_name
@@ -117,5 +116,5 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.PaperRows]) -> F
     for axes in grid[1]:
         axes.set_xlabel("slope [°]")
     labels = [str(h.get_label()) for h in handles]
-    fig.legend(handles=handles, loc="outside lower center", ncols=legend_columns(labels))
+    fig.legend(handles=handles, loc="outside lower center", ncols=len(labels))
     return fig

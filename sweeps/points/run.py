@@ -126,7 +126,7 @@ def compute_chunks(
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
     stored = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
-    chunks_left, times = [k for k in chunks if k not in stored], scale.Times()
+    chunks_left = [k for k in chunks if k not in stored]
     advance(sum(map(job.blocks.count, stored)))
 
     def keep(chunk: int, arrays: Table, _: Any) -> None:
@@ -135,9 +135,7 @@ def compute_chunks(
             folder.keep_chunk(files[chunk], stored[chunk])
 
     if chunks_left:
-        scale.write_chunks(
-            keep, job, scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance), advance, times
-        )
+        scale.write_chunks(keep, scale.Compiled(job), chunks_left, advance)
     results = [stored.pop(k) for k in chunks]
     return {column: np.concatenate([part.pop(column) for part in results]) for column in tuple(results[0])}
 

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import queue
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -69,20 +68,6 @@ class Job:
     storage: str
     blocks: Blocks
     profile: Profile | None = None
-
-
-@dataclasses.dataclass
-class Times:
-    """Durations of overlapping steps [s]: waiting for points, starting the computation (on CPUs the whole of it),
-    waiting for results, fetching them from the device, writing them, and the total.
-    """
-
-    points: float = 0.0
-    start: float = 0.0
-    compute: float = 0.0
-    transfer: float = 0.0
-    write: float = 0.0
-    total: float = 0.0
 
 
 def device_kind() -> str:
@@ -257,15 +242,12 @@ class Piece:
     told: float = 0.0
 
 
-Produced = Iterator[Piece]
 Advance = Callable[[float], None]
 #: Stores a chunk by its number: values of its points by variable, and its samples from `drawn_samples`.
 Keep = Callable[[int, Columns, np.ndarray | None], Any]
 
 
-def produce_chunks(
-    compiled: Compiled, chunks: Iterable[int], times: Times, advance: Advance | None = None
-) -> Produced:
+def produce_chunks(compiled: Compiled, chunks: Iterable[int], advance: Advance) -> Iterator[Piece]:
     """Computes chunks on the local devices, in order. The points of the next chunk are prepared meanwhile.
 
     Args:
@@ -276,26 +258,19 @@ def produce_chunks(
         for chunk in chunks:
             prepared.append((chunk, maker.submit(compiled.points, chunk)))
             if len(prepared) > 1:
-                yield _start_chunk(compiled, *prepared.popleft(), times, advance)
+                yield _start_chunk(compiled, *prepared.popleft(), advance)
         while prepared:
-            yield _start_chunk(compiled, *prepared.popleft(), times, advance)
+            yield _start_chunk(compiled, *prepared.popleft(), advance)
 
 
-def _start_chunk(
-    compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times, advance: Advance | None
-) -> Piece:
-    start = time.perf_counter()
+def _start_chunk(compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], advance: Advance) -> Piece:
     values = points.result()
-    begin = time.perf_counter()
-    if compiled.in_parts and advance is not None:
-        count = compiled.job.blocks.count(chunk)
-        counter = share_counter(advance, count)
-        piece = Piece(chunk, compiled(values, counter), values, count)
-        counter(1.0)
-    else:
-        piece = Piece(chunk, compiled(values), values)
-    times.points += begin - start
-    times.start += time.perf_counter() - begin
+    if not compiled.in_parts:
+        return Piece(chunk, compiled(values), values)
+    count = compiled.job.blocks.count(chunk)
+    counter = share_counter(advance, count)
+    piece = Piece(chunk, compiled(values, counter), values, count)
+    counter(1.0)
     return piece
 
 
@@ -326,36 +301,29 @@ def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] |
     return piece.values[: sample_range.stop - sample_range.start, len(design.axes) :].T
 
 
-def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
-    """Writes chunks as they arrive, in a separate thread, while the next is computed.
+def write_chunks(keep: Keep, compiled: Compiled, chunks: Iterable[int], advance: Advance) -> None:
+    """Computes chunks and writes each in a separate thread, while the next is computed.
 
     Args:
         keep: function that stores a chunk.
-        advance: callback for the number of points in each finished chunk.
+        advance: callback for the number of points that are done.
 
     Raises:
         OSError: the disk is full, or the store cannot be written. Earlier chunks are kept.
     """
     waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
     stop, failures = threading.Event(), list[BaseException]()
-    start_time = time.perf_counter()
 
     def write(piece: Piece) -> None:
         is_ready = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
         if stop.is_set() and not is_ready:
             return
-        start = time.perf_counter()
         jax.block_until_ready(list(piece.arrays.values()))
-        computed = time.perf_counter()
-        count = job.blocks.count(piece.chunk)
+        count = compiled.job.blocks.count(piece.chunk)
         host_values = fetch_values(piece.arrays, count)
-        transferred = time.perf_counter()
         if stop.is_set() and not is_ready:  # interrupted during its computation
             return
-        keep(piece.chunk, host_values, drawn_samples(job, piece))
-        times.compute += computed - start
-        times.transfer += transferred - computed
-        times.write += time.perf_counter() - transferred
+        keep(piece.chunk, host_values, drawn_samples(compiled.job, piece))
         advance(count - piece.told)
 
     def keep_writing() -> None:
@@ -370,7 +338,7 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     writer = threading.Thread(target=keep_writing, name=WORKER, daemon=True)
     writer.start()
     try:
-        for piece in chunks:
+        for piece in produce_chunks(compiled, chunks, advance):
             waiting.put(piece)
             if stop.is_set():
                 break
@@ -382,7 +350,5 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
             waiting.put(None, timeout=LAST)
         writer.join(LAST)  # computed chunks are written, running computations are abandoned
         raise
-    finally:
-        times.total += time.perf_counter() - start_time
     if failures:
         raise failures[0]

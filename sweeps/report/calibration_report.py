@@ -1,25 +1,22 @@
-"""Report of a calibration: adequacy, parameters, errors before and after, and their certainty."""
+"""Reports of calibrations: adequacy, parameters, errors and their certainty, and feedforward constants."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from calibration.data.columns import Layout
 from calibration.data.table import Runs
-from calibration.described import as_paragraph
+from calibration.described import as_paragraph, sentences
 from calibration.inference import blocks
-from calibration.inference.feedforward import Feedforward
-from calibration.inference.identifiability import HELD
-from calibration.inference.result import METHOD, CalibrationResult
+from calibration.inference.feedforward import Feedforward, constant_units, interval_95
+from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import fit_words
+from calibration.words import feedforward_words, fit_words
 from mmrjax.errors import count_noun
 from sweeps.pages import words
-from sweeps.report import catalogue, feedforward_report, fit_tables, run_tables
-from sweeps.report.document import Block, Document, Note, Section, Table, remarks
+from sweeps.report import catalogue, fit_tables, run_tables
+from sweeps.report.document import Block, Document, Figure, Note, Section, Table, remarks
 
 #: Prefixes of simulated readings of a log, and their names.
 LINES = {"after_": "calibrated", "before_": "before"}
@@ -30,12 +27,6 @@ def calibration_document(
 ) -> Document:
     """Report of a calibration. `robot_name` is the name or the file of the robot."""
     sized = Layout.of(found.robot).crosses_zero
-    chi, about = found.chi_square, found.identifiability
-    estimated = "" if chi.tests_adequacy else catalogue.text("calibration.estimated")
-    facts = catalogue.note(
-        "calibration.facts", count_noun(len(found), "row"), found.model, len(found.parameters), METHOD, chi.value,
-        chi.degrees_of_freedom, estimated, int(np.sum(about.singular_values > 1)), len(found.parameters), about.rank,
-    )  # fmt: skip
     search = Note(
         as_paragraph([found.starts.statement()]), "" if found.converged else "warn", "search", terminal=True
     )
@@ -55,15 +46,13 @@ def calibration_document(
             search,
             *run_tables.curve_warning(found.robot),
             *remarks(found.notes),
-            facts,
             catalogue.note("calibration.free"),
         ),
         (
-            Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),
             *_over_rows(found, sized),
-            *([feedforward_report.voltage_section(voltage_fit)] if voltage_fit is not None else []),
+            *([voltage_section(voltage_fit)] if voltage_fit is not None else []),
             *fit_tables.clusters_section(found.residual_clusters),
-            Section("How sure", tuple(_certainty(found))),
+            Section("Noise", tuple(_noise(found))),
             fit_tables.rows_section(table, found.channels, kinds, sized),
         ),
         brief=fit_words.brief_calibration(found),
@@ -98,8 +87,7 @@ def _errors(found: CalibrationResult) -> Table:
     return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)
 
 
-def _shifts(found: CalibrationResult) -> Iterable[Block]:
-    yield catalogue.figure("calibration.parameters", found, words=(HELD,))
+def _noise(found: CalibrationResult) -> Iterable[Block]:
     if found.tied:
         ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in found.tied.items())
         yield Note(f"Tied: {'; '.join(ties)}.")
@@ -108,31 +96,47 @@ def _shifts(found: CalibrationResult) -> Iterable[Block]:
 
 
 def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
-    """Sections: frequency response of a log, simulated against measured readings, residuals over each condition."""
+    """Sections: frequency response of a log, residuals over each condition."""
     table, panels = found.rows(), found.channels
     table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in panels}
     if found.axis:
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
         for figure in fit_tables.frequency_response(runs, panels, LINES):
             yield Section("Frequency response", (figure,))
-    unit = "the channel's unit, band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
-    figures = (
-        catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
-        catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
-    )  # fmt: skip
-    headings = "Parity", "Residuals against every condition"
-    yield from (Section(heading, (figure,)) for heading, figure in zip(headings, figures, strict=True))
+    figure = catalogue.figure("calibration.residuals", table, panels, along)
+    yield Section("Residuals against every condition", (figure,))
 
 
-def _certainty(found: CalibrationResult) -> Iterable[Block]:
-    if found.profiled:
-        yield catalogue.figure("calibration.profiles", found)
-    yield catalogue.figure("calibration.correlations", found)
-    weak = [
-        (value, " ".join(f"{x:+.2f} `{n}`" for n, x in parts.items()))
-        for value, parts in found.identifiability.weak_directions()
-    ]
-    if weak:
-        yield catalogue.note("calibration.weak-note")
-        yield catalogue.table("calibration.weak", weak)
+def feedforward_document(found: Feedforward) -> Document:
+    """Constants, gains, remarks and the two figures."""
+    units, t = constant_units(found.unit), found.tolerances
+    gains = [(*name.split("_"), x, units[name.split("_")[1]]) for name, x in found.gains.items()]
+    option_rows = (
+        f"Gains for tolerances of {t.position:g} {found.unit}, {t.velocity:g} {found.unit}/s and {t.effort:g} V, a "
+        f"period of {1000 * t.period:g} ms and a measurement delay of {1000 * (t.delay or 0):.3g} ms."
+    )
+    blocks: list[Block] = [_constants(found), *remarks(sentences(found.remarks))]
+    if gains:
+        blocks += [catalogue.table("feedforward.gains", gains), *remarks((option_rows,), "asked")]
+    return Document(
+        f"Feedforward of {'an' if found.mechanism[0] in 'ae' else 'a'} {found.mechanism} mechanism",
+        feedforward_words.feedforward_statement(found),
+        tuple(blocks),
+        (Section("Windows", _figures(found)),),
+    )
+
+
+def voltage_section(found: Feedforward) -> Section:
+    """The two voltage plots of a log and the constants of their lines, for other reports."""
+    return Section("Voltage against speed and acceleration", (*_figures(found), _constants(found)))
+
+
+def _figures(found: Feedforward) -> tuple[Figure, ...]:
+    return tuple(catalogue.figure(f"feedforward.{name}", found) for name in ("quasistatic", "dynamic"))
+
+
+def _constants(found: Feedforward) -> Table:
+    units = constant_units(found.unit)
+    rows = [(n, x, interval_95(x, found.sds[n])[1] - x, units[n]) for n, x in found.constants.items()]
+    return catalogue.table("feedforward.constants", rows)

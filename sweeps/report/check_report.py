@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
 from sweeps.pages import words
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table
-from sweeps.report.words.posture_words import Drawn
+from sweeps.report.document import Cell, Document, Note, Section, Table
 
 #: Number of missed requirements that the statement names.
 NAMED = 3
@@ -33,13 +32,11 @@ class CheckResult:
         asked: the requirements.
         robot: the robot.
         outcomes: one for each requirement, in order.
-        drawn: the robot in the posture of each geometric requirement, see `posture_words.of_requirements`.
     """
 
     asked: Requirements
     robot: Robot
     outcomes: tuple[RequirementOutcome, ...]
-    drawn: Mapping[str, tuple[Drawn, float, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def missed(self) -> list[RequirementOutcome]:
@@ -133,10 +130,7 @@ SHOWN = 3
 def check_document(found: CheckResult, robot_name: str, changes: bool = True) -> Document:
     """The report. `changes`: True if changes were searched for."""
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
-    margins = catalogue.figure("check.margins", found, finding=found.statement())
-    sections = [
-        Section("Requirements", (catalogue.note("check.corners"), requirements_sheet(found.outcomes)), "sheet")
-    ]
+    sections = []
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
     corners = [o.at for o in found.outcomes]
@@ -145,7 +139,7 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
         volts = float(robot.battery.voltage_no_load(0.0))
         figures.append(catalogue.figure("run.drive_plane", robot, volts, words=(volts,)))
     sections.append(Section("Motor and gear", tuple(figures)))
-    blocks: tuple[Block, ...] = (Note(lead, "lead"), margins, *_postures(found))
+    blocks = Note(lead, "lead"), requirements_sheet(found.outcomes), catalogue.note("check.corners")
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 
 
@@ -160,16 +154,6 @@ def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = 
         for o in outcomes
     ]  # fmt: skip
     return catalogue.table("check.requirements", rows, terminal=terminal)
-
-
-def _postures(found: CheckResult) -> tuple[Figure, ...]:
-    if not found.drawn:
-        return ()
-    names = ", ".join(
-        f"{requirement_label(o)} {reached_value_text(o)}" for o in found.outcomes if o.requirement.name in found.drawn
-    )
-    title = f"The robot from the side: {names}"
-    return (catalogue.figure("check.postures", found.drawn, finding=title),)
 
 
 def _changes(found: CheckResult) -> tuple[Note | Table, ...]:

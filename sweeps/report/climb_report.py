@@ -239,7 +239,7 @@ def _sections(found: ClimbResult) -> Iterable[Section]:
         for name, value in found.numbers().items()
     ]  # fmt: skip
     of_run = catalogue.table("climb.run", numbers)
-    yield Section("The run in numbers", (of_run,), "numbers")
+    yield Section("The run in numbers", (of_run, catalogue.note("climb.belts")), "numbers")
     if found.margins:
         rows = [(n.removeprefix("margin_"), 100 * value, OUTPUTS[n][1]) for n, value in found.margins.items()]
         shares = catalogue.table("climb.shares", rows)
@@ -248,9 +248,6 @@ def _sections(found: ClimbResult) -> Iterable[Section]:
         yield Section(
             "Derivatives", (_derivatives(found, found.along), catalogue.note("climb.slopes")), "derivatives"
         )
-    meanings = [(f"`{name}`", *about) for name, about in VERDICTS.items()]
-    verdicts = catalogue.table("climb.meanings", meanings)
-    yield Section("Verdicts", (verdicts, catalogue.note("climb.belts")), "verdicts")
 
 
 def _derivatives(found: ClimbResult, along: Along) -> Table:

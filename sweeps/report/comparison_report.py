@@ -131,21 +131,9 @@ def comparison_document(found: Comparison) -> Document:
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
-    parity = catalogue.figure(
-        "comparison.parity",
-        *table,
-        False,
-        finding="Simulated minus measured, on average: "
-        + "; ".join(
-            f"{c.label} {np.nanmean(e):+.1f} %"
-            for c in found.channels
-            if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
-        ),
-    )
     known_sd = any(np.isfinite(found.table.get(c.sd_column, [])).any() for c in found.channels)
     band = " Band: ±2 standard deviations of the readings." * known_sd
-    trend = _strongest_trend(found)
-    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=trend, more=band)
+    errors = catalogue.figure("comparison.errors", *table, found.over, more=band)
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -163,13 +151,11 @@ def comparison_document(found: Comparison) -> Document:
                 if name not in words.SETTLED
             ),
             _errors_table(found),
-            *([_both_robots(found)] if found.against else []),
             catalogue.note("comparison.errors-note"),
             *remarks(found.notes),
         ),
         (
             *_over_time(found),
-            Section("Parity", (parity,)),
             Section("Errors against conditions", (errors,)),
             Section("Rows", (_rows(found),)),
         ),
@@ -190,8 +176,7 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
         apart = {prefix: f"{name}, without the two samples after each step" for prefix, name in lines.items()}
         rows = [*fits.rows, *fit_tables.fits_of_runs(rest, found.channels, apart).rows]
         fits = dataclasses.replace(fits, rows=sorted(rows, key=lambda row: row[0]))
-    more = fit_tables.range_of_fits(fits, found.channels)
-    overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer, more=more)
+    overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer)
     return (Section("Over time", (overlay, fits)),)
 
 
@@ -226,12 +211,6 @@ def _second_robot(found: Comparison) -> str:
     return f"This robot and {found.against} on the same {count_noun(shared, 'row')}: {', '.join(parts)}."
 
 
-def _both_robots(found: Comparison) -> Table:
-    error_columns = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
-    rows = [(c.label, *found.rms_of_both[c.name]) for c in found.channels]
-    return catalogue.table("comparison.robots", rows, *error_columns)
-
-
 def _errors_table(found: Comparison) -> Table:
     rows = []
     groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one equals the total
@@ -257,20 +236,3 @@ def _rows(found: Comparison) -> Table:
         heads.append(Column("error", c.unit, f"{{:+.{c.resolution}f}}", c.label))
         cells += [measured, simulated, simulated - measured]
     return Table("rowtable", tuple(heads), list(zip(*cells, strict=True)), file="comparison.csv", wide=True)
-
-
-def _strongest_trend(found: Comparison) -> str:
-    """Channel and condition with the strongest correlation of errors."""
-    best, size = "No error depends on a condition", 0.0
-    headings = {column: heading for column, (heading, _) in condition_formats(found.table).items()} | dict(
-        found.over or {}
-    )
-    for c in found.channels:
-        error = found.table[f"error_{c.name}_percent"]
-        for column, heading in headings.items():
-            is_paired = np.isfinite(error) & np.isfinite(found.table[column])
-            x, y = found.table[column][is_paired], error[is_paired]
-            if is_paired.sum() > 2 and np.ptp(x) > 0 and np.ptp(y) > 0 and abs(r := np.corrcoef(x, y)[0, 1]) > size:
-                best = f"The error of {c.label} changes most with {heading} (correlation {r:+.2f}, n = {len(x)})"
-                size = abs(r)
-    return best

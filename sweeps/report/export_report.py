@@ -19,16 +19,11 @@ def export_document(found: Export) -> Document:
     usage = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
     fate_rows = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
     fates = catalogue.table("export.fates", fate_rows)
-    readings = catalogue.figure("export.readings", compared, finding=words.export_statement(found))
     sections = [
         Section("What the format represents", (fates, catalogue.note("export.kept")), "holds"),
         Section(
             "Errors",
-            (
-                _errors(found),
-                catalogue.note("export.rim", words.errors_title(found).capitalize()),
-                readings,
-            ),
+            (_errors(found), catalogue.note("export.rim", words.errors_title(found).capitalize())),
             "errors",
         ),
     ]

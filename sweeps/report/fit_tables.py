@@ -100,30 +100,12 @@ def frequency_response(runs: Runs, shown: Sequence[Channel], lines: Mapping[str,
     return [catalogue.figure("fit.frequency", runs, shown, lines)] * bool(swept)
 
 
-def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
-    """Sentence on the values of `fits_of_runs`: their range over the runs for each channel, for the first simulated
-    line.
-    """
-    first = [row[2:] for row in fits.rows if row[1] == fits.rows[0][1]]
-    ranges = []
-    for channel, values in zip(shown, np.array(first, float).T, strict=True):
-        if np.isfinite(values).any():
-            ends = dict.fromkeys(f"{end(values):.1f}" for end in (np.nanmin, np.nanmax))
-            ranges.append(f"{channel.label} {' to '.join(ends)} %")
-    return f" Fit of each run (100 %: exact, 0 %: no better than its mean): {', '.join(ranges)}."
-
-
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
     """Section on columns that the model does not use that correlate with residuals, if there are any."""
     if not clusters:
         return ()
     statements = (f"{c.statement}." for c in clusters)
-    return (
-        Section(
-            "Columns that the residuals depend on",
-            (*remarks(statements, "clusters"), catalogue.figure("fit.clusters", clusters)),
-        ),
-    )
+    return (Section("Columns that the residuals depend on", remarks(statements, "clusters")),)
 
 
 def rows_section(

@@ -15,7 +15,7 @@ from calibration.described import as_paragraph, describe
 from calibration.discovery.experiments import NONE
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference import bases, blocks
+from calibration.inference import blocks
 from calibration.inference.details import TimeStatistics
 from calibration.inference.fit_notes import Determination, remarks_with_codes
 from calibration.words import loop_words
@@ -31,8 +31,6 @@ from sweeps.report.fit_tables import Change
 NOTABLE = 0.05
 #: Distance of a fitted parameter from its stated value that the first screen states [prior sds].
 MOVED = 2.0
-#: Verdicts that leave something open.
-OPEN = ("open", "class", "undescribed", *WITHOUT_NAME)
 
 
 def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str, Change]) -> Document:
@@ -51,7 +49,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         (
             *remarks(shifts, "moved"),
             *_first_figure(found, table, changes),
-            _summary(found),
+            _errors(found),
             *([Note(rise, name="worse", terminal=True)] if rise else []),
             _advice(found),
             *remarks(added, "found"),
@@ -66,8 +64,7 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
     """Figure of the law that was found, on its readings. For logs or without a law: measured and simulated values."""
     if isinstance(found.detail, TimeStatistics):
         lines = _simulated_lines(found)
-        fits = fit_tables.range_of_fits(fit_tables.fits_of_runs(table, found.channels, lines), found.channels)
-        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement, more=fits)
+        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
     elif changes:
         name, change = next(iter(changes.items()))
         effect = next(e for e in found.effects if e.name == name)
@@ -133,41 +130,17 @@ def _arrow_cell(text: str, change: float) -> Cell:
     return Cell(f"{text} ↓", "good") if change < 0 else Cell(f"{text} ↑", "bad")
 
 
-def _summary(found: DiscoveryResult) -> Table:
-    """Table of errors as stated, refitted, and with the effects found, for fitted rows and for rows held out by the
-    first kind of block. Changes are marked if both lines have the same number of rows.
-    """
-    kind, unseen = next(iter(found.errors_held_out.items()), ("", ({}, {})))
-    total, before = len(found.runs), dict[str, tuple[float, int]]()
-    lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
-    if not found.refit_alone:
-        lines.append(("with the effects found", found.errors[1], unseen[1]))
-    rows = []
-    for row_label, seen_error, held_out_error in lines:
-        cells = []
-        for c, e in seen_error.items():
-            other = (
-                f" ({loop_words.percent_text(held_out_error[c])} %)"
-                if c in held_out_error and held_out_error[c]["rows"]
-                else ""
-            )
-            last, rows_before = before.get(c, (e["rms_percent"], e["rows"]))
-            change = e["rms_percent"] - last if rows_before == e["rows"] else 0.0
-            cells.append(_arrow_cell(f"{loop_words.percent_text(e)} %{other}", change) if e["rows"] else Cell("-"))
-        before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen_error.items()}
-        reached, also = (
-            max((int(e["rows"]) for e in errors_by_channel.values()), default=0)
-            for errors_by_channel in (seen_error, held_out_error)
-        )
-        rows.append((row_label, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
-    held_out = f", seen and (unseen, by {blocks.kind_in_words(kind)})" if kind else ""
-    heads = f"rms error{held_out}", *(f"{c.label} |" for c in found.channels)
-    return catalogue.table("loop.summary", rows, *heads, f"{_rows_are(found)} reached |")
+def _errors(found: DiscoveryResult) -> Table:
+    """Errors as given, of the refit and with the effects found, on fitted and on held-out rows."""
+    total, many = len(found.runs), not found.refit_alone
 
+    def reached(errors: Mapping[str, Mapping[str, Any]]) -> str:
+        return f"{max((int(e['rows']) for e in errors.values()), default=0)} of {total}"
 
-def held_out_table(found: DiscoveryResult) -> Table:
-    """Errors of the refit and with the effects found, for each kind of held-out block, with numbers of rows."""
-    total, many, rows = len(found.runs), not found.refit_alone, list[tuple[Any, ...]]()
+    given = found.errors_as_stated
+    rows: list[tuple[Any, ...]] = [
+        ("robot file as given", *map(loop_words.percent_text, given.values()), reached(given))
+    ]
     for kind, error_pair in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
         cells = []
@@ -176,9 +149,8 @@ def held_out_table(found: DiscoveryResult) -> Table:
             change = error_pair[1][c]["rms_percent"] - error_pair[0][c]["rms_percent"] if many else 0.0
             change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
             cells.append(_arrow_cell(" → ".join(texts), change_shown))
-        reached = max(int(e["rows"]) for e in error_pair[0].values())
         row_label = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
-        rows.append((row_label, *cells, f"{reached} of {total}"))
+        rows.append((row_label, *cells, reached(error_pair[0])))
     for kind in found.held_out_unpredictable:
         if kind not in found.errors_held_out:
             row_label = f"unseen: another {blocks.kind_in_words(kind)}"
@@ -220,71 +192,22 @@ def _advice(found: DiscoveryResult) -> Table:
     return catalogue.table("loop.advice", rows)
 
 
-def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
-    """Effects that were found, and an unnamed discrepancy, in words."""
-    rows = []
-    for e in found.to_json()["effects"]:
-        effect = next((x for x in found.effects if x.name == e["name"]), None)
-        plot_words = f"not in the library, plotted over {bases.variable_in_words(str(e.get('variable')))}"
-        lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
-        place = bases.place_in_words(e["balance"])
-        if effect is None:
-            alike = ", ".join(bases.place_in_words(b) for b in e["balances_alike"] if b != e["balance"])
-            rows.append((e["name"], kinds, place, plot_words, "-", lowers, e["p_value"], "a curve", alike))
-            continue
-        reason = loop_words.tentative_reason(found, effect)
-        rows.append(
-            (
-                f"{e['name']}\n({reason})" if reason else e["name"], kinds, place, e["equation"] or plot_words,
-                loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
-                reason or e["standing"],
-                loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
-            )
-        )  # fmt: skip
-    if rows:
-        yield catalogue.table("loop.effects", rows)
-        yield catalogue.note("loop.definitions")
-
-
-def _certainty(found: DiscoveryResult, missing: bool) -> Table:
-    """Table of verdict, adequacy, rows and prediction, each with the numbers behind it."""
-    (chi_before, chi_after), (before, after) = found.chi2_of_readings, found.chi2
-    chi = f"{chi_before:.0f} → {chi_after:.0f}" if missing else f"{chi_before:.0f}"
-    priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
-    adequate, level = bool(found.after.adequate), found.headline.level
-    unusable_count, set_aside = len(found.unusable), len(found.outliers)
-    aside = f"{unusable_count} without a result of the fitted model, {set_aside} set aside as outliers"
-    p = loop_words.p_value(found.before.p_value)
-    rows = [
-        (
-            Cell(catalogue.text(f"loop.verdict-{level}"), "fair" if level in OPEN else "good"),
-            f"family-wise p {p}, from {found.replicates} bootstrap tables",
-        ),
-        (
-            Cell("adequate" if adequate else "residuals exceed the noise", "good" if adequate else "fair"),
-            f"χ² of {found.readings} readings {chi} σ², with priors {priors} σ²",
-        ),
-        (
-            f"{int(found.included.sum())} of {len(found.runs)} {_rows_are(found)}",
-            aside if unusable_count or set_aside else "all used",
-        ),
-    ]  # fmt: skip
-    if missing and found.gain is not None:
-        better, error = found.gain.mean > 0, found.gain.se
-        spread = f" ± {error:.2f}" if np.isfinite(error) else ""
-        gain = f"log likelihood {found.gain.mean:+.2f}{spread} per held-out reading"
-        robot = f"robot.toml contains {'what was found' if found.written else 'the refit'}"
-        verb = "better" if better else "worse"
-        rows.append((Cell(f"predicts {verb} than the refit", "good" if better else "fair"), f"{gain}. {robot}"))
-    return catalogue.table("loop.certainty", rows)
+def _adequacy(found: DiscoveryResult, missing: bool) -> str:
+    """Sentences on the misfit before and after, and on the rows."""
+    (before, after), unusable_count = found.chi2_of_readings, len(found.unusable)
+    chi = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
+    verb = "are consistent with" if found.after.adequate else "exceed"
+    aside = f" ({unusable_count} without a result of the fitted model, {len(found.outliers)} set aside as outliers)"
+    return (
+        f"The residuals {verb} the noise (χ² of {found.readings} readings {chi} σ², {found.replicates} bootstrap "
+        f"tables). {int(found.included.sum())} of {len(found.runs)} {_rows_are(found)} are used"
+        f"{aside * bool(unusable_count or len(found.outliers))}."
+    )
 
 
 def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     """Sections on the certainty of the answer and its limits."""
-    reasons = {
-        "standing": loop_words.support_sentence(found),
-        "ruled_out": loop_words.sentence_on_ruled_out_effects(found),
-    }
+    standing = loop_words.support_sentence(found)
     also = [] if found.unnamed is None else [loop_words.proposed_formula(found.unnamed)]
     also += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
@@ -293,25 +216,12 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
     blocks = [
         Note(f"{_noise_alone(found)}{found.verdict_statement}", name="statement", terminal=True),
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
-        *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
+        *([Note(standing, name="standing", terminal=True)] if standing else []),
         *remarks(also, "also"),
-        *_effects_in_words(found),
-        _certainty(found, missing),
+        Note(_adequacy(found, missing), name="adequacy", terminal=True),
     ]
     yield Section("How certain the verdict is", tuple(blocks))
     yield Section("Before you use it", remarks(filter(None, notes)))
-    if found.resolved is not None:
-        d = found.resolved.to_json()
-        rows = [
-            (f"`{n}`", e["value"], e["sd"], e["unit"], "no" if e["held_by_prior"] else "yes")
-            for n, e in d["constants"].items()
-        ]
-        labels = {c.name: c.label for c in found.channels}
-        rms = "; ".join(f"{labels[c]} {e['before']:.2g} → {e['after']:.2g} %" for c, e in d["rms_percent"].items())
-        pairs = "; ".join(f"{a['a']} and {a['b']} ({a['correlation']:+.2f})" for a in d["alike"])
-        trade = catalogue.text("loop.alike", pairs) if pairs else ""
-        table = catalogue.table("loop.resolved_constants", rows)
-        yield Section("What the track model says", (table, catalogue.note("loop.resolved-errors", rms, trade)))
 
 
 def _sections(
@@ -330,10 +240,10 @@ def _sections(
     }
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    error_blocks: tuple[Block, ...] = held_out_table(found), catalogue.note("loop.fitted_again"), *in_units
-    yield Section("Errors on runs used in the fit, and on held-out runs", error_blocks)
+    yield Section("Errors", (catalogue.note("loop.fitted_again"), *in_units))
     yield from _certainty_sections(found, missing)
-    yield Section("Candidates", tuple(_candidates(found)))
+    candidates = tuple(_candidates(found))
+    yield from [Section("Candidates", candidates)] if candidates else []
     yield from [looked_for] if missing else []
     rows = [
         (
@@ -356,8 +266,6 @@ def _sections(
 def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
     verdict, detail = "none" if found.refit_alone else found.verdict, found.detail
     if isinstance(detail, TimeStatistics):
-        some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
-        yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
         lines = _simulated_lines(found)
         yield fit_tables.fits_of_runs(table, found.channels, lines)
         runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
@@ -378,7 +286,6 @@ def _blocks_of_missing_terms(
         names = ", ".join(detail.orders_unresolved)
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
-        yield catalogue.figure("loop.input_correlation", found.runs, table, found.channels, verdict)
     else:
         if run_tables.lost_by_load(found.robot) and found.robot.rig.imposed == "voltage":
             yield catalogue.figure("run.measured_drive_plane", found.robot, found.runs)
@@ -410,9 +317,7 @@ def _closed(found: DiscoveryResult, table: Columns) -> str:
 
 
 def _candidates(found: DiscoveryResult) -> Iterable[Block]:
-    """Section with the scores of all effects, and alternatives that explain the data."""
-    share, allowed = found.settings.shares["single"], found.settings.family_wise_error
-    yield catalogue.figure("loop.ladder", found, words=(100 * (1 - share), 100 * (allowed - share)))
+    """Section with alternatives that explain the data."""
     several = [(_named(a.effects), a.rise_chi2) for a in found.alternatives]
     curves = "; none of them is adequate, or curves explain the data better"
     sizes = [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible]
@@ -423,28 +328,17 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         )
         for h in found.hidden
     ]  # fmt: skip
-    candidate_rows = [
-        (
-            f"**{', '.join(a.effects)}**" if a.leads else ", ".join(a.effects), a.rise_chi2, a.rms_sigma,
-            *a.by_kind.values(), a.lost,
-        )
-        for a in found.alternatives_held_out
-    ]  # fmt: skip
-    kinds = (
-        []
-        if not candidate_rows
-        else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
-    )
-    tables: dict[str, tuple[str, Sequence[Any], Sequence[str], Names]] = {
-        "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
-        "hidden": ("hidden", hidden, (), ()),
-        "held": ("alternatives_held_out", candidate_rows, kinds, ()),
-        "implausible": ("implausible", sizes, (), ()),
+    tables: dict[str, tuple[Sequence[Any], Names]] = {
+        "alternatives": (several, (curves if found.verdict in WITHOUT_NAME else "",)),
+        "hidden": (hidden, ()),
+        "implausible": (sizes, ()),
     }
-    for above, (name, rows, more, values) in tables.items():
+    if any(rows for rows, _ in tables.values()):
+        yield catalogue.note("loop.definitions")
+    for name, (rows, values) in tables.items():
         if rows:
-            yield catalogue.note(f"loop.{above}-above", *values)
-            yield catalogue.table(f"loop.{name}", rows, *more)
+            yield catalogue.note(f"loop.{name}-above", *values)
+            yield catalogue.table(f"loop.{name}", rows)
 
 
 def _named(values: Mapping[str, float]) -> str:

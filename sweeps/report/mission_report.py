@@ -114,11 +114,11 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             *([] if is_complete else [endings]),
             *remarks(_charge_left(table)),
         ),
-        page_sections=lambda: _sections(file.robot, found, first_run, answer),
+        page_sections=lambda: _sections(file.robot, found, first_run),
     )
 
 
-def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterable[Section]:
+def _sections(robot: Robot, found: Missions, first: Json) -> Iterable[Section]:
     """Sections on the first run: over time, from above, energy and segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
     run_rows = found.course["run_id"] == name
@@ -150,10 +150,15 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
         f"{_NO_RETURN}. Driven motors first supply other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
-    energy = catalogue.figure(
-        "mission.energy", first, on_battery, robot.has_ground, finding=answer, words=source_name
-    )  # fmt: skip
-    yield Section("Where the energy goes", (energy,), "energy-section")
+    labels = words.sink_labels(robot.has_ground)
+    uses = [(label, float(first[f"energy_to_{name}_Wh"])) for name, label in labels.items()]
+    uses += [
+        ("kinetic energy at the end", float(first["energy_stored_Wh"])), ("returned to the source", returned_Wh)
+    ]  # fmt: skip
+    drawn = max(float(first["energy_drawn_Wh"]), 1e-12)
+    shares = [(label, energy, 100 * energy / drawn) for label, energy in uses if abs(energy) > 1e-5 * drawn]
+    energy = catalogue.table("mission.energy", shares), catalogue.note("mission.energy", *source_name)
+    yield Section("Where the energy goes", energy, "energy-section")
     yield Section(
         "Segments",
         (_segments(found, name, capabilities.inapplicable_columns(robot)), catalogue.note("mission.settles")),

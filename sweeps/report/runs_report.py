@@ -153,8 +153,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
     if history.reactions is not None:
         averaged = catalogue.text("runs.averaged", 1e3 * float(history.time[0, 1] - history.time[0, 0]))
     figure = catalogue.figure("runs.history", starts, more=averaged)
-    slip = catalogue.figure("runs.slip", starts)
-    yield Section("From standstill", (*cut, figure, starts_table(starts), slip), "history-section")
+    yield Section("From standstill", (*cut, figure, starts_table(starts)), "history-section")
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
@@ -192,9 +191,8 @@ def ripple_table(ripples: Sequence[Any]) -> Table:
 
 
 def _posture(stands: Postures, names: Sequence[str]) -> Section:
-    steps = [catalogue.figure("runs.steps", stands.over)] if len(names) == 1 else []
     table = posture_words.posture_table(stands, names)
-    return Section("Posture", (catalogue.figure("runs.posture", stands), *steps, table), "posture-section")
+    return Section("Posture", (catalogue.figure("runs.posture", stands), table), "posture-section")
 
 
 def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[Block]:

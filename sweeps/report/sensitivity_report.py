@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
-from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult, interactions
+from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from calibration.words import sensitivity_words
 from sweeps.pages.words import short_name
 from sweeps.report import catalogue, run_tables
@@ -64,7 +64,7 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
     for k, (name, study) in enumerate(found.outputs.items()):
         yield Section(study.row.label.capitalize(), (Note(_sentence(study, found)),), name, level=3)
         if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _any_influence(study):
-            folded = "tornado, shares, where" if k >= UNFOLDED else ""
+            folded = "tornado" if k >= UNFOLDED else ""
             yield Section("", tuple(_output(name, study, found)), folded=folded)
     if found.next_runs is not None:
         yield Section("What to measure next", tuple(_next_runs(found, found.next_runs)), "measure")
@@ -77,20 +77,12 @@ def _any_influence(study: OutputStudy) -> bool:
 
 
 def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable[Block]:
-    """Section on an output: tornado, indices, and certain interactions, the strongest first."""
+    """Figure of an output."""
     label = study.row.label
-    for kind in ("tornado", "indices"):
-        figure = catalogue.figure(
-            f"sensitivity.{kind}", study, found, finding=_sentence(study, found), words=(label.capitalize(),)
-        )
-        yield dataclasses.replace(figure, name=f"{kind}_{name}")
-    sure = [pair for pair in interactions(study, found.names) if pair.sure and pair.second >= NEGLIGIBLE / 2]
-    rows = [(" with ".join(p.pair), 100 * p.second, "{:.1f} to {:.1f}".format(*(100 * x for x in p.interval)))
-            for p in sure[:PAIRS]]  # fmt: skip
-    if rows:
-        yield dataclasses.replace(catalogue.table("sensitivity.pairs", rows), name=f"pairs_{name}")
-    elif study.second is not None:
-        yield catalogue.note("sensitivity.none")
+    figure = catalogue.figure(
+        "sensitivity.tornado", study, found, finding=_sentence(study, found), words=(label.capitalize(),)
+    )
+    yield dataclasses.replace(figure, name=f"tornado_{name}")
 
 
 def _sentence(study: OutputStudy, found: SensitivityResult) -> str:

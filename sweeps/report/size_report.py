@@ -1,16 +1,12 @@
-"""Report of `size`: the best design, its limits, the Pareto front, and the best design of each motor."""
+"""Report of `size`: the best design, the Pareto front, and the best design of each motor."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Iterable
-
-import numpy as np
 
 from calibration.data import Json, Names, writing
 from calibration.data.requirements_file import Requirements
-from calibration.sizing.chart import LIMITS, MarginChart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import SizedDesign, SizingResult
 from calibration.sizing.sheet import RequirementOutcome
@@ -18,7 +14,7 @@ from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 from sweeps.report import catalogue
 from sweeps.report.check_report import requirement_label, requirements_sheet
-from sweeps.report.document import Cell, Document, Figure, Note, Section, Table, columns
+from sweeps.report.document import Cell, Document, Note, Section, Table, columns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +27,6 @@ class SizeResult:
         sizing: result of the search.
         objectives: minimised numbers.
         outcomes: results of `check` for the best design, empty without one.
-        charts: limits over payload and slope, for the best design (if any) and for `robot`. Empty without a page.
     """
 
     asked: Requirements
@@ -39,7 +34,6 @@ class SizeResult:
     sizing: SizingResult
     objectives: Names
     outcomes: tuple[RequirementOutcome, ...]
-    charts: tuple[MarginChart, ...] = ()
 
     def statement(self) -> str:
         """The answer: the best design and its binding limits, or the nearest design and the limits that it misses."""
@@ -126,14 +120,12 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
     motors = _table("by_motor", found, s.motors.values(), "best design of each motor, the first five", terminal=True)
     designs = [f"{describe_design(f)} ({objective_text(f, s.objective)})" for f in s.alternatives]
     front_words = _front_in_words(found)
-    front = [
-        b for x in front_words for b in (Note(x, terminal=True), catalogue.figure("size.front", found, finding=x))
-    ]
+    front = [b for x in front_words for b in (Note(x, terminal=True), _table("front", found, s.front))]
     next_best = (f"Next best: {'. '.join(designs[:NEXT])}.",) if designs else ()
     return Document(
         "Sizing",
         found.statement(),
-        (Note(lead, "lead"), *_limits(found, robot_name), *front),
+        (Note(lead, "lead"), *front),
         (
             Section("Designs", (Note(about), *tables), "designs"),
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
@@ -167,23 +159,6 @@ def _table(
         for f in designs
     ]  # fmt: skip
     return Table(name, COLUMNS, rows, title, terminal=terminal, brief=range(min(SHOWN, len(rows))))
-
-
-def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
-    if not found.charts:
-        return ()
-    best = found.sizing.best
-    names = [] if best is None else [f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}"]
-    charts = dict(zip([*names, f"as it is: {robot_name}"], found.charts, strict=True))
-    alternative = "; ".join(f"{name}: {_share_within_limits(c)}" for name, c in charts.items())
-    return (catalogue.figure("size.limits", found, charts, finding=alternative),)
-
-
-def _share_within_limits(c: MarginChart) -> str:
-    """Share of a chart within all limits, and the most frequent nearest limit."""
-    (most, _), *_ = Counter(c.nearest.ravel().tolist()).most_common(1)
-    within = f"{100 * np.mean(c.margin >= 0):.0f} % of payloads up to {c.payload[-1]:.3g} kg and slopes up to "
-    return f"{within}{c.slope[-1]:.3g}° are within all limits, the nearest is mostly {LIMITS[most]}"
 
 
 def _front_in_words(found: SizeResult) -> Names:

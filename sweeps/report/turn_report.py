@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from calibration.data import Columns
 from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities.base import History
-from mmrjax.model.channels import SIDES
+from mmrjax.model.channels import SIDES, channels_named
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
@@ -48,15 +50,17 @@ def turn_document(
     robot, row = file.robot, {name: values[0] for name, values in run.items()}
     sides, going = sides_table(robot, row), turn_words.has_motion(row)
     sections = []
-    if sides.rows and history is None:
-        sections.append(Section("From above", (catalogue.figure("turn.circle", robot, row),)))
-    elif sides.rows:
-        sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, history),)))
+    if sides.rows and history is not None:
+        path = (np.asarray(history.reading[name])[0] for name in ("place_x", "place_y", "yaw"))
+        sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, *path),)))
     if history is not None:
-        sections.append(Section("Over time", (catalogue.figure("turn.course", history),)))
+        names = [f"motor_{what}_{side}" for what in ("current", "speed") for side in SIDES]
+        shown = channels_named((*names, "yaw_rate"))
+        rows = {c.column: np.asarray(history.reading[c.name])[0] / c.factor for c in shown}
+        rows["time_s"] = np.asarray(history.time)[0]
+        sections.append(Section("Over time", (catalogue.figure("turn.course", rows),)))
     elif turns is not None:
         sections.append(Section("Other turns", (catalogue.figure("turn.turns", turns, row),)))
-    assumed = catalogue.note("turn.grousers" if model == "track" else "turn.rigid")
     return Document(
         f"Turn of {run_headings(run)[0]}",
         turn_words.turn_answer(row, ended),
@@ -65,7 +69,7 @@ def turn_document(
             sides,
             *remarks([*(turn_words.turn_notes(robot, row) if going else []), *notes]),
         ),
-        (*sections, Section("What is assumed", (assumed,))),
+        tuple(sections),
     )
 
 

@@ -24,6 +24,10 @@ NOISE = ",".join(f"{name}={sd}{channels.find_channel(name).unit}" for name, sd i
 #: Of the truth: distance of the sides [m], φ_y/φ_x [-], height of the centre of mass, as the packaged robot's [m].
 WIDTH, LATERAL, HEIGHT = 0.236, 1.45, 0.0476
 VOLTAGES = (15.0, 24.0, 33.0)
+#: Of a log: samples of a turn, their distance [s], lag of all readings [s].
+HOLD, EVERY, LAG = 60, 0.02, 0.06
+#: Function of case, count and seed that returns columns.
+Columns = Callable[[str, int, int], dict[str, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +84,8 @@ def _circling(planted: Planted, drive: world.Inputs) -> world.Circling | None:
         world.ground = kept
 
 
-def rows(case: str, count: int = 40, seed: int = 0) -> dict[str, np.ndarray]:
-    """Columns of a table of a case."""
+def rows(case: str, count: int = 40, seed: int = 0, noise: float = 1.0) -> dict[str, np.ndarray]:
+    """Columns of a table of a case. `noise`: factor on the sds of the instruments."""
     random, planted = np.random.default_rng(seed), CASES[case]
     told, seen = [], []
     while len(told) < count:
@@ -102,13 +106,29 @@ def rows(case: str, count: int = 40, seed: int = 0) -> dict[str, np.ndarray]:
     columns |= {"payload_kg": 0.0, "slope_deg": 0.0, "duty_left": told[:, 1], "duty_right": told[:, 2]}
     for k, name in enumerate(SHOWN):
         channel = channels.find_channel(name)
-        columns[channel.column] = np.round(read[:, k] / channel.factor + SDS[name] * random.normal(size=count), 4)
+        columns[channel.column] = np.round(
+            read[:, k] / channel.factor + noise * SDS[name] * random.normal(size=count), 4
+        )
     return {name: np.broadcast_to(x, count) for name, x in columns.items()}
 
 
-def write(folder: Path, case: str, count: int = 40, seed: int = 0) -> tuple[Path, Path]:
-    """A table of a case, and the robot that its instruments belong to: the nominal one."""
-    columns = rows(case, count, seed)
+def log(case: str, count: int = 40, seed: int = 0) -> dict[str, np.ndarray]:
+    """Columns of a log that holds each turn of a case for `HOLD` samples. Readings follow with a lag."""
+    random, table = np.random.default_rng([seed, 1]), rows(case, count, seed, noise=0.0)
+    columns = {"time_s": np.round(EVERY * np.arange(count * HOLD), 4)}
+    columns |= {name: np.repeat(x, HOLD) for name, x in table.items()}
+    fades = np.exp(-EVERY * np.arange(HOLD) / LAG)
+    for name in SHOWN:
+        column = channels.find_channel(name).column
+        steps = np.diff(table[column], prepend=0.0)
+        late = columns[column] - np.outer(steps, fades).ravel()
+        columns[column] = np.round(late + SDS[name] * random.normal(size=len(late)), 4)
+    return columns
+
+
+def write(folder: Path, case: str, count: int = 40, seed: int = 0, form: Columns = rows) -> tuple[Path, Path]:
+    """A table or log of a case, and the robot that its instruments belong to: the nominal one."""
+    columns = form(case, count, seed)
     lines = [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
     table, robot = folder / f"{case}.csv", folder / "robot.toml"
     table.write_text("\n".join([",".join(columns), *lines]) + "\n")

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from calibration.data import Columns, Names
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite_or_zero
+from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
 from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.linear_rows import LinearRows, grid_of_effects
 from calibration.inference.observers.settled import SettledRuns
@@ -33,6 +33,7 @@ from calibration.inference.weak_form import (
     derivative_weights,
     disturbance_intensities,
 )
+from mmrjax.compile.compiling import compiled
 from mmrjax.effects.curve import WAYS
 from mmrjax.model import channels
 from mmrjax.model.params import Scalar
@@ -92,6 +93,9 @@ class Integrals(eqx.Module):
         """Mean of a quantity of the points in each window."""
         weight = np.asarray(self.weight)
         return np.sum(weight * x[np.asarray(self.index)], 1) / np.maximum(np.sum(weight, 1), 1e-300)
+
+
+_whitened = compiled(Integrals.__call__)
 
 
 class WindowsLinearization(Linearization):
@@ -192,7 +196,10 @@ def problem_of_windows(
     absent[list(places)] = False
     none = np.where((run < 0)[:, None] | absent, np.nan, 0.0)
     data = dataclasses.replace(data_from_readings(none, np.ones_like(none), size), centre=jnp.asarray(fit.centre))
-    reading_slopes = tuple(np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True))
+    finite = functools.partial(np.nan_to_num, posinf=0.0, neginf=0.0)
+    reading_slopes = finite([np.concatenate(x, 2) for x in zip(terms.by_balance, terms.by_reading, strict=True)])
+    errors = [x[..., None] for x in fit.read]
+    plain = [jnp.asarray(np.concatenate(x, 2)) for x in zip(errors, terms.by_z, terms.by_effects, strict=True)]
 
     def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
         factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
@@ -200,16 +207,13 @@ def problem_of_windows(
         arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
         integrals = Integrals(arrays[0], arrays[1], arrays[2], arrays[3], places, count)
 
-        def whole(f: Any, y: Any) -> np.ndarray:
-            return np.asarray(integrals(jnp.asarray(f), jnp.asarray(y))).reshape(-1, f.shape[-1])
-
-        errors = whole(fit.read.f[..., None], fit.read.y[..., None])[:, 0]
+        whitened = np.asarray(_whitened(integrals, *plain)).reshape(-1, plain[0].shape[2])
         prior = np.concatenate([np.zeros(len(run)), fit.origin - fit.centre])
-        jacobian = np.concatenate([whole(*terms.by_z), np.zeros((len(run), size)), np.eye(size)])
+        jacobian = np.concatenate([whitened[:, 1 : size + 1], np.zeros((len(run), size)), np.eye(size)])
         linear = WindowsLinearization(
-            jnp.asarray(np.concatenate([errors, prior])), jnp.asarray(jacobian),
-            finite_or_zero(jnp.asarray(whole(*terms.by_effects))), jnp.zeros((len(PROBED), 0)), data.weight,
-            jax.tree.map(jnp.asarray, terms.signals), integrals, finite_or_zero(jnp.stack(reading_slopes)),
+            jnp.asarray(np.concatenate([whitened[:, 0], prior])), jnp.asarray(jacobian),
+            jnp.asarray(finite(whitened[:, size + 1 :])), jnp.zeros((len(PROBED), 0)), data.weight,
+            jax.tree.map(jnp.asarray, terms.signals), integrals, jnp.asarray(reading_slopes),
             fit.rows.time, fit.rows.angle, jnp.asarray(run),
             channels=channels.channel_names(problem.channels), magnitudes=problem.base.rig.magnitudes,
         )  # fmt: skip
@@ -226,10 +230,10 @@ def problem_of_windows(
     table = {name: jnp.asarray(x) for name, x in columns(np.asarray(fit.rows.first)).items()}
     table |= {c.column: fit.rows.shown[:, k] for k, c in enumerate(problem.channels)}
     index, grid = grid_of_effects(effects)
+    conditions = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[middle]), fit.rows.conditions)
     observe = Windows(
-        jax.tree.map(lambda x: jnp.asarray(x)[middle], fit.rows.conditions), "drive", linear, jnp.asarray(fit.origin),
-        jnp.asarray(fit.z), width, index, grid, table,
-    )  # fmt: skip
+        conditions, "drive", linear, jnp.asarray(fit.origin), jnp.asarray(fit.z), width, index, grid, table
+    )
     return Problem(problem.base, problem.coordinates, observe, data), np.asarray(fit.rows.first)[middle]
 
 

@@ -36,18 +36,6 @@ const stack = () => document.querySelectorAll(".scroll > table").forEach(table =
 stack();
 addEventListener("resize", stack);
 addEventListener("toggle", stack, true);
-document.querySelectorAll("table").forEach((table, number) => {  // every table as CSV
-  const next = (table.closest(".scroll") || table).nextElementSibling;
-  if (table.rows.length < 3 || table.closest(".overlay") || next && next.querySelector("a.csv")) return;
-  const cell = text => /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
-  const link = Object.assign(document.createElement("a"), {className: "download", textContent: "CSV", href: "#", download: (table.id || `table-${number + 1}`) + ".csv"});
-  link.setAttribute("aria-label", "download this table as CSV");
-  link.addEventListener("click", () => {
-    const lines = [...table.rows].map(row => [...row.cells].flatMap(c => [cell(c.textContent.trim().replace("\u2212", "-")), ...Array(c.colSpan - 1).fill("")]).join(","));
-    link.href = URL.createObjectURL(new Blob(["\ufeff" + lines.join("\n") + "\n"], {type: "text/csv"}));
-  });
-  (table.closest(".scroll") || table).after(link);
-});
 const reading = document.body.appendChild(Object.assign(document.createElement("div"), {id: "reading", hidden: true}));
 document.querySelectorAll("svg[data-axes]").forEach(svg => {
   const all = JSON.parse(svg.dataset.axes);

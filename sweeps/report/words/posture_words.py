@@ -11,17 +11,12 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
-from calibration.sizing.sheet import RequirementOutcome
-from mmrjax.climbing import resting_posture, static_limits
+from mmrjax.climbing import static_limits
 from mmrjax.climbing.resting_posture import SideOutline
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import lever_angles
 from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from sweeps.report.document import Column, Table
-
-#: Angles of front and rear levers in the map of highest steps [deg].
-ANGLES = np.arange(-180.0, 181.0, 6.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,40 +37,19 @@ class Drawn:
 
 
 @dataclasses.dataclass(frozen=True)
-class StepMap:
-    """Highest step and tipping margin as functions of the lever angles.
-
-    Attributes:
-        angles_deg: angles of front and rear levers [deg].
-        step_mm, margin_mm: highest step, and margin at rest on the run's slope [mm], shape (front, rear).
-        best: posture with the highest step.
-        front_deg, rear_deg: angles of its levers.
-        own_deg: angles of the run, front and rear.
-    """
-
-    angles_deg: np.ndarray
-    step_mm: np.ndarray
-    margin_mm: np.ndarray
-    best: Drawn
-    front_deg: float
-    rear_deg: float
-    own_deg: tuple[float, float]
-
-
-@dataclasses.dataclass(frozen=True)
 class Postures:
     """Postures of the runs of a table.
 
     Attributes:
         table: columns of the postures.
         rest, step: posture of the first run at rest and on its highest step.
-        over: map of the first run.
+        best: highest step in any posture [m], and angles of front and rear levers there [deg], of the first run.
     """
 
     table: Columns
     rest: Drawn
     step: Drawn
-    over: StepMap
+    best: tuple[float, float, float]
 
 
 def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
@@ -105,53 +79,9 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     }
     first_conditions, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
     level = Drawn(side, float(rests.height[0]), 0.0, float(first_conditions.slope))
-    found, margin = jax.device_get(static_limits.steps_over_lever_angles(robot, first_conditions, ANGLES, ANGLES))
-    front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
-    best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
-    lever_degrees = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, first_conditions))
-    return Postures(
-        table,
-        level,
-        _on_step(step),
-        StepMap(
-            ANGLES,
-            found.height / MM,
-            margin / MM,
-            best,
-            float(ANGLES[front]),
-            float(ANGLES[rear]),
-            (lever_degrees[0], lever_degrees[1]),
-        ),
-    )
-
-
-def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dict[str, tuple[Drawn, float, float]]:
-    """Robot in the posture of each geometric requirement, by name, with the angles of its levers [deg].
-
-    On a step it is the best posture, over a gap the levers are flush with the belt, and for the size they are folded.
-    """
-    postures: dict[str, tuple[Drawn, float, float]] = {}
-    for outcome in outcomes:
-        name = outcome.requirement.name
-        if name not in ("step_mm", "gap_mm", "length_mm"):
-            continue
-        conditions = Conditions(outcome.at["configuration"], payload=outcome.at.get("payload_kg", 0.0)).resolved(
-            robot
-        )
-        if name == "step_mm":
-            step, front, rear = jax.device_get(static_limits.best_step(robot, conditions))
-            drawn = _on_step(step)
-        else:
-            front = rear = float(static_limits.flush_lever_angle(robot)) if name == "gap_mm" else np.pi
-            stands = static_limits.with_lever_angles(conditions, front, rear)
-            rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
-            drawn = Drawn(jax.device_get(side.with_pitch(rests.pitch)), float(rests.height), 0.0)
-        postures[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
-    return postures
-
-
-def _on_step(found: static_limits.StepLimit) -> Drawn:
-    return Drawn(found.side, float(found.base), float(found.height))
+    highest, front, rear = static_limits.best_step(robot, first_conditions)
+    best = float(highest.height), degrees * float(front), degrees * float(rear)
+    return Postures(table, level, Drawn(step.side, float(step.base), float(step.height)), best)
 
 
 #: Columns of the page's table: heading, format.
@@ -180,13 +110,13 @@ def posture_table(found: Postures, names: Sequence[str]) -> Table:
 
 def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
-    run, highest = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
+    run, (highest, front, rear) = {c: values[0] for c, values in found.table.items()}, found.best
     return (
         f"posture: pitch {run['pitch_deg']:z.1f}°, on {run['contact_mm']:.0f} mm, carried by {run['bears']}. It tips "
         f"on slopes of {run['tips_back_deg']:.1f}° uphill, {run['tips_forward_deg']:.1f}° downhill, "
         f"{run['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {run['highest_step_mm']:.0f} mm "
-        f"and gaps up to {run['widest_gap_mm']:.0f} mm. The highest step in any posture is {highest:.0f} mm (front "
-        f"{found.over.front_deg:g}°, rear {found.over.rear_deg:g}°)"
+        f"and gaps up to {run['widest_gap_mm']:.0f} mm. The highest step in any posture is {highest / MM:.0f} mm "
+        f"(front {front:.0f}°, rear {rear:.0f}°)"
     )
 
 

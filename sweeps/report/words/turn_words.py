@@ -48,34 +48,6 @@ def turn_under_equal_commands(robot: Robot, found: Result, value: float) -> str:
     return f"{alike}, the robot does not travel straight: {', '.join(told)} ({states} show it)" if told else ""
 
 
-def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
-    """Reason for a missing turn: the limit at full voltage, or no steady turn under friction.
-
-    Args:
-        speed: demanded speed [m/s].
-        rate: demanded yaw rate [rad/s].
-        speeds, rates: speeds and rates of settled turns at full voltage, from straight travel to the spot. NaN: no
-            steady turn.
-    """
-    known = np.isfinite(speeds) & np.isfinite(rates)
-    if not known.any():
-        return "and no turn settles even at the full supply voltage"
-    straight_speeds, round_ = np.abs(speeds[known]), np.abs(rates[known])
-    most_rate = np.interp(abs(speed), straight_speeds[::-1], round_[::-1], right=math.nan)
-    most_speed = np.interp(abs(rate), round_, straight_speeds, right=math.nan)
-    if most_rate >= abs(rate):
-        return "which would be enough, unless friction falls with sliding speed"
-    told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
-    told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
-    told += (
-        [f"no more than {straight_speeds.max():.3g} m/s in straight travel"] if not math.isfinite(most_rate) else []
-    )
-    told += (
-        [f"no more than {round_.max():.3g} rad/s when turning on the spot"] if not math.isfinite(most_speed) else []
-    )
-    return f"which gives {' and '.join(told)}"
-
-
 def has_motion(row: Json) -> bool:
     """True if a turn has a motion, settled or not."""
     return math.isfinite(float(row["yaw_rate_rad_s"])) and row["status"] in ("converged", "not_settled")
