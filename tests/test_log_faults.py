@@ -8,14 +8,16 @@ import pytest
 from test_log_kinds import carriage, servo, written
 from test_weak_form import RIG, motor
 
-from calibration.data import rig_facts, robot_file
+from calibration.data import invalid_readings, rig_facts, robot_file
 from calibration.data import runs as records
+from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration
 from calibration.inference.conduct import error_after_steps
+from mmrjax.model import channels
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,6 @@ SPEED, VOLTS = "motor_speed_rpm", "supply_voltage_V"
 
 
 @pytest.mark.parametrize("column, fault, words", [
-    (SPEED, held, "Empty these cells to use the other rows"),
     (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
     (VOLTS, constant, "12 V in every row"),
 ])  # fmt: skip
@@ -96,6 +97,26 @@ def test_rows_after_a_jump_of_the_clock_are_a_run_that_begins_at_their_readings(
     assert (runs.run_names == "part 2").tolist() == late.tolist()
     np.testing.assert_allclose(np.diff(runs["time_s"])[701:], np.diff(log["time_s"])[701:], atol=1e-6)
     assert runs["time_s"][700] == 0 and any("row 701, time_s" in n and "new run" in n for n in runs.notes)
+
+
+@pytest.mark.parametrize(("column", "left_out"), [(SPEED, 276), ("motor_current_A", 276), ("output_angle_deg", 0)])
+def test_readings_that_are_held_at_the_last_value_are_left_out(robot, column, left_out):
+    """The last 70 of 150 rows of each run repeat one reading, over steps of 1.8 to 15 V. An angle may rest."""
+    shown = tuple(channels.find_channel(n) for n in ("motor_speed", "motor_current", "output_angle"))
+    columns = motor()
+    columns["output_angle_deg"] = np.cumsum(columns[SPEED])
+    runs = Runs("log.csv", columns, layout=dataclasses.replace(Layout.of(robot), channels=shown))
+    assert invalid_readings.without_held(runs).notes == ()
+    faulty = dataclasses.replace(runs, columns={**columns, column: held(columns[column])})
+    found = invalid_readings.without_held(faulty)
+    lost = {c.column: np.isnan(found[c.column]) for c in shown}
+    assert {name: rows.sum() for name, rows in lost.items()} == dict.fromkeys(lost, 0) | {column: left_out}
+    assert lost[column].reshape(4, 150)[:, 81:].all() == bool(left_out)
+    (note,) = found.notes
+    assert note.startswith(
+        f"log.csv rows 531 to 600, {column}: the same reading while {VOLTS} changes, like repeats. "
+    )
+    assert note.endswith("Such rows are left out" if left_out else "Empty these cells to use the other rows")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.data import posterior_file as posteriors
 from calibration.data import robot_file
 from calibration.inference import priors
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.sensitivity import next_runs
 from calibration.sensitivity import uncertain_inputs as room
@@ -119,6 +120,8 @@ def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
     assert_allclose(sampled.value[:2], linear, atol=0.03)
     assert np.all(sampled.low[:2] <= linear + 0.01) and np.all(linear - 0.01 <= sampled.high[:2])
     assert not shares["sobol"].studied[3] and np.isnan(sampled.value[3]).all()
+    (left,) = remarks_with_codes(found["local"].remarks, "points_left_out")
+    assert (left.points, left.total) == (1, 4)
 
 
 @pytest.mark.slow

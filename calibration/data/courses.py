@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.runs import Runs
+from calibration.data.table import Runs
 
 #: Columns whose values may change between the samples of a run. A stated mass may change with the payload.
 CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode", "held")

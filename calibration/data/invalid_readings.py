@@ -1,17 +1,20 @@
-"""Readings that are none: computed torques, unread speeds, and rows beyond a limit of supply or driver."""
+"""Readings that are none: computed torques, unread speeds, repeats, and rows beyond a limit of supply or driver."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.contradictions import CURRENTS
+from calibration.data.courses import applied_drive
 from calibration.data.input_errors import BadData, rows_text
 from calibration.data.instruments import FEWEST, common_step
 from calibration.data.table import Runs
+from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.robot import Robot
 
 #: Fewest rows and distinct readings for which an exact line through all of them is no coincidence.
@@ -183,3 +186,47 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
         elif len(levels) > 2 and drive[top].max() > RISE * drive[top].min():
             is_limited[top[command[top] > levels[0]]] = True
     return is_limited
+
+
+#: Reading above which an angle is not at rest, as a share of its largest value. A reading is held if it stays the
+#: same over these shares of the run and of the imposed range. A smaller share suffices for an instrument that repeats
+#: few of its other readings, with the share of readings that differ from the one before.
+MOVES, HELD, SLIGHTLY, NOISY = 0.05, 0.1, 0.02, 0.8
+
+
+def drive_heading(runs: Runs) -> str:
+    """Name in the file of the column that drives the motors."""
+    column = "duty" if runs.has("duty") else runs.layout.imposed_column
+    return runs.headings.get(column, column)
+
+
+def without_held(runs: Runs) -> Runs:
+    """Log without repeats of the last speed or current while the imposed quantity changes, and a note on each channel
+    that has some. An angle may rest, so its repeats are only noted.
+    """
+    if not (runs.sampled and runs.has(runs.layout.imposed_column)):
+        return runs
+    columns, notes, drive = dict(runs.columns), dict[str, str](), np.nan_to_num(applied_drive(runs))
+    shown = [c for c in runs.channels if runs.has(c.column) and c.rests_on != VOLTAGE]
+    changing = [c for c in shown if np.ptp(np.nan_to_num(runs[c.column])) > 0]  # others are frozen from the start
+    for rows, channel in itertools.product(runs.rows_by_run().values(), changing):
+        column, readings = channel.column, runs[channel.column][rows]
+        rest = 0.0 if channel.settled else MOVES * np.nanmax(np.abs(readings), initial=0.0)
+        begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
+        lasts = np.diff(np.r_[begins, len(rows)])
+        is_long = lasts > HELD * len(rows)
+        noisy = np.mean(lasts[~is_long] == 1) > NOISY if not is_long.all() else False
+        for k in np.flatnonzero(is_long & (np.abs(readings[begins]) > rest)):
+            held = rows[begins[k] : begins[k] + lasts[k]]
+            if np.ptp(drive[held]) <= (SLIGHTLY if noisy else HELD) * np.ptp(drive):
+                continue
+            cure = "Empty these cells to use the other rows"
+            if channel.settled:
+                columns[column] = columns[column].copy()
+                columns[column][held[1:]] = np.nan
+                cure = "Such rows are left out"
+            notes[column] = (
+                f"{runs.source} rows {held[0] + 1} to {held[-1] + 1}, {runs.headings.get(column, column)}: the same "
+                f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
+            )
+    return dataclasses.replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))

@@ -12,6 +12,7 @@ from calibration.data import Names, rig_file
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
 from calibration.data.courses import applied_drive, changing_columns, intervals_by_run
 from calibration.data.input_errors import three_digits
+from calibration.data.invalid_readings import drive_heading
 from calibration.data.robot_file import RobotFile
 from calibration.data.row_checks import JUMP, time_constant
 from calibration.data.runs import Runs
@@ -334,7 +335,7 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     row = int(np.flatnonzero(limited)[0])
     return (
-        f"{runs.source} row {row + 1}, {_drive_heading(runs)}: commands {three_digits(drive[row])} V, but "
+        f"{runs.source} row {row + 1}, {drive_heading(runs)}: commands {three_digits(drive[row])} V, but "
         f"current and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the "
         f"log. Give the voltage that the driver applies, or limit the column to {three_digits(limit)} V"
     )
@@ -398,35 +399,8 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     )
 
 
-#: Reading above which a signal is not at rest, as a share of its largest value. A reading is held if it stays the
-#: same over these shares of the run and of the imposed range. Share of power of either sign that indicates swapped
-#: signs.
-MOVES, HELD, SWAPPED = 0.05, 0.1, 0.3
-
-
-def _drive_heading(runs: Runs) -> str:
-    column = "duty" if runs.has("duty") else runs.layout.imposed_column
-    return runs.headings.get(column, column)
-
-
-def held_sentence(runs: Runs) -> str:
-    """Sentence on readings that repeat their last value while the imposed quantity changes, empty for others."""
-    if not (runs.sampled and runs.has(runs.layout.imposed_column)):
-        return ""
-    drive = np.nan_to_num(applied_drive(runs))
-    range_ = float(np.ptp(drive))
-    for rows in runs.rows_by_run().values():
-        for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
-            begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
-            for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
-                moves = abs(readings[begin]) > MOVES * np.nanmax(np.abs(readings), initial=0.0)
-                if moves and end - begin > HELD * len(rows) and np.ptp(drive[rows[begin:end]]) > HELD * range_ > 0:
-                    column, last_row = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
-                    return (
-                        f"{runs.source} rows {rows[begin] + 1} to {last_row}, {column}: the same reading while "
-                        f"{_drive_heading(runs)} changes, like repeats. Empty these cells to use the other rows"
-                    )
-    return ""
+#: Share of power of either sign that indicates swapped signs.
+SWAPPED = 0.3
 
 
 def swapped_sentence(runs: Runs) -> str:
@@ -452,7 +426,7 @@ def swapped_sentence(runs: Runs) -> str:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is opposite to "
-                    f"{_drive_heading(runs)}. Correct one part"
+                    f"{drive_heading(runs)}. Correct one part"
                 )
     return ""
 
@@ -463,7 +437,6 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
         jitter_sentence(runs),
         saturation_sentence(runs),
         constant_conditions_sentence(runs),
-        held_sentence(runs),
         swapped_sentence(runs),
         doubtful_time(runs, robot),
         doubtful_current(runs, robot),

@@ -30,7 +30,7 @@ from calibration.data import (
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.invalid_readings import drop_computed_torques, without_unread
+from calibration.data.invalid_readings import drop_computed_torques, without_held, without_unread
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
 from calibration.data.sources.columnar import EXPECTED
@@ -188,7 +188,7 @@ def runs_of_arrays(
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
         runs = contradictions.check_contradictions(runs, robot)
-        runs = drop_computed_torques(without_unread(runs, robot), robot)
+        runs = drop_computed_torques(without_held(without_unread(runs, robot)), robot)
     return runs
 
 
