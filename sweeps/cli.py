@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import functools
 import importlib
 import inspect
@@ -563,19 +562,12 @@ def _prepare_environment(resolved: Any, no_cache: bool = False) -> None:
 OF_LOOP = ("xla_cpu_small_while_loop_byte_threshold=1000000", OLDER_EMITTERS)
 
 
-#: Parameter of `mallopt`, and its value: from this size on memory returns to the system when it is freed [bytes]. By
-#: default glibc raises it to 32 MB, and arrays of a log then leave gaps: 0.2 of 1.7 GB on 20 000 rows.
-MMAP_THRESHOLD, LARGE = -3, 1 << 20
-
-
 def _start_jax(no_cache: bool, flags: Names = (), options: Names = ()) -> None:
     """Import jax with double precision, XLA flags and the compilation cache, unless `no_cache`.
 
     Compiler options are added to that of `SOUND_AT_LEVEL_0`.
     """
     _refuse_little_memory()
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # glibc alone
-        ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, LARGE)
     if "jax" not in sys.modules:  # which takes it when it starts
         flags = ",".join((SOUND_AT_LEVEL_0, *options)), *flags
     if flags:

@@ -134,18 +134,25 @@ def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_
 
 
 def test_a_thinned_log_takes_the_mean_of_its_current_and_fewer_steps(tmp_path):
-    """The current changes in each of 4000 rows. It moves the load by as much at each reading that is kept."""
+    """The current changes in each of 4000 rows. It moves the load by as much, and as far, at each reading that is kept."""
     rng, time = np.random.default_rng(4), np.arange(4000) * 1e-3
     current = 1.6 * np.sin(5 * time) + 0.4 * np.sin(40 * time) + 0.05 * rng.standard_normal(len(time))
     current[2500:] += 1.0  # a jump, whose row stays
-    columns = {"time_s": time, "motor_current_A": current, "position_mm": np.zeros(len(time))}
+
+    def travelled(times, amperes):
+        """Charge [A·s] and its integral [A·s²] at each instant, of a current that is held from one to the next."""
+        lasts = np.diff(times)
+        charge = np.append(0.0, np.cumsum(amperes[:-1] * lasts))
+        return charge, np.append(0.0, np.cumsum(charge[:-1] * lasts + amperes[:-1] * lasts**2 / 2))
+
+    wanted = travelled(time, current)
+    columns = {"time_s": time, "motor_current_A": current, "position_mm": 1e3 * wanted[1]}
     robot = written(tmp_path, "carriage", columns)
     runs = records.read_runs(tmp_path / "log.csv", robot=robot).of(robot)
     thinned = thin_rows(runs, 500)
     brief = observers.Histories.of(thinned, robot)
     times, amperes = np.asarray(brief.times[0]), np.asarray(brief.conditions.motor_current[0])
-    assert len(times) < 0.4 * len(time) and 2.5 in times
-    moved = np.append(0.0, np.cumsum(amperes[:-1] * np.diff(times)))
-    wanted = np.append(0.0, np.cumsum(current[:-1] * np.diff(time)))
-    at = np.searchsorted(times, thinned["time_s"])
-    np.testing.assert_allclose(moved[at], wanted[np.searchsorted(time, thinned["time_s"] - 1e-9)], atol=1e-6)
+    assert len(times) < 0.6 * len(time) and 2.5 in times
+    rows = np.searchsorted(time, thinned["time_s"] - 1e-9)
+    for simulated, true, error in zip(travelled(times, amperes), wanted, (2e-4, 2e-6), strict=True):
+        np.testing.assert_allclose(simulated[np.searchsorted(times, thinned["time_s"])], true[rows], atol=error)

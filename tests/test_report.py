@@ -208,7 +208,7 @@ def driven(robot, tmp_path_factory):
 @pytest.mark.slow
 def test_report_shows_the_runs_own_history_with_its_peak(driven):
     folder, page, batch = driven
-    assert drawn(page) == {"drive_chart", "history", "power"} and outside(folder) == []
+    assert drawn(page) == {"history", "power", "drive_chart"} and outside(folder) == []
     rows = Tables(page).tables["starts"][2:]
     assert [row[0] for row in rows] == ["6T2A, 33 V, 0 kg, 5°", "6T2A, 33 V, 0 kg, 25°", "4W2T, 0.3 V, 0 kg, 5°"]
     assert [row[1] for row in rows] == ["settled", "slides", "stands"]

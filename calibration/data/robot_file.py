@@ -260,9 +260,10 @@ def _robot_before_parameters(
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     file_values = dict(_flatten(content))
     parameters = params.parameters_by_name(robot)
-    resistance = file_values.get("motor.resistance")
+    resistance = file_values.get("motor.resistance", float(robot.motor.resistance))
     if isinstance(resistance, int | float):
-        robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
+        time_constant = rig_file.WINDING_AT_ONCE if rig.imposed == "motor_current" else rig_file.WINDING
+        robot = params.replace(robot, {"motor.inductance": params.as_float(time_constant * resistance)})
     for name in file_values:
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")

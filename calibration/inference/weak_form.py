@@ -48,6 +48,7 @@ from calibration.inference.shown_states import (
     with_condition,
 )
 from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.compile.programs import return_memory
 from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
 from mmrjax.model.chassis import inertia_reduced
@@ -617,6 +618,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
     z = centre
     try:
         for _ in range(ROUNDS):
+            return_memory()  # terms of a long log
             terms_at_fit = of(z)
             regression = least_squares(
                 lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1:], method="lm",  # noqa: B023

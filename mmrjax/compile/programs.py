@@ -91,9 +91,14 @@ def compile_with_options(lowered: Any, options: dict[str, Any]) -> Any:
         lowered: result of `jax.jit(function).lower`.
     """
     program = lowered.compile({name: value for name, value in options.items() if _is_supported(name, value)})
-    with contextlib.suppress(AttributeError, TypeError):  # glibc alone keeps what a compilation frees: up to 200 MB
-        ctypes.CDLL(None).malloc_trim(0)
+    return_memory()
     return program
+
+
+def return_memory() -> None:
+    """Returns freed memory to the system. glibc alone keeps it: up to 200 MB after a compilation."""
+    with contextlib.suppress(AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @functools.cache

@@ -137,6 +137,9 @@ ELASTIC = 0.2
 #: For a thinned log: least number of steps between readings; largest growth of steps with the time since a condition
 #: changed [1/s · s]; change of the supply that counts, as a share of its largest value.
 BETWEEN, LATER, SMALL = 4, 0.05, 0.05
+#: Share of a run's largest speed below which an imposed current is not averaged. A mean across a stop or a breakaway
+#: leaves it with another speed.
+RESTS = 0.1
 #: The same number for a log with imposed speed, and its longest step in usual longest steps.
 COARSELY, SLOWLY = 2, 4
 #: Change of a speed from the third to the last quarter of an interval, as a share, above which it has not settled.
@@ -301,7 +304,9 @@ class Histories(Observer):
         longest_steps = _longest_steps(runs, robot)
         if smooth:
             noted = [
-                n | _begins_new_step(whole_log["time_s"][rows], n)
+                _begins_new_step(
+                    whole_log["time_s"][rows], n | np.append(_near_rest(whole_log, robot, rows, RESTS), True)
+                )
                 for n, rows in zip(noted, rows_of_whole, strict=True)
             ]
             whole_log = _average_imposed_current(whole_log, rows_of_whole, noted)
@@ -722,12 +727,13 @@ class Histories(Observer):
     def number_of_scan_points(self, problem: Problem, k: int) -> int:
         """Number of values of a scan.
 
-        A delay has a spacing of at most half a current's rise time L/R or an eighth of a sample, within `DELAYS`.
+        A delay has a spacing of at most an eighth of a sample, within `DELAYS`. If the log shows the voltage, the
+        spacing is also at most half a current's rise time L/R.
         """
         if problem.coordinates.names[k] != DELAY:
             return SCANNED
         motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
-        rise = float(motor.inductance) / float(motor.resistance)
+        rise = float(motor.inductance / motor.resistance) if problem.base.rig.shows_voltage else np.inf
         fine = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
         steps_needed = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
         return int(2 ** np.clip(np.ceil(np.log2(steps_needed)), *np.log2(DELAYS)))
@@ -1048,19 +1054,29 @@ def _drive_changes(runs: Runs, rows: np.ndarray, share: float) -> np.ndarray:
 
 
 def _begins_new_step(time: np.ndarray, noted: np.ndarray) -> np.ndarray:
-    """True for rows that divide the time between noted rows into parts of at most the usual longest step."""
+    """True for noted rows and rows that divide the time between them into parts of at most the usual longest step."""
     begin = time[np.maximum.accumulate(np.where(noted, np.arange(len(time)), 0))]
     part = np.floor((time - begin) / (FAST * LONGEST) + 1e-9)
-    return np.diff(part, prepend=0.0) > 0
+    return noted | (np.diff(part, prepend=0.0) > 0)
 
 
 def _average_imposed_current(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray]) -> Runs:
-    """Runs whose imposed current is averaged between noted rows. The mean moves the load by the same amount."""
+    """Runs whose imposed current is averaged between noted rows.
+
+    The means change the load's speed by the same amount. A small charge moves from each mean to the next one, so that
+    the load also travels as far.
+    """
     column, time = runs.layout.imposed_column, runs["time_s"]
     drive = runs[column].copy()
     for rows, begins in zip(each, noted, strict=True):
         lasts, first = np.diff(time[rows], append=time[rows[-1]]), np.flatnonzero(begins)
-        total, span = (np.add.reduceat(x, first) for x in (drive[rows] * lasts, lasts))
+        middle, charge = time[rows] + lasts / 2, drive[rows] * lasts
+        total, span, moment, middles = (
+            np.add.reduceat(x, first) for x in (charge, lasts, charge * middle, lasts * middle)
+        )
+        centre = middles / np.where(span > 0, span, 1.0)
+        moved = (total * centre - moment)[:-1] / np.where(span[1:] > 0, np.diff(centre), np.inf)
+        total += np.append(moved, 0.0) - np.append(0.0, moved)
         mean = np.where(span > 0, total / np.where(span > 0, span, 1.0), drive[rows[first]])
         drive[rows] = mean[np.cumsum(begins) - 1]
     return dataclasses.replace(runs, columns={**runs.columns, column: drive})
@@ -1076,23 +1092,35 @@ def _usual_interval(apart: np.ndarray) -> float:
     return float(np.median(apart)) if len(apart) else np.inf
 
 
+def _near_rest(runs: Runs, robot: Robot, rows: np.ndarray, share: float) -> np.ndarray:
+    """True between rows of a run where it may pass through rest, and earlier by the largest delay of the rig.
+
+    There the measured speeds, or the rates of measured angles and positions, are below a share of their largest or
+    change their sign. All True if no reading can tell.
+    """
+    channels = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
+    rates = [k for k, channel in enumerate(channels) if not runs.channels[channel].settled]
+    speeds, time = runs.measured()[rows][:, channels], runs["time_s"][rows]
+    speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+        is_moving = np.abs(speeds) > share * np.nanmax(np.abs(speeds), 0, initial=0.0)
+    ways = np.where(is_moving, np.sign(speeds), 0.0)
+    slow = ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
+    early = DELAYED * np.max(np.asarray(robot.rig.delay)) + EARLIER.get(robot.rig.imposed, 0.0)
+    early_steps = int(np.ceil(early / _usual_interval(np.diff(time))))
+    return np.convolve(slow, np.ones(early_steps + 1))[early_steps:] > 0
+
+
 def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     """Longest allowed step after each row of a log except the last, for each run in order of their names [s].
 
     With an imposed speed, only the memory of effects is simulated. If the command of a run changes its sign, and
     shafts and load do not move as one, friction jumps when a speed passes through zero. Steps must then be short
-    compared with the time between readings: near each such passage, and earlier by the largest delay of the rig. A
-    passage is where the measured speeds, or the rates of measured angles and positions, are low or change their sign.
-    Without such readings it may be anywhere.
+    compared with the time between readings near each such passage.
     """
     whole_log, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
-    motion_channels = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
-    measured, rates = (
-        whole_log.measured()[:, motion_channels],
-        [k for k, at in enumerate(motion_channels) if not runs.channels[at].settled],
-    )
-    driven = None if exact else applied_drive(whole_log)
-    early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
+    driven, found = None if exact else applied_drive(whole_log), []
     output_inertia = robot.motor.inertia * robot.gearbox.ratio**2
     elastic = (
         max(float(load.frequency(output_inertia)) for _, load in robot.configurations.items()) if robot.loose else 0.0
@@ -1110,16 +1138,7 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             time_in_run = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * time_in_run[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
-            speeds = measured[rows]
-            speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            # True between rows where a run may pass through rest. All True if no reading can tell.
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-                is_moving = np.abs(speeds) > SLOW[rig.imposed] * np.nanmax(np.abs(speeds), 0, initial=0.0)
-            ways = np.where(is_moving, np.sign(speeds), 0.0)
-            slow = ~np.any((ways[1:] == ways[:-1]) & (ways[1:] != 0), 1)
-            early_steps = int(np.ceil(early / _usual_interval(row_steps)))
-            slow = np.convolve(slow, np.ones(early_steps + 1))[early_steps:] > 0
+            slow = _near_rest(whole_log, robot, rows, SLOW[rig.imposed])
             longest[slow] = min(LONGEST, wait / FINE)
         if elastic > 0:
             longest = np.minimum(longest, ELASTIC / elastic)
