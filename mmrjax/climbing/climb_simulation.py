@@ -513,7 +513,7 @@ def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Foo
 
 
 class VerdictState(eqx.Module):
-    """State from which the verdict follows: the verdict and its time.
+    """State of the verdict: the verdict and its time.
 
     It also has the furthest position, its time, and the shaft angle since then.
     """

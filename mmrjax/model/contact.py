@@ -9,7 +9,7 @@ from mmrjax.model.params import Scalar, parameter
 from mmrjax.numerics.trigonometry import sine_third
 
 _SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with the adhesion of Table 5"
-_PACKAGE = "10 V_s, as in the multibody package of ref. [48]; the paper prints none"
+_PACKAGE = "10 V_s, as in the multibody package of ref. [48]. The paper prints none"
 
 
 def cubic_step(x: Scalar, x0: Scalar, y0: Scalar, x1: Scalar, y1: Scalar) -> Scalar:
@@ -39,7 +39,7 @@ class Friction(eqx.Module):
         "Table 5, φ_x on lacquered wood (surface of the bench)", relative_sd=0.3,
     )  # fmt: skip
     dynamic: Scalar = parameter(
-        None, "-", "dynamic coefficient μ_d", (0.005, 3.0), "assumed 0.8 of μ_s; the paper prints none",
+        None, "-", "dynamic coefficient μ_d", (0.005, 3.0), "assumed 0.8 of μ_s. The paper prints none",
         relative_sd=0.3,
     )  # fmt: skip
     speed_static: Scalar = parameter(

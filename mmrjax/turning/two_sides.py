@@ -70,7 +70,7 @@ class Turning(eqx.Module):
     )  # fmt: skip
     rule: Scalar = parameter(
         1.0, "-", "rule of the direction of friction, a: 1 along (φ_x u_x, φ_y u_y), 2 maximum dissipation",
-        (0.0, 3.0), "assumed; the paper has no lateral sliding", sd=0.5,
+        (0.0, 3.0), "assumed. The paper has no lateral sliding", sd=0.5,
     )  # fmt: skip
     inertia: Scalar = parameter(
         0.2, "kg·m^2", "moment of inertia in yaw J_ψ of the robot without payload", (0.0, 1e4),

@@ -23,7 +23,7 @@ class Levers(eqx.Module):
 
     roller: Scalar = parameter(
         13.5e-3, "m", "radius of the roller at a lever's tip over the grousers of its track", (1e-3, 0.5),
-        "Table 6, d/2; with the resulting pitch radius of 8 mm, the track of 112 teeth closes to 0.4 mm",
+        "Table 6, d/2. With the resulting pitch radius of 8 mm, the track of 112 teeth closes to 0.4 mm",
         relative_sd=0.05,
     )  # fmt: skip
     worm_ratio: Scalar = parameter(
@@ -31,7 +31,7 @@ class Levers(eqx.Module):
     )
     worm_efficiency: Scalar = parameter(
         0.5, "-", "efficiency of the worm gear, driven by its worm; self-locking up to 0.5", (0.05, 0.99),
-        "Fig. 5b, without a table; single-start worm: 0.4-0.6", sd=0.15,
+        "Fig. 5b, without a table. Single-start worm: 0.4-0.6", sd=0.15,
     )  # fmt: skip
     planetary_ratio: Scalar = parameter(
         23.04, "-", "ratio of the planetary gear between motor and worm", (1.0, 1e4),
@@ -134,7 +134,7 @@ class RunningGear(eqx.Module):
     )  # fmt: skip
     contact_exponent: Scalar = parameter(
         1.5, "-", "exponent e of the contact force, eq. (27)", (1.0, 3.0),
-        "elastic bodies (Hertz 1881); the paper says e > 1 is hard contact", relative_sd=0.1,
+        "elastic bodies (Hertz 1881). The paper says e > 1 is hard contact", relative_sd=0.1,
     )  # fmt: skip
     contact_damping: Scalar = parameter(
         300.0, "N·s/m", "damping b_max of a grouser or wheel on the ground, eq. (27)", (0.0, 1e5),

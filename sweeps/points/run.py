@@ -45,7 +45,7 @@ PARTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
-    """Result of a command that simulates, from which all its files are written.
+    """Result of a command that simulates. All its files are written from it.
 
     Attributes:
         command: name of the command.
