@@ -207,6 +207,11 @@ def test_missing_effect_file_is_refused(tmp_path):
         effect_file.effect_library([tmp_path / "none.py"])
 
 
+def test_an_effect_may_read_the_torque_that_the_gearbox_transmits():
+    """The check compared the first guess of that torque with the final one."""
+    effect_file._check_effect(Path("library"), BY_NAME["gear_load_loss"])
+
+
 @pytest.mark.slow
 def test_packaged_effects_pass_the_users_checks():
     for effect in BY_NAME.values():

@@ -63,7 +63,7 @@ def readable_signals(
     order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
-    return signals_read[0]
+    return signals_read[-1]  # at the torque that a gearbox really transmits, which is iterated
 
 
 #: Effects by name, as in robot files and on the command line.
