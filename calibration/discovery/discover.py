@@ -291,7 +291,8 @@ class LoopInput:
             base_input = dataclasses.replace(self, others=others if ahead else None, later=[], begin=begin)
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
             if not self.shows_unmodelled_backlash and screened.base.space.bare.observe.long:
-                settled = None if screened.base.candidate.converged else self.trace_settled()
+                described = begin is not None or screened.base.candidate.converged
+                settled = None if described else self.trace_settled()
                 return settled or _trace_readings(self, screened, sds, bool(ranked) or begin is not None)
             screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
