@@ -72,7 +72,8 @@ def seen(request, runs):
         z = np.zeros(space.free)
         posed, scored_ = space.bare, space.library.scored
         linear = jax.jit(lambda z: posed.observe.linearise(posed, z, posed.data, scored_))(jnp.asarray(z))
-    return SimpleNamespace(runs=runs, space=space, problem=space.bare, z=jnp.asarray(z), linear=linear)
+    problem = jax.device_put(space.bare)  # arrays of NumPy cannot be constants of a compiled program
+    return SimpleNamespace(runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=linear)
 
 
 @pytest.fixture(scope="module")
