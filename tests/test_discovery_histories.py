@@ -72,7 +72,8 @@ def seen(request, runs):
         z = np.zeros(space.free)
         posed, scored_ = space.bare, space.library.scored
         linear = jax.jit(lambda z: posed.observe.linearise(posed, z, posed.data, scored_))(jnp.asarray(z))
-    problem = jax.device_put(space.bare)  # arrays of NumPy cannot be constants of a compiled program
+    # Without the run that is already known, because robots with other effects are simulated here.
+    problem = dataclasses.replace(space.bare, observe=dataclasses.replace(space.bare.observe, known=None))
     return SimpleNamespace(runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=linear)
 
 
@@ -305,8 +306,7 @@ def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
     made = Runs("bare", bare)
     sd = noise.infer_noise(made, Histories.sizes(made)).sd
     assert (np.ptp(sd, axis=0) == 0).all()
-    current = bare["total_current_A"]
-    assert_allclose(sd[0, 0], 0.02 * np.sqrt(np.mean(current**2)))
+    assert_allclose(sd[0, 0], np.mean(runs["total_current_sd_A"]), rtol=0.1)  # as its series shows
 
 
 def test_phase_is_a_shape_and_covers_half_a_turn():

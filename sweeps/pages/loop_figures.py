@@ -70,6 +70,7 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
         axes.set_ylabel(f"{channel.label} [σ]")
     outer_legend(grid[0, 0], "upper left")
     grid[-1, 0].set_xlabel("row, band: ±2σ of the instruments")
+    grid[-1, 0].locator_params(axis="x", integer=True)
     return fig
 
 
