@@ -103,8 +103,8 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
             "an official division into training and test data (Janot, Gautier and Brunot 2019). "
             "`python benchmarks/emps.py --data DIR` made this page. The loop does not see `test.csv`. "
             "Its windows leave out speeds below 2 % of the largest, a limit set on generated logs. With 1, 2, 3 and "
-            "4 %, the error on `test.csv` is 8.7, 4.1, 6.9 and 6.8 mm. Errors of an earlier version (4.6, 3.7, 3.8 and "
-            "7.6 mm) were known when the limit was set.\n",
+            "4 %, the error on `test.csv` is 8.7, 4.1, 6.9 and 6.8 mm. Errors of an earlier version (4.6, 3.7, 3.8 "
+            "and 7.6 mm) were known when the limit was set.\n",
             f"**{found['headline']['statement']}** The command took {seconds:.0f} s. The model contains:\n",
             *effects,
             "",

@@ -137,11 +137,11 @@ ELASTIC = 0.2
 #: For a thinned log: least number of steps between readings; largest growth of steps with the time since a condition
 #: changed [1/s · s]; change of the supply that counts, as a share of its largest value.
 BETWEEN, LATER, SMALL = 4, 0.05, 0.05
+#: The same number for a log with imposed speed, and its longest step in usual longest steps.
+COARSELY, SLOWLY = 2, 4
 #: Share of a run's largest speed below which an imposed current is not averaged. A mean across a stop or a breakaway
 #: leaves it with another speed.
 RESTS = 0.1
-#: The same number for a log with imposed speed, and its longest step in usual longest steps.
-COARSELY, SLOWLY = 2, 4
 #: Change of a speed from the third to the last quarter of an interval, as a share, above which it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
 STILL = 0.2
