@@ -317,8 +317,9 @@ def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
     torque = np.arange(9) * 0.1
     current = (torque + 0.01) / 0.05
     speed = (24 - 0.5 * current) / 0.05 * 30 / np.pi
+    current += 0.003 * np.random.default_rng(1).standard_normal(9)  # an exact line would be a computed current
     lines = ["supply_voltage_V,motor_speed_rpm,output_torque_Nm,motor_current_A"]
-    lines += [f"24,{n:.1f},{m:.1f},{i:.1f}" for n, m, i in zip(speed, torque, current, strict=True)]
+    lines += [f"24,{n:.1f},{m:.1f},{i:.3f}" for n, m, i in zip(speed, torque, current, strict=True)]
     head = 'channels = ["motor_current", "motor_speed"]\n[columns]\nload_torque_Nm = "output_torque_Nm"'
     off = RIG.replace("= 0.5\n", '= "0.54 ± 10 %"\n').replace("= 0.05\n", '= "0.047 ± 10 %"\n')
     off = off.replace("= 0.01\n", '= "0.02 ± 100 %"\n').replace("load = 1.0", 'load = "1 ± 0"')
@@ -326,7 +327,7 @@ def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
     rig = mm.read_robot(str(tmp_path / "rig.toml"))
     runs = mm.read_runs(str(tmp_path / "runs.csv"), robot=rig)
-    found = mm.discover(runs, rig, noise="motor_current=0.03 A,motor_speed=0.03 rpm")  # the steps of the table
+    found = mm.discover(runs, rig, noise="motor_current=0.003 A,motor_speed=0.03 rpm")
     assert found.verdict == "none"
     motor = found.robot.motor
     for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():

@@ -41,7 +41,7 @@ def _power(run, motion):
     gained = after.v - motion.v
     mean, at = motion.v + gained / 2, sides.at
     ahead, aside, normal = b.contact_forces_after_step(at, pulled, levers, rises, gained)
-    moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in (levers.along, levers.across, levers.off)]
+    moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in levers]  # along, across, off
     front, rear = mean[b.PULLEYS].T
     belt = run.path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
     losses = b._loss_derivatives(run, plane, sides)
