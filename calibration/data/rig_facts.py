@@ -477,7 +477,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
         is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in names_in_file
         is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in names_in_file)
         assumed = not robot.rig.inherits and (
-            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in names_in_file)
+            p.name == "motor.inertia" or (p.name == "motor.inductance" and robot.rig.shows_voltage)
         )
         if not is_shown and not assumed:
             continue

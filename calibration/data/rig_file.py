@@ -56,7 +56,8 @@ DEFAULTS: dict[str, tuple[float, str]] = {
 }
 #: Time constant L / R assumed if the inductance is not stated [s]. Small motors have 0.05 to 1 ms.
 WINDING = 2e-4
-#: The same under an imposed current, which then follows its column at once. Its lateness is in the rig's delay.
+#: The same without a voltage in the log. An imposed current then follows its column at once. Its lateness is in the
+#: rig's delay.
 WINDING_AT_ONCE = 1e-6
 WINDING_WHY = f"not stated: assumed, {1e3 * WINDING:g} ms of the resistance"
 #: The same for a vehicle, below its configuration.

@@ -262,7 +262,7 @@ def _robot_before_parameters(
     parameters = params.parameters_by_name(robot)
     resistance = file_values.get("motor.resistance", float(robot.motor.resistance))
     if isinstance(resistance, int | float):
-        time_constant = rig_file.WINDING_AT_ONCE if rig.imposed == "motor_current" else rig_file.WINDING
+        time_constant = rig_file.WINDING if rig.shows_voltage else rig_file.WINDING_AT_ONCE
         robot = params.replace(robot, {"motor.inductance": params.as_float(time_constant * resistance)})
     for name in file_values:
         if "." not in name and name not in COUNTS:
