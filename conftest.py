@@ -320,3 +320,16 @@ def mmrjax(monkeypatch, capsys, tmp_path):
         return end.value.code, out.out, out.err
 
     return command
+
+
+@pytest.fixture(scope="session")
+def worlds():
+    """Twelve rigs of every kind with everything imposed."""
+    from worlds import rigs
+
+    return [
+        rigs.world(np.random.default_rng([3, seed]), kind, imposed)
+        for kind in rigs.KINDS
+        for imposed in rigs.IMPOSED
+        for seed in range(12)
+    ]

@@ -10,17 +10,6 @@ from worlds import laws, rigs
 from tests.commands import read_json
 
 
-@pytest.fixture(scope="module")
-def worlds():
-    """Twelve rigs of every kind with everything imposed."""
-    return [
-        rigs.world(np.random.default_rng([3, seed]), kind, imposed)
-        for kind in rigs.KINDS
-        for imposed in rigs.IMPOSED
-        for seed in range(12)
-    ]
-
-
 def test_rigs_span_what_they_should(worlds):
     assert {w.rig.sides for w in worlds} == set(range(1, 7))
     assert {w.rig.supply for w in worlds} == set(rigs.SUPPLIES)

@@ -25,17 +25,6 @@ from mmrjax.model.track_friction import Track
 ROWS = 64  # of all tables once padded, so that few programs are compiled
 
 
-@pytest.fixture(scope="module")
-def worlds():
-    """Twelve rigs of every kind with everything imposed."""
-    return [
-        rigs.world(np.random.default_rng([3, seed]), kind, imposed)
-        for kind in rigs.KINDS
-        for imposed in rigs.IMPOSED
-        for seed in range(12)
-    ]
-
-
 def robot(w):
     """The true rig of a world, as mmrjax has it."""
     r, p = w.rig, w.constants
