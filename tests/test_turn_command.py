@@ -19,10 +19,10 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.channels import SIDES
 from mmrjax.model.quantities import HEAT
+from sweeps.capabilities import UNLIMITED
 from sweeps.commands import simulate
 from sweeps.pages import mission_figures
 from sweeps.pages.figure_style import figure_as_svg
-from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
 from sweeps.report import check_report, run_tables, turn_report
 from sweeps.report.words import turn_words

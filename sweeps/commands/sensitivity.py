@@ -25,13 +25,13 @@ from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import print_message
 from sweeps.inputs import load_robot, posterior_beside_robot, read_runs
 from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
-from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions, grid_configurations
 from sweeps.points.job import showing_turns
 from sweeps.points.run import check_runs_bearable
@@ -128,7 +128,7 @@ def _operating_points(
     axes = {key: getattr(config, key) or usual_axes.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
         ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
-        imposed.check_acting(robot, ground, shaft)
+        capabilities.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
@@ -150,7 +150,7 @@ def _operating_points(
     for note in notes:
         print_message(note)
     names = grid_configurations(grid, robot)
-    imposed.check_turning(robot, ranges, names, "--vary")
+    capabilities.check_turning(robot, ranges, names, "--vary")
     return grid_conditions(
         grid.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
     )

@@ -23,7 +23,7 @@ from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress_bar, report_stage
 from sweeps.inputs import load_robot, one_run
-from sweeps.points import imposed, run, scale
+from sweeps.points import run, scale
 from sweeps.report import turn_report
 from sweeps.report.words import posture_words
 from sweeps.store import open_folder, print_report
@@ -111,7 +111,7 @@ def check_can_turn(robot: Robot, named: str) -> None:
     Raises:
         BadConfiguration: it cannot turn. The message has the reason.
     """
-    imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
+    capabilities.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
         raise BadConfiguration("--left, --right: the robot's file imposes no voltage")
 

@@ -18,10 +18,10 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import SLOPES_DEG
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, is_done
+from sweeps import capabilities
 from sweeps.config import GridPart
 from sweeps.export.joint import DriveJoint, channels_of
 from sweeps.inputs import read_runs
-from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions
 
 #: Loads of a shaft in a grid, as shares of its stall torque.
@@ -139,7 +139,7 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     """
     robot = joint.file.robot
     if data is None:
-        if not Layout.of(robot).uses_paper_conditions and imposed.imposed_limit(robot) is None:
+        if not Layout.of(robot).uses_paper_conditions and capabilities.imposed_limit(robot) is None:
             raise BadConfiguration(
                 f"--data: not given, and {joint.file.name} has no motor.voltage_limit; give a table of runs, or "
                 "add the limit"

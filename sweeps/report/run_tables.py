@@ -18,9 +18,9 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import SET, TABLE, Condition
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
+from sweeps.capabilities import UNLIMITED
 from sweeps.pages import words
 from sweeps.points import uncertainty
-from sweeps.points.imposed import UNLIMITED
 from sweeps.report import catalogue
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
