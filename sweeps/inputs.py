@@ -23,7 +23,7 @@ from sweeps import capabilities, store
 from sweeps.config import Calibrate, Compare, Export, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
 from sweeps.options import options_of_fields
-from sweeps.report.words import turn_words
+from sweeps.report import turn_words
 
 #: Option for each condition of a single run.
 OPTIONS = options_of_fields(OneRun)

@@ -18,8 +18,8 @@ from sweeps import config as configuration
 from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot
 from sweeps.pages import words
-from sweeps.report import size_report
-from sweeps.report.size_report import SizeResult, describe_design
+from sweeps.report import check_report
+from sweeps.report.check_report import SizeResult, describe_design
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
@@ -55,7 +55,7 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
         result = SizeResult(requirements, robot, sizing, objectives, outcomes)
         _write_folder(folder, config, result)
         document = print_report(
-            size_report.size_document(result, capabilities.displayed_name(file)),
+            check_report.size_document(result, capabilities.displayed_name(file)),
             dataclasses.replace(file, robot=best),
             brief=not beside.verbose,
         )
