@@ -738,7 +738,7 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     seed: Seed = option_field(0, "Random seed of the starts")
 
 
-class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
+class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
     """A sensitivity study. Methods that draw a sample take the ends of axes that are not stated, and of
     slopes also the middle."""
 
@@ -763,14 +763,6 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
     )
     seed: Seed = option_field(0, "Random seed of the sample")
     posterior: bool = option_field(False, "Use the posterior.nc of the calibrated --robot as inputs")
-    candidates: str = option_field(
-        "",
-        "CSV of candidate runs",
-        usual="Table 8; for a rig the operating points",
-        format="path",
-    )
-    runs: Annotated[int, Field(ge=1, le=100)] = option_field(5, "Number of runs to propose")
-    noise: str = option_field("", "Standard deviation of the readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
     @classmethod
