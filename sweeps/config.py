@@ -686,16 +686,6 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     forbid: Names = option_field(
         (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', a configuration"
     )
-    resolve: bool = option_field(
-        False,
-        "Test if another running gear explains the remaining error. Takes tens of minutes",
-    )
-    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
-        None, "Members of the search of --resolve", usual="128"
-    )
-    generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Most generations of --resolve", usual="20"
-    )
     model: Path | None = option_field(
         None,
         "MuJoCo model of several joints, whose torques are their loads",
