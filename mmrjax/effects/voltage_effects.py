@@ -1,4 +1,4 @@
-"""Effects on the supply [V], eqs. (8)-(13), and the electrical circuit [V] and inductance [H] of the armature (15)."""
+"""Effects on the supply [V], eqs. (8)-(13), and the electrical circuit [V] and inductance [H] of motors, eq. (15)."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from mmrjax.model.channels import Channel
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, posterior_beside_robot, read_runs, recorded_fit
-from sweeps.points import run, uncertainty
+from sweeps.points import run
 from sweeps.report import comparison_report
 from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
 from sweeps.store import RunFolder, open_folder, print_report
@@ -59,10 +59,10 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         notes = (*missing_readings_notes(comparison, measured_runs.channels), *remarks)
         of_draws: list[str] = []
         if posterior is not None and config.posterior is not None:
-            spread = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            of_draws = uncertainty.interval_ranges(table, spread)
+            spread = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            of_draws = run.interval_ranges(table, spread)
             table |= spread.columns
-            ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
+            ends = (run.SD, run.LOWER, run.UPPER)
             comparison |= {
                 f"simulated_{key}": table[key] for c in robot.channels for e in ends if (key := c.column + e)
             }
