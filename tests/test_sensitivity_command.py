@@ -17,10 +17,9 @@ from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
-from calibration.sensitivity.local import inert_inputs, local_derivatives
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import OperatingPoints
-from calibration.sensitivity.study import Study
+from calibration.sensitivity.study import Study, inert_inputs, local_derivatives
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report

@@ -20,7 +20,6 @@ from calibration.words import (
     fit_words,
     loop_words,
     sensitivity_words,
-    settle_words,
     step_words,
     table_words,
 )
@@ -54,7 +53,7 @@ RESULTS: dict[type, Callable[..., str]] = {
     formula.Proposal: lambda found: found.expression or loop_words.NO_FORMULA,
     loop_results.UnnamedDiscrepancy: loop_words.curve_course,
     SensitivityResult: sensitivity_words.sensitivity_statement,
-    Settled: settle_words.settle_statement,
+    Settled: table_words.settle_statement,
 }
 #: The same of parts of results, by name.
 PARTS: dict[tuple[type, str], Callable[..., str]] = {

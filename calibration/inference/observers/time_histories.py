@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.data import Columns, Names
-from calibration.data.columns import SUPPLY
-from calibration.data.courses import (
+from calibration.data.clock import (
     ConstantInterval,
     applied_drive,
     changing_columns,
@@ -32,6 +31,7 @@ from calibration.data.courses import (
     divide_run,
     intervals_by_run,
 )
+from calibration.data.columns import SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
