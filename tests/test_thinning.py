@@ -201,7 +201,7 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("rows", [100, None])
-@pytest.mark.parametrize("way", [(calibrate, "prepare_input"), (discover, "preparation.prepare_input")])
+@pytest.mark.parametrize("way", [(calibrate, "prepare_input"), (discover, "loop_input.preparation.prepare_input")])
 def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     """Of the same log the same rows, whoever asks. Each row once thinned is still of the whole log."""
     room, before = way
