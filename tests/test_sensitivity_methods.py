@@ -1,12 +1,10 @@
 """Indices against what is known exactly: Ishigami, linear models, correlated normals, brute force."""
 
-import itertools
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.sensitivity import morris, next_runs, sobol
+from calibration.sensitivity import morris, sobol
 from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
 
 A, B = 7.0, 0.1
@@ -141,26 +139,6 @@ def test_morris_design_is_repeatable_and_leaves_the_global_generator_alone():
     first = morris.morris_design(3, 10, 5)
     assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
     assert_array_equal(first, morris.morris_design(3, 10, 5))
-
-
-# --- information --------------------------------------------------------------------------------------------------
-
-
-def test_chosen_runs_are_the_best_of_all_sets():
-    rng = np.random.default_rng(0)
-    jacobian = rng.normal(size=(9, 2, 3)) * rng.uniform(0.2, 3, size=(9, 1, 1))
-    each = next_runs.fisher_information(jacobian, np.full((9, 2), 0.5))
-    value = lambda rows: np.linalg.slogdet(np.eye(3) + each[list(rows)].sum(0))[1]  # noqa: E731
-    rows, gain, covariance = next_runs.choose_runs(each, 3)
-    best = max(itertools.combinations(range(9), 3), key=value)
-    assert value(rows) == pytest.approx(value(best))
-    assert np.sum(gain) * 2 * np.log(2) == pytest.approx(value(rows))
-    assert_allclose(covariance[-1], np.linalg.inv(np.eye(3) + each[rows].sum(0)))
-
-
-def test_missing_readings_tell_nothing():
-    jacobian = np.array([[[1.0], [np.nan]]])
-    assert next_runs.fisher_information(jacobian, np.array([[0.5, 1.0]]))[0, 0, 0] == 4.0
 
 
 def test_ratio_interval_is_that_of_students_t_for_a_constant_denominator():

@@ -1,4 +1,4 @@
-"""Sensitivity study: important inputs at each operating point, and the most informative next runs."""
+"""Sensitivity study: important inputs at each operating point."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.local import LocalDerivatives, correlated_directions, inert_inputs, local_derivatives
 from calibration.sensitivity.methods import PartialResult, morris_screening, sobol_indices
-from calibration.sensitivity.next_runs import CandidateRuns, choose_next_runs
 from calibration.sensitivity.result import METHODS, InputSummary, OutputStudy, SensitivityResult
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
@@ -22,16 +21,13 @@ EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
 LEAST = 1_000
 
 
-def analyse_sensitivity(
-    study: Study, method: str, evaluations: int | None, seed: int = 0, candidates: CandidateRuns | None = None
-) -> SensitivityResult:
+def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed: int = 0) -> SensitivityResult:
     """Runs a sensitivity study and returns its result.
 
     Args:
         method: one of `METHODS`.
         evaluations: smallest total number of model evaluations. None: the default.
         seed: random seed.
-        candidates: possible next runs. None: no runs are proposed.
 
     Raises:
         BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs that
@@ -62,7 +58,6 @@ def analyse_sensitivity(
     outputs = {o.name: _study_of_output(o, study, studies, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_no_point_message(study, study.statuses()))
-    proposed = None if candidates is None else choose_next_runs(study, studies, candidates)
     return SensitivityResult(
         method=method,
         model=model.fidelity,
@@ -73,7 +68,6 @@ def analyse_sensitivity(
         outputs=outputs,
         statuses=studies.statuses,
         sampled=study.statuses(),
-        next_runs=proposed,
         evaluations=study.evaluations,
         seconds=round(study.seconds, 3),
         remarks=_study_remarks(study, method, outputs, idle),
