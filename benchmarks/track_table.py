@@ -49,9 +49,9 @@ from calibration.inference.held_out import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import MemberObservations, simulate_members  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
-from mmrjax.effects.electrical_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
-from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
+from mmrjax.effects.travel_effects import VibrationSlip  # noqa: E402
+from mmrjax.effects.voltage_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.fidelities.steady import steady  # noqa: E402
 from mmrjax.fidelities.track import STEP, track  # noqa: E402
 from mmrjax.model import channels, paper_robots, params  # noqa: E402

@@ -19,7 +19,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
 from mmrjax import effects
 from mmrjax.compile.compiling import compiled, for_equations
-from mmrjax.effects.scaled import scaled_effect
+from mmrjax.effects.base import scaled_effect
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions

@@ -19,13 +19,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.contact import Friction
-from mmrjax.model.ground import Ground
+from mmrjax.model.contact import Friction, Ground, Track
 from mmrjax.model.rig import Instrument, Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STALLED
-from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
 from tests.commands import csv_text, read_rig, read_table, text_file

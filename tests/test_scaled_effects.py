@@ -16,7 +16,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import loop_input, scales
 from mmrjax import effects
-from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
+from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import paper_robots, params
 from mmrjax.model.quantities import RPM

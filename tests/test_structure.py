@@ -247,7 +247,7 @@ def discovery_keeps_its_stages(path, tree):
 KEPT = {
     ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
     ("mmrjax/undercarriage/mjcf.py", "_template"): "pure: the topology of the track model",
-    ("mmrjax/effects/scaled.py", "scaled_effect"): "pure: a class of a class and its factors",
+    ("mmrjax/effects/base.py", "scaled_effect"): "pure: a class of a class and its factors",
     ("mmrjax/model/params.py", "rig_spec"): "pure, of hashable arguments",
     ("mmrjax/compile/programs.py", "_is_supported"): "pure: whether this XLA has a compile option",
     ("calibration/data/effect_file.py", "_test_points"): "pure: signals of the nominal robot",

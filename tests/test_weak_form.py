@@ -16,7 +16,7 @@ from calibration.discovery import discover, findings, loop_input, search, stages
 from calibration.discovery.settings import settings_for
 from calibration.inference import shown_states, weak_form
 from calibration.inference.observers import Histories
-from mmrjax.effects import BY_NAME, sensor_effects
+from mmrjax.effects import BY_NAME, signal_effects
 from tests.commands import csv_text, motor_on_bench, read_rig, read_table
 
 STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
@@ -249,7 +249,7 @@ def test_noise_of_an_angle_alone_is_neither_an_inertia_nor_a_gain(tmp_path, impo
         records.read_runs(tmp_path / "table.csv", robot=robot).of(robot),
         case.rig.noise("output_angle") * np.pi / 180,
     )
-    space = posed(runs, robot, sd, {"output_angle_gain": sensor_effects.OF_CHANNELS["output_angle_gain"]})
+    space = posed(runs, robot, sd, {"output_angle_gain": signal_effects.OF_CHANNELS["output_angle_gain"]})
     problem = space.bare
     fit, k = weak_form.fit_weak_form(problem, space.library.scored), problem.coordinates.names.index("bench.inertia")
     sds = np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian)))

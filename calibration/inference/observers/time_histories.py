@@ -99,8 +99,8 @@ from mmrjax.model.quantities import GOALS
 from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.linear_equations import solve
-from mmrjax.numerics.one_sided import value_and_slope
 
 #: Most knots of a run's defect in time, and largest product of knots and steps of all runs (2 GB of working memory).
 KNOTS, KNOT_STEPS = 256, 1e7
