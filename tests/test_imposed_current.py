@@ -10,7 +10,7 @@ import pytest
 
 from calibration.data import rig_facts, robot_file, unused_readings
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.discovery import discover
+from calibration.discovery import loop_input
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
 from calibration.inference.calibration import calibrate
@@ -128,7 +128,7 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
     rows = [f"{factor * i},{x * 9.549}\n" for i, x in zip(current, settles(current), strict=True)]
     runs = read_table(tmp_path, "motor_current_A,motor_speed_rpm\n" + "".join(rows), robot, "runs.csv")
     monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
-    ready = discover.prepare_loop(runs, robot)
+    ready = loop_input.prepare_loop(runs, robot)
     assert any("Is it in another unit" in str(note) for note in ready.at_first) == doubted
     said = []
     monkeypatch.setattr(observers, "pose_problem", lambda *given: said.append("fit") or 1 / 0)

@@ -13,7 +13,7 @@ from synthetic import SETTLED, STATED
 from calibration.data import inferred_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.discovery import discover, findings
+from calibration.discovery import findings, loop_input
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
 from calibration.inference.linearization import free_shape_parameter, shape_parameter_at, shape_scales
@@ -83,7 +83,7 @@ def fits(tmp_path_factory):
     robot = robot_file.add_effects(paper_robots.nominal(), UNSEEN)
     robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
     sd = 0.02 * np.abs(runs.measured())
-    space = discover.build_candidate_space(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
+    space = loop_input.build_candidate_space(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
     z = np.zeros(len(space.coordinates))
     z[: space.free] = np.random.default_rng(3).normal(0.0, 0.5, space.free)
     # The exponent of sinkage is then beyond its bounds, which a file could not state.
