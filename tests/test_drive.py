@@ -11,8 +11,8 @@ from scipy.integrate import cumulative_simpson
 from worlds import paper
 
 from mmrjax.effects.voltage_effects import ThermalDrift
+from mmrjax.fidelities.base import movers_slip
 from mmrjax.fidelities.drive import _status_of_run, drive, drive_batch
-from mmrjax.fidelities.result import movers_slip
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions

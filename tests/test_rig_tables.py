@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import inferred_facts, rig_facts, robot_file, surfaces
+from calibration.data import configuration_tables, inferred_facts, rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
@@ -382,7 +382,7 @@ ON = "motor_speed_rpm,surface,total_current_A,speed_mm_s\n" + "".join(
 def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_path):
     robot = vehicle(priors=(("rig.ground.friction.static", 0.6, 0.1), ("rig.radius", 0.05, 0.001)))
     runs = read(tmp_path, ON, robot)
-    apart = surfaces.with_surface_configurations(robot, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
     assert apart.configurations.names == ("rig-felt", "rig-tiles")
     assert apart.rig.surfaces == (("rig-tiles", "rig-felt"),)
     assert runs.configurations(apart).tolist() == [0, 0, 0, 1, 1, 1]
@@ -390,8 +390,8 @@ def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_p
         "rig-felt.ground.friction.static", "rig-tiles.ground.friction.static", "rig-felt.radius",
     }  # fmt: skip
     assert (
-        surfaces.with_surface_configurations(apart, runs) == apart
-        or surfaces.with_surface_configurations(apart, runs).rig.surfaces == apart.rig.surfaces
+        configuration_tables.with_surface_configurations(apart, runs) == apart
+        or configuration_tables.with_surface_configurations(apart, runs).rig.surfaces == apart.rig.surfaces
     )
     assert runs.conditions(apart).adhesion == pytest.approx(1.0)
     again = read(tmp_path, ON, apart)  # without a column configuration
@@ -403,7 +403,7 @@ def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_p
 def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
-    apart = surfaces.with_surface_configurations(robot, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
     names = priors.loop_parameter_names(apart, runs.configurations_named(apart))
     assert "rig-felt.radius" in names and "rig-tiles.radius" not in names
     assert {"rig-felt.ground.rolling_resistance", "rig-tiles.ground.rolling_resistance"} <= set(names)
@@ -421,7 +421,9 @@ def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
 def test_one_surface_alone_and_a_robot_without_the_others_stay_as_they_are(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
-    assert surfaces.with_surface_configurations(robot, runs.where(np.arange(3))).configurations.names == ("rig",)
+    assert configuration_tables.with_surface_configurations(robot, runs.where(np.arange(3))).configurations.names == (
+        "rig",
+    )
     assert runs.configurations(robot).tolist() == [0] * 6  # simulated as it is
 
 
@@ -429,7 +431,7 @@ def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(ro
     runs = records.read_runs("measured").where(np.arange(4))
     columns = {**runs.columns, "surface": np.array(["linoleum", "linoleum", "sand", "sand"])}
     runs = dataclasses.replace(runs, columns=columns)
-    apart = surfaces.with_surface_configurations(robot, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
     assert apart.configurations.names == ("6T2A", "4W2T", "6T2A-sand") and apart.rig.surfaces == (
         ("6T2A-sand", "6T2A"),
     )
@@ -439,8 +441,10 @@ def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(ro
 def test_options_name_a_configuration_that_gave_way_to_its_surfaces(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
-    apart = surfaces.with_surface_configurations(robot, runs)
-    said = surfaces.names_of_surfaces(["rig.radius", "rig.ground.friction.static", "motor.resistance"], apart, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
+    said = configuration_tables.names_of_surfaces(
+        ["rig.radius", "rig.ground.friction.static", "motor.resistance"], apart, runs
+    )
     assert said == [
         "rig-felt.radius", "rig-felt.ground.friction.static", "rig-tiles.ground.friction.static", "motor.resistance",
     ]  # fmt: skip

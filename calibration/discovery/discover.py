@@ -34,7 +34,7 @@ from calibration.inference.observers.windows import Windows
 from calibration.inference.optimizers import CORES
 from calibration.inference.population import StoreStage, compute_without_storing
 from mmrjax import effects
-from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
+from mmrjax.compile.compiling import SINGLE, Threads, in_double, is_double
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 

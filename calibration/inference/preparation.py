@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
 
-from calibration.data import Names, Priors, inferred_facts, rig_facts, settling, surfaces
+from calibration.data import Names, Priors, configuration_tables, inferred_facts, rig_facts, settling
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.data.unused_readings import used_rows
@@ -124,8 +124,10 @@ def prepare_input(
     except UsageError as error:
         raise BadConfiguration(str(error)) from error
     observe = observers.observer_kind(runs)
-    robot = surfaces.with_surface_configurations(inferred_facts.with_inferred_instruments(robot, runs), runs)
-    priors = surfaces.values_of_surface_configurations(stated or {}, robot, runs)
+    robot = configuration_tables.with_surface_configurations(
+        inferred_facts.with_inferred_instruments(robot, runs), runs
+    )
+    priors = configuration_tables.values_of_surface_configurations(stated or {}, robot, runs)
     inferred_facts.check_priors(priors, robot, runs)
     as_stated, weighed = robot, inferred_facts.mass_notes(robot, runs)
     robot = inferred_facts.with_table_mass(robot, runs)

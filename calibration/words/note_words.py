@@ -14,22 +14,13 @@ from calibration.inference.fit_notes import Remark as Remark
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.sensitivity.result import SensitivityResult
-from calibration.words import (
-    experiment_words,
-    feedforward_words,
-    fit_words,
-    loop_words,
-    sensitivity_words,
-    step_words,
-    table_words,
-)
+from calibration.words import experiment_words, fit_words, loop_words, sensitivity_words, step_words, table_words
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 NOTES: dict[str, str | Callable[..., str]] = {
     "step": step_words.step_sentence,
     "residual_cluster": lambda cluster: fit_words.residual_cluster(cluster),
     **table_words.SAID,
-    **feedforward_words.SAID,
     **fit_words.SAID,
     **loop_words.SAID,
     **experiment_words.SAID,
@@ -37,7 +28,7 @@ NOTES: dict[str, str | Callable[..., str]] = {
 }
 #: Kind of result, or part of one → the function that makes its sentence.
 RESULTS: dict[type, Callable[..., str]] = {
-    Feedforward: feedforward_words.feedforward_statement,
+    Feedforward: fit_words.feedforward_statement,
     fit_notes.Determination: fit_words.is_determined_answer,
     fit_notes.ReachedBound: fit_words.distance_from_prior,
     fit_notes.DependentPair: fit_words.determined_combination,

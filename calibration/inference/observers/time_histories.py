@@ -68,8 +68,7 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from calibration.inference.weak_form import fit_weak_form
 from mmrjax import fidelities
-from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, Threads, compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import drive_rates, moving, state_of_unknowns
