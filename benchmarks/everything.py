@@ -158,7 +158,7 @@ def run(command: list[str], log: Path, seconds: float, extra: dict[str, str]) ->
                 if mutant := re.match(r"(killed|survived|error) +([\d.]+) s +\S+ +(\w+) ", line):
                     outcome = "passed" if mutant[1] == "killed" else "failed"
                     note(log, test=mutant[3], outcome=outcome, seconds=float(mutant[2]), text=mutant[1])
-                elif number := re.match(r"(\d+) mutants; their tests pass", line):
+                elif number := re.match(r"(\d+) mutants; the tests", line):
                     note(log, selected=int(number[1]))
 
     reader = threading.Thread(target=read, daemon=True)

@@ -320,14 +320,14 @@ def actuator(robot: str) -> tuple[str, str]:
     from calibration.data import robot_file
     from mmrjax.compile.precision import in_double
     from sweeps.export.formats import export_format
-    from sweeps.report.words import export_words
+    from sweeps.report import export_report
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.toml"
         path.write_text(robot, encoding="utf-8")
         exported = in_double(lambda: export_format(robot_file.find_robot_file(str(path)), "mujoco"))()
     drive = str(exported.files["drive.xml"]).splitlines(keepends=True)
-    law = export_words.law_text(exported).replace("\n## ", "\n### ").replace("# The law", "## LAW.md: the law", 1)
+    law = export_report.law_text(exported).replace("\n## ", "\n### ").replace("# The law", "## LAW.md: the law", 1)
     return "".join(line for line in drive if "<!--" not in line), law
 
 

@@ -1,6 +1,6 @@
 """Applies the plausible mistakes of tests/mutants.toml: each has to make one of its listed tests fail.
 
-Each mutant replaces one piece of a function's text in a copy of the tree and runs its tests in a separate process.
+Each mutant replaces one node of a function's syntax in a copy of the tree and runs its tests in a separate process.
 Before that the same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list.
 A mutant with `slow = true` is killed by a slow test, one of `make test-all`.
 
@@ -8,7 +8,7 @@ A mutant with `slow = true` is killed by a slow test, one of `make test-all`.
     python benchmarks/mutants.py --jobs 2
     python benchmarks/mutants.py --only track_drops_guide --only gravity_takes_cosine
 
-Exits with 1 if a mutant survives, its tests cannot run, or its text does not occur exactly once in its function.
+Exits with 1 if a mutant survives, its tests cannot run, or its function has another number of such nodes.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from __future__ import annotations
 import argparse
 import ast
 import dataclasses
-import functools
 import importlib.util
-import itertools
 import json
 import multiprocessing
 import os
@@ -48,8 +46,10 @@ BASE = (
     "ignore::pytest.PytestAssertRewriteWarning",
 )
 OPTIONS = ("-x", *BASE)
-#: A word or a sign of a program.
-TOKEN = re.compile(r"\w+|[^\w\s]")
+#: A mutant's node: kind, its rank of how many, and the path to a part.
+NODE = re.compile(r"(\S+)(?: (\d+)/(\d+))?(?: ([.\[].*))?")
+#: The node or a part of it in a replacement.
+PART = re.compile(r"(?<!\w)_(?:\.[a-z_]+|\[-?\d+\])*(?!\w)")
 #: Time limit of a mutant's tests [s]: a mutant may loop for ever.
 PATIENCE = 900.0
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
@@ -62,17 +62,17 @@ class Mutant:
     Attributes:
         kind: where it is.
         file: from the root of the tree.
-        text: replaced, once in the function, with any white space between its words and signs.
-        by: its replacement.
+        node: syntax node to replace, `kind`, `kind 2/3` or either followed by a path to one of its parts.
+        by: its replacement. `_` is the node, `_.left` a part of it. An empty text removes a statement.
         killed_by: node ids of tests, at least one of them has to fail.
-        function: qualified name of the function or class. Empty for the whole file.
+        function: qualified name of the function, class or assigned name. Empty for the whole file.
         slow: these tests are marked slow.
     """
 
     name: str
     kind: str
     file: str
-    text: str
+    node: str
     by: str
     killed_by: tuple[str, ...]
     function: str = ""
@@ -83,42 +83,74 @@ class Mutant:
         """Selection of the tests that may kill it, for pytest's option -m."""
         return "not nightly" if self.slow else "not slow"
 
-    def applied(self, source: str) -> str:
-        """The file's text with the mistake in it.
+    def change(self, module: ast.Module) -> tuple[ast.AST, ast.AST]:
+        """The node of the module's tree, and what replaces it.
 
         Raises:
-            ValueError: the text does not occur exactly once in the file.
+            ValueError: the function has another number of such nodes.
         """
-        matches = list(pattern(self.text).finditer(source, *functions(source)[self.function]))
-        if len(matches) != 1:
+        searched, rank, number, path = NODE.fullmatch(self.node).groups("")  # type: ignore[union-attr]
+        nodes = [n for n in reading_order(definitions(module)[self.function]) if kind_of(n) == searched]
+        if len(nodes) != int(number or 1):
             where = f"{self.function} of {self.file}" if self.function else self.file
-            raise ValueError(f"{self.name}: its text occurs {len(matches)} times in {where}; expected once")
-        begin, end = matches[0].span()
-        return source[:begin] + self.by + source[end:]
+            raise ValueError(f"{self.name}: {where} has {len(nodes)} nodes {searched}; expected {number or 1}")
+        node = eval(f"_{path}", {"_": nodes[int(rank or 1) - 1]})
+        filled = PART.sub(lambda part: f"({ast.unparse(eval(part[0], {'_': node}))})", self.by or "pass")
+        made = ast.parse(filled).body[0]
+        return node, made.value if isinstance(node, ast.expr) and isinstance(made, ast.Expr) else made
+
+    def applied(self, source: str) -> str:
+        """The file's text with the mistake in it."""
+        tree = ast.parse(source)
+        return ast.unparse(_Replacement(*self.change(tree)).visit(tree))
 
 
-def pattern(text: str) -> re.Pattern[str]:
-    """Expression for a text with any white space between its words and signs."""
-    return re.compile(r"\s*".join(map(re.escape, TOKEN.findall(text))))
+class _Replacement(ast.NodeTransformer):
+    """Replaces one node of a tree."""
+
+    def __init__(self, node: ast.AST, made: ast.AST) -> None:
+        self.node, self.made = node, made
+
+    def visit(self, node: ast.AST) -> Any:
+        return self.made if node is self.node else self.generic_visit(node)
 
 
-@functools.cache
-def functions(source: str) -> dict[str, tuple[int, int]]:
-    """Characters of each function and class by its qualified name, with decorators. Empty: the whole file."""
-    starts = list(itertools.accumulate(map(len, source.splitlines(keepends=True)), initial=0))
-    spans = {"": (0, len(source))}
+def kind_of(node: ast.AST) -> str:
+    """Sub, Lt, Not ... of an operation, `f()` of a call, the number or the name; else the class of the node."""
+    match node:
+        case ast.BinOp(op=op) | ast.BoolOp(op=op) | ast.UnaryOp(op=op) | ast.Compare(ops=[op, *_]):
+            return type(op).__name__
+        case ast.Call(func=ast.Attribute(attr=name) | ast.Name(id=name)):
+            return f"{name}()"
+        case ast.Constant(value=value) if not isinstance(value, str):
+            return repr(value)
+        case ast.Attribute(attr=name) | ast.Name(id=name) | ast.keyword(arg=str(name)):
+            return name
+    return type(node).__name__
+
+
+def reading_order(tree: ast.AST) -> list[ast.AST]:
+    """Nodes that have a place in the text, by place; of those that begin together, the outer one first."""
+    placed = (n for n in ast.walk(tree) if hasattr(n, "lineno"))
+    return sorted(placed, key=lambda n: (n.lineno, n.col_offset))
+
+
+def definitions(module: ast.Module) -> dict[str, ast.AST]:
+    """Functions, classes and assigned names by qualified name. Empty: the whole file."""
+    named: dict[str, ast.AST] = {"": module}
 
     def visit(node: ast.AST, prefix: str) -> None:
         for child in ast.iter_child_nodes(node):
             inner = prefix
             if isinstance(child, (ast.FunctionDef, ast.ClassDef)):
-                first = min([child.lineno, *(d.lineno for d in child.decorator_list)])
-                spans[prefix + child.name] = starts[first - 1], starts[child.end_lineno or child.lineno]
+                named[prefix + child.name] = child
                 inner = f"{prefix}{child.name}."
+            elif isinstance(child, (ast.Assign, ast.AnnAssign)):
+                named.setdefault(prefix + re.split(r"\W", ast.unparse(child))[0], child)
             visit(child, inner)
 
-    visit(ast.parse(source), "")
-    return spans
+    visit(module, "")
+    return named
 
 
 def mutants() -> list[Mutant]:

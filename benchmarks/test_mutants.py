@@ -1,12 +1,13 @@
-"""The list of mutants is one that `make mutants` can try: texts that occur once, mistakes that parse, quick tests."""
+"""The list of mutants is one that `make mutants` can try: nodes that exist, mistakes that parse, quick tests."""
 
 import ast
+import builtins
 import dataclasses
 import functools
 import importlib.util
+import re
 import subprocess
 import sys
-import textwrap
 from collections import Counter
 from pathlib import Path
 
@@ -60,23 +61,34 @@ def test_mutants_are_many_and_of_every_kind(command):
     assert (
         len(every) >= 300
         and sum(m.slow for m in every) <= 0.03 * len(every)
-        and len({(m.file, m.function, m.text, m.by) for m in every}) == len(every)
+        and len({(m.file, m.function, m.node, m.by) for m in every}) == len(every)
     )
     kinds = Counter(m.kind for m in every)
     assert set(kinds) == KINDS and min(kinds.values()) >= 2
 
 
-def test_mutants_apply_once_and_parse(command):
-    sources = {m.file: (ROOT / m.file).read_text(encoding="utf-8") for m in command.mutants()}
+def test_mutants_apply_once_and_name_what_exists(command):
+    files = {m.file for m in command.mutants()}
+    modules = {file: ast.parse((ROOT / file).read_text(encoding="utf-8")) for file in files}
+    words = {
+        file: set(re.findall(r"\w+", ast.unparse(module))) | set(dir(builtins)) for file, module in modules.items()
+    }
     for mutant in command.mutants():
-        source = sources[mutant.file]
-        begin, end = command.functions(source)[mutant.function]
-        wrong = mutant.applied(source)
-        texts = source[begin:end], wrong[begin : end + len(wrong) - len(source)]
-        right, wrong = (ast.dump(ast.parse(textwrap.dedent(text))) for text in texts)
-        assert right != wrong, mutant.name
-    with pytest.raises(ValueError, match=rf"{mutant.name}: its text occurs \d+ times in .*; expected once"):
-        dataclasses.replace(mutant, function="").applied(2 * source)
+        node, made = mutant.change(modules[mutant.file])
+        assert ast.dump(node) != ast.dump(made), mutant.name
+        assert {n.id for n in ast.walk(made) if isinstance(n, ast.Name)} <= words[mutant.file], mutant.name
+        compile(ast.unparse(made), mutant.name, "exec")
+    with pytest.raises(ValueError, match=rf"{mutant.name}: .* has \d+ nodes {mutant.node}; expected 1"):
+        dataclasses.replace(mutant, function="").applied((ROOT / mutant.file).read_text(encoding="utf-8"))
+
+
+def test_a_mutant_survives_new_names_and_layout_but_not_another_node_of_its_kind(command):
+    mutant = command.Mutant("twice", "units", "x.py", "Sub 2/2 .right", "2 * _", ("t",), "Box.size")
+    box = "class Box:\n\n    def size(self, a, b):\n        return a - {}"
+    assert mutant.applied(box.format("(b - 3 * a)")) == box.format("(b - 2 * (3 * a))")
+    assert mutant.applied(box.format("( # a comment\n a-(a)) ")) == box.format("(a - 2 * a)")
+    with pytest.raises(ValueError, match=r"twice: Box\.size of x\.py has 3 nodes Sub; expected 2"):
+        mutant.applied(box.format("(b - 3 - a)"))
 
 
 def test_tests_that_kill_exist_and_are_quick(command):

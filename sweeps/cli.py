@@ -313,7 +313,7 @@ def loop() -> None:
     example="mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000",
 )
 def sensitivity() -> None:
-    """Rank parameters by influence, and propose the next runs.
+    """Rank parameters by influence.
 
     Every method includes local derivatives and elasticities at every operating point. With sobol and morris, each
     condition that you do not give takes only the two ends of its usual range, and the slope also its middle. Writes

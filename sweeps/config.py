@@ -686,16 +686,6 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     forbid: Names = option_field(
         (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', a configuration"
     )
-    resolve: bool = option_field(
-        False,
-        "Test if another running gear explains the remaining error. Takes tens of minutes",
-    )
-    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
-        None, "Members of the search of --resolve", usual="128"
-    )
-    generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Most generations of --resolve", usual="20"
-    )
     model: Path | None = option_field(
         None,
         "MuJoCo model of several joints, whose torques are their loads",
@@ -738,7 +728,7 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     seed: Seed = option_field(0, "Random seed of the starts")
 
 
-class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
+class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
     """A sensitivity study. Methods that draw a sample take the ends of axes that are not stated, and of
     slopes also the middle."""
 
@@ -763,14 +753,6 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
     )
     seed: Seed = option_field(0, "Random seed of the sample")
     posterior: bool = option_field(False, "Use the posterior.nc of the calibrated --robot as inputs")
-    candidates: str = option_field(
-        "",
-        "CSV of candidate runs",
-        usual="Table 8; for a rig the operating points",
-        format="path",
-    )
-    runs: Annotated[int, Field(ge=1, le=100)] = option_field(5, "Number of runs to propose")
-    noise: str = option_field("", "Standard deviation of the readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
     @classmethod

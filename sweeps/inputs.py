@@ -23,8 +23,7 @@ from sweeps import capabilities, store
 from sweeps.config import Calibrate, Compare, Export, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
 from sweeps.options import options_of_fields
-from sweeps.points import imposed
-from sweeps.report.words import turn_words
+from sweeps.report import turn_words
 
 #: Option for each condition of a single run.
 OPTIONS = options_of_fields(OneRun)
@@ -77,7 +76,7 @@ def _unlike_sides_sentence(name: str, robot: Robot) -> Names:
         return ()
     if why := turn_error(robot, robot.configurations):
         return (turn_words.unlike_sides_note(name, robot.unlike, f"turning cannot be computed: {why}"),)
-    value = imposed.imposed_example(robot)
+    value = capabilities.imposed_example(robot)
     turn_rows = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
     turns = turn_words.turn_under_equal_commands(robot, turn_rows, value)
     return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
@@ -201,14 +200,14 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
     layout = Layout.of(robot)
     column = layout.imposed_column
     for other in (c for c, _ in IMPOSED.values() if c != column and c in cell_values):
-        raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
+        raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
     idle = [OPTIONS[key] for key in cell_values if key in layout.idle]
-    imposed.check_acting(robot, idle, idle)
+    capabilities.check_acting(robot, idle, idle)
     if battery:
-        imposed.check_battery(robot)
+        capabilities.check_battery(robot)
     elif column not in cell_values:
         default = 0.0 if column in elsewhere else None
-        cell_values[column] = imposed.imposed_default(robot, OPTIONS[column]) if default is None else default
+        cell_values[column] = capabilities.imposed_default(robot, OPTIONS[column]) if default is None else default
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}

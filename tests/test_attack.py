@@ -270,7 +270,7 @@ OPTIONS = {
                              "--outputs", "--export", "--config"],
     ("loop", "measured"): ["--prior", "--noise", "--seed", "--replicates", "--forbid", "--prefer", "--within", "--rows"],
     ("calibrate", "measured"): ["--free", "--fix", "--starts", "--population"],
-    ("sensitivity",): ["--method", "--parameters", "--vary", "--evaluations", "--candidates"],
+    ("sensitivity",): ["--method", "--parameters", "--vary", "--evaluations"],
     ("climb",): ["--step", "--stairs", "--gap", "--terrain", "--sequence", "--find"],
     ("render", "x.png"): ["--time"],
     ("check",): ["--robot", "--set"],

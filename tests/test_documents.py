@@ -24,19 +24,10 @@ from mmrjax.model import channels
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
 from sweeps.inputs import recorded_fit
-from sweeps.report import (
-    catalogue,
-    check_report,
-    comparison_report,
-    page_renderer,
-    settle_report,
-    size_report,
-    terminal_renderer,
-)
-from sweeps.report.check_report import CheckResult
+from sweeps.report import catalogue, check_report, comparison_report, page_renderer, settle_report, terminal_renderer
+from sweeps.report.check_report import CheckResult, SizeResult
 from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
 from sweeps.report.document import Cell, Column, Document, Note, Section, Table, remarks
-from sweeps.report.size_report import SizeResult
 
 
 def outcomes():
@@ -71,7 +62,7 @@ def size():
     sizing = SizingResult(
         None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
     )  # fmt: skip
-    return size_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
+    return check_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
 def test_a_design_that_meets_all_that_can_be_met_is_not_red():

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import cumulative_simpson
 from worlds import paper
 
-from mmrjax.effects.electrical_effects import ThermalDrift
+from mmrjax.effects.voltage_effects import ThermalDrift
 from mmrjax.fidelities.drive import _status_of_run, drive, drive_batch
 from mmrjax.fidelities.result import movers_slip
 from mmrjax.fidelities.steady import steady, steady_batch

@@ -32,18 +32,7 @@ from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.signals import Signals
 from sweeps.commands import rig_new
-from sweeps.export import (
-    comparison,
-    expressions,
-    feed_forward,
-    formats,
-    jax_actuator,
-    law_source,
-    mujoco,
-    onnx,
-    randomization,
-    situation,
-)
+from sweeps.export import comparison, expressions, feed_forward, formats, jax_actuator, law_source, mujoco
 from sweeps.export import joint as joints
 from tests.commands import ends, read_json
 
@@ -64,7 +53,7 @@ def of_effects(amplitudes):
 def compared(file):
     """A drive on wheels and the native model over Table 8."""
     drive = joints.joint_of_robot(file, WHEELS)
-    runs = situation.situation_of_joint(drive, None)
+    runs = comparison.situation_of_joint(drive, None)
     return drive, runs, law_source.law_constants(drive, runs.signals, None)
 
 
@@ -323,15 +312,15 @@ def test_onnx_model_is_the_step_of_jax(with_effects):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
     drive, _, known = with_effects
-    files = onnx.onnx_files(drive, known)
-    assert onnx.difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
+    files = jax_actuator.onnx_files(drive, known)
+    assert jax_actuator.difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
 
 
 def test_missing_onnx_library_names_the_extra(with_effects, monkeypatch):
     drive, _, known = with_effects
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(BadConfiguration, match=r'jax2onnx is not installed; pip install "mmrjax\[export\]"'):
-        onnx.onnx_files(drive, known)
+        jax_actuator.onnx_files(drive, known)
 
 
 def stand_in(monkeypatch):
@@ -411,19 +400,19 @@ def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain):
     law = mujoco.translate_law(drive, normal)
     refitted = dict(zip(law.names, map(float, law.start), strict=True))
     refitted[mujoco.RESISTANCE] *= 1.1  # as if a refit had found more
-    found = randomization.draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
+    found = formats.draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
     resistance, friction = found["actuator/motor.resistance"], found["actuator/motor.friction_coulomb"]
     assert_allclose(found["mujoco/resistance"], 1.1 * resistance / 0.74, rtol=1e-9)
     assert np.corrcoef(resistance, friction)[0, 1] == pytest.approx(-0.8, abs=0.06)
     assert np.corrcoef(found["mujoco/resistance"], found["mujoco/frictionloss"])[0, 1] == pytest.approx(
         -0.8, abs=0.06
     )
-    files = randomization.randomization_files(found)
+    files = formats.randomization_files(found)
     kept = np.load(io.BytesIO(files["draws.npz"]))
     assert set(kept) == set(found)
     assert len(kept["mujoco/motorconst"]) == 400
     with pytest.raises(BadConfiguration, match=f"no {posterior_file.FILE} next to"):
-        randomization.draw_parameters(drive, None, known, refitted, normal, 4, 0)
+        formats.draw_parameters(drive, None, known, refitted, normal, 4, 0)
 
 
 RIG = """
@@ -608,13 +597,13 @@ def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path)
     (tmp_path / "runs.csv").write_text(f"{header}\n{row}\n")
     drive = joints.joint_of_robot(of_effects({}), TRACKS if message == "levers" else WHEELS)
     with pytest.raises(BadData, match=message):
-        situation.situation_of_joint(drive, str(tmp_path / "runs.csv"))
+        comparison.situation_of_joint(drive, str(tmp_path / "runs.csv"))
 
 
 def test_a_rig_without_a_limit_of_the_voltage_needs_runs(rig):
     rig.write_text(RIG.replace("voltage_limit = 12.0\n", ""))
     with pytest.raises(BadConfiguration, match=r"--data: not given, and rig\.toml has no motor\."):
-        situation.situation_of_joint(joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm"), None)
+        comparison.situation_of_joint(joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm"), None)
 
 
 def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
@@ -637,16 +626,16 @@ def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
     assert kept["directional_viscous"] < 0.01 and kept["gear_quadratic_loss"] < 0.95
     rng = np.random.default_rng(4)
     volts = rng.choice((-1.0, 1.0), 8) * rng.uniform(4, 12, 8)
-    grid = situation.export_grid(found.joint)
-    loads = rng.uniform(0, 0.5, 8) * np.sign(volts) * situation.stall_torque(found.joint, np.abs(volts))
+    grid = comparison.export_grid(found.joint)
+    loads = rng.uniform(0, 0.5, 8) * np.sign(volts) * comparison.stall_torque(found.joint, np.abs(volts))
     columns = {"configuration": np.repeat("arm", 8), grid.layout.imposed_column: volts, "load_torque_Nm": loads}
-    other = situation.situation_of_joint(found.joint, dataclasses.replace(grid, columns=columns))
+    other = comparison.situation_of_joint(found.joint, dataclasses.replace(grid, columns=columns))
     law = mujoco.translate_law(found.joint, 0.0)
     theta = jnp.asarray([found.comparison.refitted[n] for n in law.names])
     near = comparison.evaluate_law(law, theta, other.command, other.load, other.way)
     motor = mujoco.mjcf_motor(found.joint, found.comparison.refitted)
     got = mujoco.settle_in_mujoco(
-        found.files, motor, other, situation.JointResult(*map(np.asarray, near)), range(len(other.load))
+        found.files, motor, other, comparison.JointResult(*map(np.asarray, near)), range(len(other.load))
     )
     stated = found.comparison.errors[comparison.EXPORTED]
     assert len(other.load) >= 6

@@ -25,9 +25,8 @@ from sweeps import config as configuration
 from sweeps import console
 from sweeps.export import feed_forward, law_source, mujoco
 from sweeps.export import joint as joints
-from sweeps.report import page_renderer
+from sweeps.report import export_report, page_renderer
 from sweeps.report.document import Column, Document, Note, Section, Table
-from sweeps.report.words import export_words
 
 #: Each ends a literal, a comment or a line of some language, and would then call `boom`.
 NAMES = (
@@ -101,7 +100,7 @@ def test_models_headers_and_pages_of_an_export_have_names_as_words(drive):
     header = feed_forward.c_header(joint, points, [ALL])
     assert "boom" not in re.sub(r"/\*.*?\*/", "", header, flags=re.S).replace(joint.name, "")
     assert joint.name.isidentifier() and not obeyed(header)
-    words = export_words.escape_markdown(ALL)
+    words = export_report.escape_markdown(ALL)
     assert not obeyed(words) and "<" not in words and "`" not in words and not re.search(r"(?<!\\)\||\n", words)
 
 

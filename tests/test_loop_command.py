@@ -176,7 +176,7 @@ def test_result_has_the_schema_of_the_issue(done):
     jsonschema.validate(r, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**r, "verdict": "perhaps"}, schema)
-    assert r["schema"] == "mmrjax.loop/3" and r["verdict"] in ("named", "class")
+    assert r["schema"] == "mmrjax.loop/4" and r["verdict"] in ("named", "class")
     (effect,) = r["effects"]
     assert {"name", "class", "balance", "equation", "parameters", "p_value", "score"} <= set(effect)
     assert effect["name"] == effect["class"][0] and "churning" in effect["class"]

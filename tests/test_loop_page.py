@@ -19,18 +19,16 @@ from test_stated_values import traced as leads
 from worlds import settled, tables
 
 from calibration.data.writing import json_value
-from calibration.discovery.discover import FAR
 from calibration.discovery.hidden import HiddenEffect
-from calibration.discovery.loop_notes import NameSupport, NameTest, RuledOut, TrackModelQuestion
+from calibration.discovery.loop_notes import NameSupport, NameTest, RuledOut
 from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.result import (
-    ParameterEstimate,
     RejectedCandidate,
     StatedValue,
-    TrackModelResult,
     WorseChannel,
 )
 from calibration.discovery.settings import WITHOUT_NAME
+from calibration.discovery.verdict import FAR
 from calibration.inference.fit_notes import Remark, remarks_with_codes
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words
@@ -108,7 +106,7 @@ def written(folder, found):
 def test_result_has_its_schema(shown, capsys, name):
     got = shown(name, capsys)
     jsonschema.validate(got.document, SCHEMA)
-    for field in ("standing", "cluster", "hidden", "resolved"):
+    for field in ("standing", "cluster", "hidden"):
         less = {k: v for k, v in got.document.items() if k != field}
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(less, SCHEMA)
@@ -293,18 +291,6 @@ def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys,
     }
 
 
-def resolved(found, p, outside=(), settled=True):
-    """The result with what the track model says of a slip."""
-    constants = {
-        "running_gear.guide_recess": ParameterEstimate(3.1e-4, 4e-5, "m", False), "x.static": ParameterEstimate(0.58, 0.02, "-", True)
-    }  # fmt: skip
-    return dataclasses.replace(found, resolved=TrackModelResult(
-        asked=TrackModelQuestion("missing", "slip", "slope"), rows=10, robot=found.robot, constants=constants, alike=(("a", "b", -0.95),),
-        outside=outside, settled=settled, fall=61.0, p=p, chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)},
-        slip_rms=(3.3, 0.6), remarks=("said too",),
-    ))  # fmt: skip
-
-
 def with_effect(found, **changes):
     return dataclasses.replace(found, verdict="class", effects=(dataclasses.replace(found.effects[0], **changes),))
 
@@ -336,15 +322,11 @@ TOLD = {
         {"brush_drop": 0.9}, {"brush_drop": 0.9}, {"brush_drop": 2.9}, -8.0,
         (RuledOut("brush_drop", "size", 2.9, ("motor.resistance",)),),
     ),)),
-    "explained": lambda found: resolved(found, 1e-6),
-    "unexplained": lambda found: resolved(found, 0.4),
-    "outside": lambda found: resolved(found, 1e-6, ("running_gear.guide_gap",)),
-    "unsettled": lambda found: resolved(found, 1e-6, settled=False),
 }  # fmt: skip
 
 
 #: Parts of result.json that are kept beside the text.
-PARTS = "effects", "cluster", "hidden", "held_out_worse", "implausible", "resolved"
+PARTS = "effects", "cluster", "hidden", "held_out_worse", "implausible"
 
 
 def lines_of(found, capsys):
@@ -386,8 +368,3 @@ def test_a_run_that_is_different_is_checked_before_another_experiment():
         for level in ("place", "class")
     ]
     assert steps[0].startswith("A different bench.inertia in run 4 explains 15.8 σ") and "run 4" not in steps[1]
-
-
-def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):
-    resolved(shown("churning", capsys).found, 1e-6).save(tmp_path / "saved")
-    assert (tmp_path / "saved/robot_track.toml").exists()

@@ -9,7 +9,7 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
-from sweeps.commands import rig_from_sheet
+from sweeps.commands import rig_numbers
 from sweeps.commands.rig_new import write_new_rig
 from tests.commands import ends, read_json
 
@@ -29,7 +29,7 @@ SILENT = ("voltage", "no-load-current", "stall-current", "resistance")
 
 @pytest.mark.parametrize("names", [n for n in SUBSETS if n != SILENT], ids="+".join)
 def test_each_sheet_that_determines_the_motor_gives_its_constants(names):
-    found = rig_from_sheet.read_data_sheet({name: EXACT[name] for name in names})
+    found = rig_numbers.read_data_sheet({name: EXACT[name] for name in names})
     values = {name.removeprefix("motor."): number.value for name, number in found.items()}
     assert values == {
         "resistance": pytest.approx(2), "torque_constant": pytest.approx(0.05),
@@ -39,7 +39,7 @@ def test_each_sheet_that_determines_the_motor_gives_its_constants(names):
 
 def test_viscous_friction_that_a_sheet_leaves_open_is_free(tmp_path):
     """Half of the no-load torque may be viscous: 0.5 k I0 / ω0."""
-    sheet = rig_from_sheet.read_data_sheet(EXACT)["motor.friction_viscous"]
+    sheet = rig_numbers.read_data_sheet(EXACT)["motor.friction_viscous"]
     assert float(sheet.width) == pytest.approx(0.5 * 0.03 / 216, rel=0.01)
     write_new_rig(tmp_path / "rig.toml", None, False, sheet=EXACT)
     robot = robot_file.read_robot(tmp_path / "rig.toml")
@@ -83,7 +83,7 @@ def test_viscous_friction_of_a_motor_does_not_look_like_a_missing_effect(mmrjax,
 
 
 def test_printed_sheet_gives_the_makers_torque_constant():
-    found = rig_from_sheet.read_data_sheet(RE30)
+    found = rig_numbers.read_data_sheet(RE30)
     assert found["motor.torque_constant"].value == pytest.approx(25.9e-3, rel=1e-3)
     assert found["motor.torque_constant"].source == "data sheet, voltage / no-load speed"
 
@@ -93,15 +93,13 @@ def test_printed_sheet_gives_the_makers_torque_constant():
 )
 def test_torques_are_read_in_the_units_of_makers(text, torque):
     sheet = {"voltage": "12V", "no-load-current": "1A", "resistance": "1 ohm", "stall-torque": text}
-    assert rig_from_sheet.read_data_sheet(sheet)["motor.torque_constant"].value == pytest.approx(
-        torque / 11, rel=1e-3
-    )
+    assert rig_numbers.read_data_sheet(sheet)["motor.torque_constant"].value == pytest.approx(torque / 11, rel=1e-3)
 
 
 def test_numbers_that_differ_widen_the_constant():
-    found = rig_from_sheet.read_data_sheet(RE30 | {"stall-torque": "1090 mNm"})
+    found = rig_numbers.read_data_sheet(RE30 | {"stall-torque": "1090 mNm"})
     assert float(found["motor.torque_constant"].width.split()[0]) == pytest.approx(7.5, abs=0.3)
-    assert rig_from_sheet.read_data_sheet(RE30)["motor.torque_constant"].width == "3 %"
+    assert rig_numbers.read_data_sheet(RE30)["motor.torque_constant"].width == "3 %"
 
 
 @pytest.mark.parametrize(
@@ -120,7 +118,7 @@ def test_numbers_that_differ_widen_the_constant():
 )  # fmt: skip
 def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, message):
     with pytest.raises(BadConfiguration, match=message):
-        rig_from_sheet.read_data_sheet({name: text for name, text in (RE30 | change).items() if text is not None})
+        rig_numbers.read_data_sheet({name: text for name, text in (RE30 | change).items() if text is not None})
 
 
 def test_sheet_without_numbers_leaves_no_file(mmrjax, tmp_path):

@@ -106,10 +106,10 @@ def _file(folder, text):
 
 
 def test_keys_of_a_file_are_read_and_options_win(tmp_path):
-    file = _file(tmp_path, "seed = 3\nreplicates = 300\npopulation = 8\n")
+    file = _file(tmp_path, "seed = 3\nreplicates = 300\nrows = 800\n")
     found = config.resolve_configuration(config.Loop, file, {})
-    assert (found.seed, found.replicates, found.population) == (3, 300, 8)
-    assert config.resolve_configuration(config.Loop, file, {"population": 16}).population == 16
+    assert (found.seed, found.replicates, found.rows) == (3, 300, 800)
+    assert config.resolve_configuration(config.Loop, file, {"rows": 1600}).rows == 1600
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,8 @@ import pytest
 
 from calibration.data import parts
 from calibration.data.input_errors import BadData
-from mmrjax.effects.electrical_effects import ThermalDrift
-from mmrjax.model.gearbox import Gearbox
-from mmrjax.model.motor import Motor
+from mmrjax.effects.voltage_effects import ThermalDrift
+from mmrjax.model.gearmotor import Gearbox, Motor
 from mmrjax.model.power import Battery
 from tests.commands import ROOT
 

@@ -19,7 +19,7 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
 from sweeps import config
-from sweeps.points import uncertainty
+from sweeps.points import run
 
 NAMES = ("motor.resistance", "6T2A.track.guide_share", "6T2A.ground.friction.static", "motor.temperature_ambient")
 
@@ -85,7 +85,7 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
 @pytest.mark.slow
 def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted):
     runs = read_runs("measured").where(np.array([0, 1, 5, 6]))
-    found = uncertainty.simulate_draws(fitted, posterior, runs, config.Compare(), 500)
+    found = run.simulate_draws(fitted, posterior, runs, config.Compare(), 500)
     conditions = runs.conditions(fitted)
 
     def readings(z):
@@ -101,7 +101,7 @@ def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted
     assert_allclose(found.sd(column), linear, rtol=0.1)
     middle = np.asarray(readings(jnp.asarray(posterior.mean)))
     assert_allclose(found.columns[column + "_upper"] - middle, 1.96 * linear, rtol=0.2)
-    assert np.all(found.columns[uncertainty.SHARE] == 1)
+    assert np.all(found.columns[run.SHARE] == 1)
 
 
 @pytest.mark.slow
@@ -110,8 +110,8 @@ def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
     coordinates = priors.parameter_coordinates(robot, names)
     wide = posterior_of_coordinates(coordinates, np.zeros(1), np.eye(1))
     runs = read_runs("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
-    found = uncertainty.simulate_draws(robot, wide, runs, config.Compare(), 300)
-    share = found.columns[uncertainty.SHARE]
+    found = run.simulate_draws(robot, wide, runs, config.Compare(), 300)
+    share = found.columns[run.SHARE]
     assert share[0] == 1 and 0.7 < share[1] < 0.95
     assert np.isfinite(found.sd("speed_mm_s")).all()
 
@@ -218,7 +218,7 @@ def test_file_of_another_schema_is_refused(tmp_path):
 
 def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():
     some = np.array([[np.inf] * 3, [40.0, np.inf, 50.0]])
-    found = uncertainty._summary({"winding_settled_C": some}, np.ones((2, 3), bool))
+    found = run._summary({"winding_settled_C": some}, np.ones((2, 3), bool))
     assert np.isnan(found["winding_settled_C_sd"]).all()
 
 
@@ -227,7 +227,7 @@ def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():
     (0.5, 0.000012, 3, "0.500 ± 0.000"), (-0.0001, 0.02, 3, "0.000 ± 0.020"), (-0.001, 0.0, 2, "0.00 ± 0.00"),
 ])  # fmt: skip
 def test_a_value_is_said_to_two_digits_of_its_sd(value, sd, most, said):
-    assert uncertainty.with_sd(value, sd, most) == said
+    assert run.with_sd(value, sd, most) == said
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.model import params
 from sweeps.inputs import one_run
-from sweeps.report.words import posture_words
+from sweeps.report import turn_words
 from tests.commands import ends, text_file
 
 
@@ -18,22 +18,20 @@ from tests.commands import ends, text_file
 def flush(robot):
     cells = {"levers_front_deg": 180.0, "levers_rear_deg": -8.5, "slope_deg": 15.0}
     runs = one_run(robot, cells)
-    return posture_words.posture_of_runs(robot, runs, runs.conditions(robot))
+    return turn_words.posture_of_runs(robot, runs, runs.conditions(robot))
 
 
 @pytest.mark.slow
 def test_a_run_that_would_tip_is_said_to(flush):
-    tipping = posture_words.Postures(
-        {**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.best
-    )
-    assert posture_words.tipping_remarks(tipping) == [
+    tipping = turn_words.Postures({**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.best)
+    assert turn_words.tipping_remarks(tipping) == [
         "posture: the run would tip over on that slope. Currents and speeds are those of a robot held upright"
     ]
 
 
 def test_runs_without_levers_have_no_posture(robot):
     runs = one_run(robot, {})
-    assert posture_words.posture_of_runs(robot, runs, runs.conditions(robot)) is None
+    assert turn_words.posture_of_runs(robot, runs, runs.conditions(robot)) is None
 
 
 @pytest.mark.slow
@@ -41,7 +39,7 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     raised = params.replace(robot, {"running_gear.lever_rear": np.pi / 2})
     conditions = one_run(raised, {"levers_front_deg": 20.0}).conditions(raised)
     assert conditions.levers_rear_deg is None and conditions.states_levers
-    tops = posture_words.posture_of_runs(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
+    tops = turn_words.posture_of_runs(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
     assert tops["tip_rear_mm"][0] == pytest.approx(262, abs=1)
 
 

@@ -8,7 +8,18 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import active_set, candidates, discover, findings, score_tests, screening, standing
+from calibration.discovery import (
+    active_set,
+    candidates,
+    discover,
+    findings,
+    log_stages,
+    loop_input,
+    score_tests,
+    search,
+    standing,
+    verdict,
+)
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
 from calibration.inference.bases import family_names
@@ -87,17 +98,17 @@ def answered(tmp_path_factory):
         noise = (
             f"motor_speed={SD[0] / RPM}rpm,{next(c.name for c in runs.channels if c.name != 'motor_speed')}={SD[1]}A"
         )
-        return discover.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
+        return loop_input.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
 
     @functools.cache
     def space_of(**faults):
         runs = Runs("log.csv", log(**faults)).of(robot)
         sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
-        return discover.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
+        return loop_input.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
 
     def of(**faults):
         space = space_of(**faults)
-        return findings.rank_effects_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
+        return findings.rank_effects_by_weak_form(space, search.screen_by_weak_form(space, SETTINGS), SETTINGS)
 
     @functools.cache
     def windows_of(**faults):
@@ -218,7 +229,7 @@ def test_a_friction_that_falls_within_each_run_is_a_curve_over_time(answered, mo
 @pytest.mark.slow
 @pytest.mark.parametrize("fault, family", [({"forward": 0.3}, "loss torque that changes with direction"), ({}, "")])
 def test_the_windows_of_a_log_decide_and_one_simulation_confirms(answered, monkeypatch, fault, family):
-    monkeypatch.setattr(discover, "LONG", 0)
-    traced, begin = answered.input_of(**fault).trace_windows()
-    assert (traced is None) == (not fault) and begin is not None
+    monkeypatch.setattr(log_stages, "LONG", 0)
+    traced = discover.trace_windows(answered.input_of(**fault))
+    assert isinstance(traced, verdict.LoopStages if fault else candidates.Candidate)
     assert not fault or (family in traced.families and traced.run.gained > 0.5 * traced.run.promised > 0)

@@ -6,8 +6,8 @@ import xarray as xr
 from pages import Tables, drawn, outside
 from test_sweep_store import CONFIG
 
-from sweeps.pages import campaign_figures
-from sweeps.report import campaign_report
+from sweeps.pages import sweep_figures
+from sweeps.report import sweep_report
 from tests.commands import read_json
 
 REPORTED = CONFIG.replace("report = false\n", "")
@@ -61,26 +61,26 @@ def test_page_of_one_axis_has_one_band(page):
 
 @pytest.mark.slow
 def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, monkeypatch):
-    monkeypatch.setattr(campaign_report, "THINNED", 60)
-    monkeypatch.setattr(campaign_report, "CHUNKS", 6)
+    monkeypatch.setattr(sweep_report, "THINNED", 60)
+    monkeypatch.setattr(sweep_report, "CHUNKS", 6)
     assert "60 settled points drawn at random." in " ".join(page().text.split())
 
 
 def test_share_is_the_variance_between_levels():
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, 5, 20_000).astype(float), rng.standard_normal(20_000)
-    assert campaign_figures.variance_share(x, x) == pytest.approx(1)
-    assert campaign_figures.variance_share(x, y) < 0.01
-    assert campaign_figures.variance_share(y, y) > 0.98
-    assert campaign_figures.variance_share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)
+    assert sweep_figures.variance_share(x, x) == pytest.approx(1)
+    assert sweep_figures.variance_share(x, y) < 0.01
+    assert sweep_figures.variance_share(y, y) > 0.98
+    assert sweep_figures.variance_share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)
 
 
 def test_few_points_fill_few_bins():
     """No panel is empty where samples have few points each."""
     resistance, voltage = np.tile(np.linspace(0.5, 0.7, 12), 2), np.repeat([15.0, 33.0], 12)
     varied = {
-        "voltage": campaign_figures.VariedQuantity(voltage, "V"),
-        "r": campaign_figures.VariedQuantity(resistance, "r"),
+        "voltage": sweep_figures.VariedQuantity(voltage, "V"),
+        "r": sweep_figures.VariedQuantity(resistance, "r"),
     }
-    histogram, *bands, _, _ = campaign_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
+    histogram, *bands, _, _ = sweep_figures.draw_output_spread(0.1 * voltage + resistance, "I", varied).axes
     assert [len(b.lines[0].get_xdata()) for b in bands] == [2, 6] and len(histogram.patches) == 6

@@ -14,8 +14,8 @@ from mmrjax import fidelities
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED
-from mmrjax.undercarriage.stability import largest_step
-from sweeps.pages import gear_figures
+from mmrjax.undercarriage.modes import largest_step
+from sweeps.pages import resonance_figures
 from sweeps.paper import report
 from sweeps.points import run as simulation
 from sweeps.report import page_renderer, runs_report
@@ -75,12 +75,14 @@ def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, wri
 @pytest.fixture(scope="module")
 def gears(robot, written):
     run = written[2]
-    return gear_figures.gear_runs(robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T"))
+    return resonance_figures.gear_runs(
+        robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T")
+    )
 
 
 @pytest.mark.slow
 def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
-    upper, lower = gear_figures.draw_touchdowns(gears[0]).axes
+    upper, lower = resonance_figures.draw_touchdowns(gears[0]).axes
     for axes in (upper, lower):
         marks = sorted(line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == ":")
         assert len(marks) >= 3

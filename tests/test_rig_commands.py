@@ -14,7 +14,6 @@ from mmrjax import fidelities
 from mmrjax.model import channels, params, quantities
 from sweeps import capabilities
 from sweeps.commands import rig_new
-from sweeps.points import imposed
 from sweeps.report import fit_tables
 from tests.commands import ends, read_json
 from tests.commands import rows as rows_of
@@ -174,8 +173,10 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
     )
     notes = []
     top = 500.0 / quantities.RPM
-    found = imposed.imposed_levels(robot, "--motor-speeds", notes)
-    assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
+    found = capabilities.imposed_levels(robot, "--motor-speeds", notes)
+    assert all(
+        0.9 * share * top < level <= share * top for level, share in zip(found, capabilities.SHARES, strict=True)
+    )
     assert notes == [
         "--motor-speeds: not given. Thirds of the speed_limit in the robot's file are used: 1500,3100,4700"
     ]

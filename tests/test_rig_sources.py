@@ -11,7 +11,7 @@ from calibration.data.stated import example_numbers, has_template_number, is_exa
 from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
-from sweeps.commands.rig_template import rig_template
+from sweeps.commands.rig_numbers import rig_template
 from tests.commands import ends, read_rig
 
 DIFFBOT = Path(__file__).parent / "data/diffbot.urdf"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import instruments, rig_facts, robot_file, surfaces
+from calibration.data import inferred_facts, rig_facts, robot_file, surfaces
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
@@ -19,13 +19,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params, quantities
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.contact import Friction
-from mmrjax.model.ground import Ground
+from mmrjax.model.contact import Friction, Ground, Track
 from mmrjax.model.rig import Instrument, Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STALLED
-from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
 from tests.commands import csv_text, read_rig, read_table, text_file
@@ -582,13 +580,13 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     ],
 )
 def test_step_of_readings_is_their_common_divisor(readings, step):
-    assert instruments.common_step(np.array(readings)) == pytest.approx(step, rel=1e-9)
+    assert inferred_facts.common_step(np.array(readings)) == pytest.approx(step, rel=1e-9)
 
 
 def test_step_of_an_encoder_is_found_in_a_log_that_is_printed_to_nine_digits():
     """648.632813 for 648.6328125: the step was not found, and its rounding was not in the noise."""
     angle = np.round(360 / 1024 * np.cumsum(np.random.default_rng(0).integers(1, 9, 400)), 6)
-    assert angle.max() > 500 and instruments.common_step(angle) == pytest.approx(360 / 1024, rel=1e-4)
+    assert angle.max() > 500 and inferred_facts.common_step(angle) == pytest.approx(360 / 1024, rel=1e-4)
 
 
 def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
@@ -603,8 +601,8 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     runs = records.read_runs(path, robot=free)
     (found,) = runs.layout.instruments
     assert found.signed is False and found.quantum == pytest.approx(0.03, rel=1e-9)
-    assert instruments.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
-    assert instruments.with_inferred_instruments(stated, runs) is stated
+    assert inferred_facts.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
+    assert inferred_facts.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
     sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
     assert_allclose(sds[0], sds[1], rtol=1e-9)

@@ -12,7 +12,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
-from sweeps.pages.time_overlay import time_overlay
+from sweeps.pages.comparison_figures import time_overlay
 from tests.commands import read_table, text_file
 
 HEADER = (

@@ -15,13 +15,11 @@ from calibration.data import robot_file
 from calibration.inference import priors
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
-from calibration.sensitivity import next_runs
 from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
-from calibration.sensitivity.local import inert_inputs, local_derivatives
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import OperatingPoints
-from calibration.sensitivity.study import Study
+from calibration.sensitivity.study import Study, inert_inputs, local_derivatives
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
@@ -150,16 +148,9 @@ def test_command_leaves_indices_as_its_schema_says(mmrjax, tmp_path):
     assert set(index) == {"first", "total", "first_interval", "total_interval"}
     assert index["total"] > 0.5 and index["total_interval"][0] < index["total"] < index["total_interval"][1]
     assert document["inputs"]["motor.inductance"]["inert"] and document["negligible"] == ["motor.inductance"]
-    runs = document["next_runs"]
-    assert len(runs["runs"]) == 5 and runs["sd_ratio"]["motor.torque_constant"][-1] < 0.5
     rows = table(tmp_path / "s/points.csv")
     assert len(rows) == 3 * 4 * 4 and {"derivative", "elasticity", "at_low", "at_high", "total_low"} <= set(rows[0])
     assert outside(tmp_path / "s") == []
-
-
-def test_a_share_of_a_reading_of_zero_tells_nothing():
-    told = next_runs.fisher_information(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
-    assert_array_equal(told, [[[0.25]]])
 
 
 def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
@@ -169,7 +160,7 @@ def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
     monkeypatch.setattr(sensitivity_report, "_inputs", lambda *_: "a table")
     one = {"studied": np.array([True]), "value": np.zeros(1), "row": SimpleNamespace(label=""), "second": None}
     outputs = {k: SimpleNamespace(overall_share=v, **one) for k, v in shares.items()}
-    found = SimpleNamespace(outputs=outputs, next_runs=None, comparison={}, names=("a", "b"))
+    found = SimpleNamespace(outputs=outputs, comparison={}, names=("a", "b"))
     blocks = [block for section in sensitivity_report._sections(found) for block in section.blocks]
     assert [b.name for b in blocks if isinstance(b, Figure)] == ["tornado_speed"]
 
@@ -217,21 +208,8 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
 
 
 @pytest.mark.slow
-def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
-    (tmp_path / "bad.csv").write_text("configuration,supply_voltage_V,payload_kg\n6T2A,24,3\n")
-    got, _, err = mmrjax(*SMALL, "--candidates", "bad.csv")
-    assert got == 4 and "bad.csv: column slope_deg is missing" in err
-    (tmp_path / "two.csv").write_text(
-        "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,3,0\n4W2T,33,8,5\n"
-    )
-    got, _, _ = mmrjax(*SMALL, "--method", "local", "--candidates", "two.csv", "--no-report", "--out", "c")
-    runs = read_json(tmp_path / "c/result.json")["next_runs"]
-    assert got == 0 and runs["candidates"] == 2 and runs["source"] == "two.csv" and len(runs["runs"]) == 2
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("vary", ["voltage=22:26", "total_mass=12:16"])
-def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(mmrjax, tmp_path, vary):
+def test_conditions_that_vary_are_inputs(mmrjax, tmp_path, vary):
     ends(
         mmrjax(
             "sensitivity --method local --parameters",
@@ -254,7 +232,7 @@ def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(m
         code=0,
     )
     document = read_json(tmp_path / "v/result.json")
-    assert vary.partition("=")[0] in document["inputs"] and len(document["next_runs"]["runs"]) == 5
+    assert vary.partition("=")[0] in document["inputs"]
 
 
 @pytest.mark.slow

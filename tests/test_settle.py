@@ -17,7 +17,7 @@ from calibration.data.input_errors import BadData
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import InformationForecast
-from calibration.words import settle_words as words
+from calibration.words import table_words as words
 from sweeps.commands import rig_check
 from tests.commands import ROOT, csv_text, ends, read_json, read_rig, text_file
 

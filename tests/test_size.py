@@ -17,7 +17,7 @@ from calibration.sizing.design import build_robot, build_sizing_task, evaluate_d
 from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
-from sweeps.report.size_report import design_verdict
+from sweeps.report.check_report import design_verdict
 from tests.commands import command, read_json, schema_of
 
 SCHEMA = schema_of("size")

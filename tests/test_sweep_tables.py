@@ -12,7 +12,7 @@ from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps import config
-from sweeps.points import run, scale, uncertainty
+from sweeps.points import run, scale
 from sweeps.points.sampled_design import DrawnSamples
 from sweeps.store import RunFolder
 
@@ -74,29 +74,29 @@ def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
 
 @pytest.mark.slow
 def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, posterior):
-    found = uncertainty.simulate_draws(robot, posterior, runs, chunked(None), DRAWS)
+    found = run.simulate_draws(robot, posterior, runs, chunked(None), DRAWS)
     each = [
         run.evaluate_runs(params.replace(robot, dict(zip(NAMES, theta, strict=True))), runs, chunked(None), None)
-        for theta in posterior.draw(DRAWS, uncertainty.SEED)
+        for theta in posterior.draw(DRAWS, run.SEED)
     ]
     speeds = np.array([table["speed_mm_s"] for table in each])
     assert_allclose(found.sd("speed_mm_s")[:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
-    low = np.quantile(speeds[:, :3], uncertainty.QUANTILES[0], axis=0)
+    low = np.quantile(speeds[:, :3], run.QUANTILES[0], axis=0)
     assert_allclose(found.columns["speed_mm_s_lower"][:3], low, rtol=1e-12)
-    assert found.columns[uncertainty.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found.sd("speed_mm_s")[3])
+    assert found.columns[run.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found.sd("speed_mm_s")[3])
 
 
 @pytest.mark.slow
 def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
     """Of a run all draws in one chunk, some runs in each, and a run's draws in three."""
-    whole = uncertainty.simulate_draws(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
-    parted = uncertainty.simulate_draws(robot, posterior, runs, chunked(4), DRAWS)
+    whole = run.simulate_draws(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
+    parted = run.simulate_draws(robot, posterior, runs, chunked(4), DRAWS)
     same(whole.columns, parted.columns, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkeypatch):
-    whole = uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS)
+    whole = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS)
     folder, computed, honest = RunFolder(tmp_path / "r", {}), [], scale.Compiled.__call__
 
     def interrupted(compiled, values, *told):
@@ -107,14 +107,14 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
 
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+        run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     kept = len(list((tmp_path / "r.partial/chunks").glob("draws-*.stage")))
     assert kept <= 2
     computed.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
-    same(uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder).columns, whole.columns)
+    same(run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder).columns, whole.columns)
     assert len(computed) == 4 - kept
-    again = uncertainty.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+    again = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     assert len(computed) == 4 - kept  # nothing is left to do
     same(again.columns, whole.columns)
     folder.close()

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 
 from mmrjax.model import channels
 from sweeps.pages import figure_style
-from sweeps.pages.time_overlay import POINTS, time_overlay
+from sweeps.pages.comparison_figures import POINTS, time_overlay
 from sweeps.report import page_renderer as page
 
 SPEED, CURRENT = channels.find_channel("motor_speed"), channels.find_channel("motor_current")

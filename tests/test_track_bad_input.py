@@ -13,9 +13,9 @@ from mmrjax.fidelities.track import _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED, FLAGS, TIPS
-from mmrjax.undercarriage import stability
+from mmrjax.undercarriage import modes
 from mmrjax.undercarriage.half_robot import build_system, stand, tipping_margin
-from mmrjax.undercarriage.stability import _whole, largest_step
+from mmrjax.undercarriage.modes import _whole, largest_step
 from sweeps import config as configuration
 from sweeps.points import run
 from sweeps.points.grid import grid_conditions
@@ -36,12 +36,12 @@ def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
 
 def test_refusal_names_the_first_run_that_a_step_is_too_large_for_and_one_to_take(robot, monkeypatch):
     """With limits as if they had been found: how they are is another test's."""
-    monkeypatch.setattr(stability, "largest_step", lambda robot, conditions: np.array([9e-4, 6.5e-4]))
+    monkeypatch.setattr(modes, "largest_step", lambda robot, conditions: np.array([9e-4, 6.5e-4]))
     with pytest.raises(
         ValueError, match=r"step: got 0.001 s; .*largest stable step is 0\.00065 s \(run 2 of 2\); take 0.0005 s,"
     ):
-        stability.check_track_step(robot, TWO, 1e-3, 1e-3)
-    stability.check_track_step(robot, TWO, 5e-4, 1e-3)
+        modes.check_track_step(robot, TWO, 1e-3, 1e-3)
+    modes.check_track_step(robot, TWO, 5e-4, 1e-3)
 
 
 @pytest.mark.slow

@@ -19,13 +19,12 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.channels import SIDES
 from mmrjax.model.quantities import HEAT
+from sweeps.capabilities import UNLIMITED
 from sweeps.commands import simulate
 from sweeps.pages import mission_figures
 from sweeps.pages.figure_style import figure_as_svg
-from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
-from sweeps.report import check_report, run_tables, turn_report
-from sweeps.report.words import turn_words
+from sweeps.report import check_report, run_tables, runs_report, turn_words
 from tests.commands import ends, read_json, rows, text_file
 
 
@@ -148,7 +147,7 @@ def told(robot, name, ended=None):
     turn = row(**TOLD[name])
     yield f"{name}: {turn_words.turn_answer(turn, ended)}"
     yield from turn_words.turn_notes(robot, turn)
-    yield from (" | ".join(map(str, side)) for side in turn_report.sides_table(robot, turn).rows)
+    yield from (" | ".join(map(str, side)) for side in runs_report.sides_table(robot, turn).rows)
 
 
 def test_turns_are_told_as_recorded(robot):

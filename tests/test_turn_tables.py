@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import mmrjax as mm
 from calibration.data import runs as records
+from calibration.data.inferred_facts import with_inferred_instruments
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.instruments import with_inferred_instruments
 from calibration.inference.calibration import calibrate
 from calibration.inference.ranges import check_ranges
 from mmrjax.model import balances

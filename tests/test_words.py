@@ -14,7 +14,6 @@ import pytest
 from synthetic import LOST_MOTION
 
 from calibration.described import describe, report_in_words
-from calibration.discovery import loop_notes as of_loop
 from calibration.discovery.formula import Proposal
 from calibration.discovery.loop_notes import (
     AlternativeValue,
@@ -331,8 +330,6 @@ def sentences():
     for found, predicted in WORSE:
         worse = () if found is None else (WorseChannel("voltage", "motor_speed", *found),)
         yield loop_words.rising_errors_sentence(worse, {"voltage": predicted})
-    for about in (("missing", "slip", "speed_motor"), ("found", "", "", ("a", "b")), ("near", "", "", ("a",))):
-        yield loop_words.track_model_question(of_loop.TrackModelQuestion(*about))
     yield from (found.statement for found in (*ADEQUACY, *CLUSTERS))
 
 

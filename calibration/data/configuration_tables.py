@@ -13,11 +13,9 @@ from calibration.data import Json, Names, rig_file
 from calibration.data.input_errors import BadConfiguration, stated_as, stated_names, stated_word
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
-from mmrjax.model.contact import Friction
-from mmrjax.model.ground import Ground
+from mmrjax.model.contact import Friction, Ground, Track
 from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
-from mmrjax.model.track_friction import Track
 
 #: Kinds of movers, and the `on_tracks` of each.
 MOVERS = {"tracks": 1.0, "wheels": 0.0}

@@ -359,20 +359,3 @@ class RuledOut:
     why: str
     size: float = 0.0
     check: Names = ()
-
-
-@dataclasses.dataclass(frozen=True)
-class TrackModelQuestion:
-    """Question to the track model: the finding that a different running gear may explain.
-
-    Attributes:
-        why: `missing`: an effect is missing. `found`: effects were found. `near`: some effects explain nearly as
-            much.
-        balance, variable: balance and variable of the discrepancy.
-        effects: names of the effects.
-    """
-
-    why: str
-    balance: str = ""
-    variable: str = ""
-    effects: Names = ()

@@ -14,16 +14,15 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import entries_of, json_value, write_json, write_table
 from calibration.described import describe, sentences
-from calibration.discovery import formula
+from calibration.discovery import REFIT_FILE, formula
 from calibration.discovery.experiments import Proposal
-from calibration.discovery.headline import headline
 from calibration.discovery.hidden import HiddenEffect
-from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Headline, NameSupport, RuledOut, TrackModelQuestion, VerdictSummary
+from calibration.discovery.loop_notes import Headline, NameSupport, RuledOut, VerdictSummary
 from calibration.discovery.outliers import OutlierCluster
-from calibration.discovery.prediction import Gain
+from calibration.discovery.prediction import Gain, HeldOutAlternative
 from calibration.discovery.settings import Settings
+from calibration.discovery.verdict import headline
 from calibration.inference.details import Detail
 from calibration.inference.fit_notes import DependentPair, Notes, Remark, remarks_with_codes
 from calibration.inference.identifiability import determined_together
@@ -32,14 +31,7 @@ from calibration.inference.simulation_errors import OF_SIZE
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
-SCHEMA = "mmrjax.loop/3"
-#: The robot with the running gear fitted by the track model.
-TRACK_FILE = "robot_track.toml"
-#: The robot fitted with nothing added.
-#: Significance at which a running gear explains the discrepancy.
-RESOLVED_ERROR = 0.01
-#: Prior sds above which a constant of the running gear is implausible.
-PLAUSIBLE = 3.0
+SCHEMA = "mmrjax.loop/4"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -323,101 +315,6 @@ class WorseChannel:
 
 
 @dataclasses.dataclass(frozen=True)
-class HeldOutAlternative:
-    """An alternative set of effects, refitted without each block of runs.
-
-    Attributes:
-        effects: names of its effects.
-        leads: True if it is the proposed one.
-        rise_chi2: χ² of its fit to all rows, minus that of the best one [σ²].
-        rms_sigma: rms hold-out error over the readings that every alternative predicts [σ].
-        by_kind: the same error for each kind of block [σ].
-        lost: number of held-out readings that it cannot predict, because its robot slides or fails there.
-    """
-
-    effects: Names
-    leads: bool
-    rise_chi2: float
-    rms_sigma: float
-    by_kind: dict[str, float]
-    lost: int
-
-
-@dataclasses.dataclass(frozen=True)
-class TrackModelResult:
-    """Result of the track model: does a different running gear explain the finding of the loop?
-
-    Attributes:
-        asked: the discrepancy, or the effects, that the running gear may explain.
-        rows: number of rows on tracks that were fitted.
-        robot: robot for `--model track` with the best running gear.
-        constants: fitted constants of running gear and friction, by name.
-        alike: strongly correlated pairs of constants, with their correlation.
-        outside: constants further than `PLAUSIBLE` prior sds from their priors.
-        settled: True if both searches converged.
-        fall: decrease of twice the objective by the best running gear, priors included [σ²].
-        p: p-value of that decrease.
-        chi2: χ² of the readings with the running gear of the file, and with the best one [σ²].
-        readings: number of included readings.
-        rms_percent: error of each channel with the running gear of the file, and with the best one [%].
-        slip_rms: the same for the slip [percentage points].
-        remarks: remarks of the search.
-    """
-
-    asked: TrackModelQuestion
-    rows: int
-    robot: Robot
-    constants: dict[str, ParameterEstimate]
-    alike: tuple[tuple[str, str, float], ...]
-    outside: Names
-    settled: bool
-    fall: float
-    p: float
-    chi2: tuple[float, float]
-    readings: int
-    rms_percent: dict[str, tuple[float, float]]
-    slip_rms: tuple[float, float]
-    remarks: Notes
-
-    @property
-    def known_from_rows(self) -> Names:
-        """Names of the constants that the rows determine."""
-        return tuple(name for name, e in self.constants.items() if not e.held_by_prior)
-
-    @property
-    def gear_explains_discrepancy(self) -> bool:
-        """True if a running gear within its priors explains the discrepancy significantly."""
-        return self.p < RESOLVED_ERROR and not self.outside
-
-    @property
-    def statement(self) -> str:
-        """The result in a sentence or two."""
-        return describe(self)
-
-    @property
-    def notes(self) -> Names:
-        """Remarks of the search, as sentences."""
-        return sentences(self.remarks)
-
-    def to_json(self) -> Json:
-        """Entry of result.json."""
-        return json_value(
-            {
-                "asked": describe(self.asked),
-                **entries_of(
-                    self, "statement", "explains=gear_explains_discrepancy", "rows", "constants", "known_from_rows"
-                ),
-                "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
-                **entries_of(self, "outside", "settled", "fall_chi2=fall", "p"),
-                "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
-                "rms_percent": {n: {"before": b, "after": a} for n, (b, a) in self.rms_percent.items()},
-                "slip_rms_points": {"before": self.slip_rms[0], "after": self.slip_rms[1]},
-                "notes": self.notes,
-            }
-        )
-
-
-@dataclasses.dataclass(frozen=True)
 class DiscoveryResult:
     """Result of the closed loop.
 
@@ -465,7 +362,6 @@ class DiscoveryResult:
         replicates: number of bootstrap tables whose refit converged.
         remarks: notes on the result.
         sensitivity: verdicts at other levels of the assumed noise.
-        resolved: result of the track model. None if it was not run, or does not apply.
     """
 
     verdict: str
@@ -513,7 +409,6 @@ class DiscoveryResult:
     replicates: int
     remarks: Notes = ()
     sensitivity: tuple[NoiseVerdict, ...] = ()
-    resolved: TrackModelResult | None = None
 
     @property
     def statement(self) -> str:
@@ -669,7 +564,7 @@ class DiscoveryResult:
                     "replicates": self.replicates,
                     **entries_of(self.settings, "asked=replicates", "seed", "family_wise_error", "shares"),
                 },
-                **entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes", "resolved"),
+                **entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes"),
             }
         )
 
@@ -706,8 +601,6 @@ class DiscoveryResult:
         """Writes `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (the refit without
         additions).
 
-        If the track model was run, it also writes `robot_track.toml`.
-
         Args:
             folder: folder for the files, created if missing.
             robot_name: name of the initial robot.
@@ -722,8 +615,6 @@ class DiscoveryResult:
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))
         posterior.write_posterior(self.posterior, folder / posterior.FILE)
-        if self.resolved is not None:
-            robot_file.write_robot(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data import Columns, Names
+from calibration.data.clock import rows_of_varying_runs
 from calibration.data.columns import CURRENT, LOAD, SPEED
-from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import held_out as refits
 from calibration.inference.problem import Problem

@@ -12,10 +12,10 @@ from calibration.data.runs import Runs
 from calibration.data.writing import entries_of, json_value
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Remark
-from calibration.sensitivity.replicates import LEVEL, REPLICATES, IntervalEstimate
+from calibration.sensitivity.sampled_indices import LEVEL, REPLICATES, IntervalEstimate
 from mmrjax.model.quantities import Quantity
 
-SCHEMA = "mmrjax.sensitivity/1"
+SCHEMA = "mmrjax.sensitivity/2"
 #: Methods.
 METHODS = ("local", "sobol", "morris")
 #: An input is negligible if its share of the variance is smaller for all outputs and points [-].
@@ -179,31 +179,6 @@ class Interaction:
 
 
 @dataclasses.dataclass(frozen=True)
-class NextRuns:
-    """The most informative next runs.
-
-    Attributes:
-        candidates: number of candidates.
-        source: origin of the list of candidates.
-        points: chosen runs, in order.
-        gain: information that each adds [bit], shape (runs,).
-        noise: channel → standard deviation relative to the reading [-], and the noise as text.
-        sd: standard deviation of each input after each number of runs, relative to that before any, shape (runs + 1,
-            inputs).
-        output_sd: output → its standard deviation after each number of runs, rms over the points [SI], shape (runs +
-            1,).
-    """
-
-    candidates: int
-    source: str
-    points: OperatingPoints
-    gain: np.ndarray
-    noise: str
-    sd: np.ndarray
-    output_sd: Columns
-
-
-@dataclasses.dataclass(frozen=True)
 class SensitivityResult:
     """Result of a sensitivity study.
 
@@ -217,7 +192,6 @@ class SensitivityResult:
         outputs: results by output name.
         statuses: source → status → number of points, at the medians.
         sampled: source → status → number of points, in the sample.
-        next_runs: most informative next runs. None if no candidate converges.
         evaluations: number of model evaluations.
         seconds: duration of the evaluations [s], including compilation.
         remarks: notes on the result.
@@ -232,7 +206,6 @@ class SensitivityResult:
     outputs: dict[str, OutputStudy]
     statuses: dict[str, dict[str, int]]
     sampled: dict[str, dict[str, int]]
-    next_runs: NextRuns | None
     evaluations: int
     seconds: float
     remarks: tuple[Remark, ...]
@@ -305,7 +278,6 @@ class SensitivityResult:
                     if study.second is not None
                 },
                 **entries_of(self, "negligible", "statuses", "statuses_sampled=sampled"),
-                "next_runs": None if self.next_runs is None else _next_runs_json(self.next_runs, names),
                 **entries_of(self, "evaluations", "seconds", "notes"),
             }
         )
@@ -381,16 +353,3 @@ def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
         value, low, high = float(second.value[i, j]), float(second.low[i, j]), float(second.high[i, j])
         pairs_found.append(Interaction((names[i], names[j]), value, (low, high), value - wider * (value - low) > 0))
     return sorted(pairs_found, key=lambda pair: -pair.second)
-
-
-def _next_runs_json(runs: NextRuns, names: Names) -> Json:
-    columns = runs.points.columns()
-    return {
-        **entries_of(runs, "candidates", "source", "noise"),
-        "runs": [
-            {**{key: column[k].item() for key, column in columns.items()}, "gain_bits": float(runs.gain[k])}
-            for k in range(len(runs.points))
-        ],
-        "sd_ratio": dict(zip(names, runs.sd.T, strict=True)),
-        "output_sd": runs.output_sd,
-    }

@@ -24,7 +24,6 @@ from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 if TYPE_CHECKING:
-    from calibration.discovery.discover import LoopStages
     from calibration.discovery.result import (
         DiscoveryResult,
         EffectRanking,
@@ -32,10 +31,10 @@ if TYPE_CHECKING:
         FoundEffect,
         NoiseVerdict,
         ParameterEstimate,
-        TrackModelResult,
         UnnamedDiscrepancy,
         WorseChannel,
     )
+    from calibration.discovery.verdict import LoopStages
 
 # --- the verdict ----------------------------------------------------------------------------------------
 
@@ -683,39 +682,6 @@ def _two_numbers(before: float, after: float) -> str:
     """Two numbers with as many digits as tell them apart."""
     texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
     return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))
-
-
-# --- the track model ------------------------------------------------------------------------------------
-
-
-def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
-    return {
-        "missing": f"the error of the {about.balance} balance over {bases.variable_in_words(about.variable)}",
-        "found": f"{', '.join(about.effects)}, found by the lumped model",
-        "near": f"{', '.join(about.effects)}, which explains the readings nearly as well",
-    }[about.why]
-
-
-def track_model_answer(found: TrackModelResult) -> str:
-    before, after = found.slip_rms
-    gear = ", ".join(
-        f"{name.removeprefix('running_gear.')} {_estimate(e)}"
-        for name, e in found.constants.items() if name.startswith("running_gear.")
-    )  # fmt: skip
-    on = "" if found.settled else ". The search has not converged: use more --generations"
-    slip = f"rms slip error of the {found.rows} rows on tracks {before:.2g} → {after:.2g} percentage points"
-    if not found.gear_explains_discrepancy:
-        why = f". Outside their priors: {', '.join(found.outside)}" if found.outside else ""
-        return (
-            f"Track model, {track_model_question(found.asked)}: no running gear within its priors explains this "
-            f"error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
-        )
-    constants_count = len(found.constants) - len(found.known_from_rows)
-    undetermined = f"These rows do not determine {constants_count} of {len(found.constants)} constants"
-    return (
-        f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains it "
-        f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}. {undetermined}{on}"
-    )
 
 
 # --- remarks --------------------------------------------------------------------------------------------

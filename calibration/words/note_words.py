@@ -20,7 +20,6 @@ from calibration.words import (
     fit_words,
     loop_words,
     sensitivity_words,
-    settle_words,
     step_words,
     table_words,
 )
@@ -47,16 +46,14 @@ RESULTS: dict[type, Callable[..., str]] = {
     ResidualCluster: fit_words.residual_cluster,
     fit_results.CalibrationResult: lambda found: fit_words.adequacy_verdict(found.adequacy),
     fit_results.PriorSummary: lambda prior: fit_words.PRIORS.get(prior.source, prior.source),
-    loop_notes.TrackModelQuestion: loop_words.track_model_question,
     loop_notes.Headline: loop_words.loop_answer,
     loop_notes.VerdictSummary: loop_words.verdict_sentences,
     loop_results.RejectedCandidate: lambda found: loop_words.why_ruled_out(found.reasons),
     loop_results.DiscoveryResult: lambda found: loop_words.loop_answer(found.headline),
     formula.Proposal: lambda found: found.expression or loop_words.NO_FORMULA,
-    loop_results.TrackModelResult: loop_words.track_model_answer,
     loop_results.UnnamedDiscrepancy: loop_words.curve_course,
     SensitivityResult: sensitivity_words.sensitivity_statement,
-    Settled: settle_words.settle_statement,
+    Settled: table_words.settle_statement,
 }
 #: The same of parts of results, by name.
 PARTS: dict[tuple[type, str], Callable[..., str]] = {

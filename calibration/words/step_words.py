@@ -21,8 +21,6 @@ STEPS = {
     "errors": "errors on held-out data",
     "next": "the next experiment",
     "others": "the verdicts at other noise levels",
-    "gear stated": "track model: fitting friction alone",
-    "gear free": "track model: fitting the running gear",
     # a sensitivity study
     "points": "derivatives at every operating point",
     "evaluations": "{:,} model evaluations so far, {:,.0f} a second",

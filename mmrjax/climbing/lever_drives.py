@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mmrjax.model.gearbox import Gearbox
+from mmrjax.model.gearmotor import Gearbox
 from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 

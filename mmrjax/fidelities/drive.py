@@ -31,7 +31,7 @@ from mmrjax.model.signals import (
     Signals,
     State,
 )
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.rosenbrock import Unknowns, error_norm, step_longest
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from mmrjax.fidelities import outputs
-from mmrjax.model import balances, ground
-from mmrjax.model.motor import UNLIMITED
+from mmrjax.model import balances, contact
+from mmrjax.model.gearmotor import UNLIMITED
 from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
-from mmrjax.numerics.one_sided import magnitude
+from mmrjax.numerics.elementary import magnitude
 
 #: Current into a supply that counts as 0 [A]: rounding and the remainder of a converged search.
 CURRENT_SMALL = 1e-3
@@ -37,7 +37,7 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
     result = Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,
-        slip=ground.slip_ratio(signals.speed, signals.speed_theoretical),
+        slip=contact.slip_ratio(signals.speed, signals.speed_theoretical),
         voltage=signals.voltage,
         mass=signals.mass,
         traction=sides * signals.traction,

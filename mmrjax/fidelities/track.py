@@ -33,8 +33,8 @@ from mmrjax.model.signals import (
 )
 from mmrjax.undercarriage import both_sides, half_robot
 from mmrjax.undercarriage.half_robot import Changes, HalfRobotState, HalfRobotSystem, SteadyAverages, build_system
+from mmrjax.undercarriage.modes import check_track_step, largest_step
 from mmrjax.undercarriage.side_contacts import GearReactions
-from mmrjax.undercarriage.stability import check_track_step, largest_step
 
 STEP = fidelities.fidelity_facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]

@@ -22,7 +22,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.rarely import compute_if_needed
+from mmrjax.numerics.batch_flow import compute_if_needed
 from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages, step_longest
 
 #: The first step of a segment [s], and the shortest.

@@ -19,7 +19,7 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 from mmrjax.numerics import rosenbrock
-from mmrjax.numerics.one_sided import clip
+from mmrjax.numerics.elementary import clip
 from mmrjax.numerics.rosenbrock import Unknowns
 
 #: Units of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the

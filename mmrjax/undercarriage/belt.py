@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model.contact import cubic_step
 from mmrjax.model.params import Scalar
-from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.numerics.elementary import cosine, sine
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_PULLEY, RunningGear
 
 #: Numbers along the belt.

@@ -7,9 +7,9 @@ import math
 
 import equinox as eqx
 
+from mmrjax.model.contact import Track
 from mmrjax.model.paper_tables import GROUSERS, TEETH_BELT, TEETH_PULLEY
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.model.track_friction import Track
 
 _UNSTATED = "not stated in the paper"
 

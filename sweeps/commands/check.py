@@ -18,7 +18,6 @@ from sweeps import config as configuration
 from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot
 from sweeps.pages import words
-from sweeps.points import imposed
 from sweeps.report import check_report
 from sweeps.report.check_report import CheckResult, requirement_limit, worst_corner_text
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
@@ -32,7 +31,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     demands = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
-    imposed.check_on_ground(robot, "check")
+    capabilities.check_on_ground(robot, "check")
     sheet.reject_impossible(robot, demands)
     for r in demands.each:
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"

@@ -24,11 +24,12 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config_campaign import SIZE
 from sweeps.console import progress_bar
 from sweeps.inputs import check_configurations, load_robot
-from sweeps.points import imposed, scale
+from sweeps.points import scale
 from sweeps.points.climbs import NEAR, SLOW, SOUGHT, climb_refusal
 from sweeps.report import climb_report
 from sweeps.report.climb_report import Along, ClimbResult
@@ -51,7 +52,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
     name = config.configuration or robot.configurations.names[0]
     check_configurations(robot, (name,), "--configuration")
     if config.battery:
-        imposed.check_battery(robot)
+        capabilities.check_battery(robot)
     voltage = SLOW if config.supply_voltage_V is None else config.supply_voltage_V
     config = config.model_copy(
         update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, Names, instruments
+from calibration.data import Columns, Names, inferred_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -21,7 +21,7 @@ from mmrjax.model.channels import Channel
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, posterior_beside_robot, read_runs, recorded_fit
-from sweeps.points import run, uncertainty
+from sweeps.points import run
 from sweeps.report import comparison_report
 from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
 from sweeps.store import RunFolder, open_folder, print_report
@@ -43,7 +43,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     second = _second_robot(config, file)
     if runs.sampled:
         return _compare_histories(config, file, second, runs, beside)
-    robot = instruments.with_inferred_instruments(file.robot, runs)
+    robot = inferred_facts.with_inferred_instruments(file.robot, runs)
     if beside.own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     remarks = sentences(check_ranges(runs, robot))
@@ -52,17 +52,17 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(measured_runs, table, robot)
         if second is not None:
-            other = instruments.with_inferred_instruments(second.robot, runs)
+            other = inferred_facts.with_inferred_instruments(second.robot, runs)
             comparison = add_second_robot(
                 comparison, measured_runs.channels, run.evaluate_runs(other, runs, config, folder=None)
             )
         notes = (*missing_readings_notes(comparison, measured_runs.channels), *remarks)
         of_draws: list[str] = []
         if posterior is not None and config.posterior is not None:
-            spread = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            of_draws = uncertainty.interval_ranges(table, spread)
+            spread = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            of_draws = run.interval_ranges(table, spread)
             table |= spread.columns
-            ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
+            ends = (run.SD, run.LOWER, run.UPPER)
             comparison |= {
                 f"simulated_{key}": table[key] for c in robot.channels for e in ends if (key := c.column + e)
             }

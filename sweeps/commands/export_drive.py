@@ -9,7 +9,6 @@ from sweeps import config as configuration
 from sweeps.export.formats import Export, export_format
 from sweeps.inputs import load_robot
 from sweeps.report import export_report
-from sweeps.report.words import export_words as words
 from sweeps.store import finish_run_folder, open_folder, print_report
 
 
@@ -23,7 +22,7 @@ def execute(config: configuration.Export, beside: configuration.FolderPart) -> i
         )  # fmt: skip
         for name, content in exported.files.items():
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
-        folder.write_text("LAW.md", words.law_text(exported))
+        folder.write_text("LAW.md", export_report.law_text(exported))
         folder.write_json("result.json", to_json(exported))
         document = print_report(export_report.export_document(exported))
         return finish_run_folder(
@@ -45,7 +44,7 @@ def to_json(found: Export) -> Json:
         "format": found.format,
         "robot": found.joint.file.name,
         "configuration": found.joint.configuration,
-        "statement": words.export_statement(found),
+        "statement": export_report.export_statement(found),
         "runs": len(compared.situation.command),
         "source": compared.situation.source,
         "reference": compared.reference,

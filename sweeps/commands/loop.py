@@ -15,11 +15,9 @@ import numpy as np
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
 from calibration.data.runs import Runs
-from calibration.described import describe, report_in_words
-from calibration.discovery import findings
+from calibration.described import describe
+from calibration.discovery import REFIT_FILE, OutOfTime, findings
 from calibration.discovery.discover import discover
-from calibration.discovery.kept import REFIT_FILE, OutOfTime
-from calibration.discovery.resolve import check_resolvable, fit_track_model
 from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
@@ -32,7 +30,7 @@ from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps import store
-from sweeps.console import print_message, print_output, step_reporter
+from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import loop_report
 from sweeps.report.fit_tables import Change
@@ -71,8 +69,6 @@ def _run_with_time_limit(
 def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     began, time_budget = time.monotonic(), beside.seconds
     prior_options = priors.parse_priors(config.prior)
-    if config.resolve:
-        check_resolvable(runs)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
 
     stages: dict[str, Any] = {}
@@ -127,17 +123,8 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
                     print_message(describe(note))
             _report_stored_stages(stages, folder, config.robot)
             raise
-        if config.resolve:
-            # Does a different running gear explain the misfit?
-            resolved = fit_track_model(
-                verdict, noise=config.noise or None, population=config.population, generations=config.generations,
-                keep=folder.stage, seed=config.seed, tell=report_in_words(progress),
-            )  # fmt: skip
-            verdict = dataclasses.replace(verdict, resolved=resolved)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
-        if config.resolve and verdict.resolved is None:
-            print_output("No error remains in the slip, track or ground balance for the track model.")
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")

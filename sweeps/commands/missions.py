@@ -17,7 +17,7 @@ from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import PAIRS
-from mmrjax.model import balances, channels, ground, quantities
+from mmrjax.model import balances, channels, contact, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import lateral_ratio
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -26,7 +26,7 @@ from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message, progress_bar
 from sweeps.inputs import OPTIONS, given_runs, load_robot
-from sweeps.points import imposed, run
+from sweeps.points import run
 from sweeps.report import mission_report
 from sweeps.report.mission_report import Missions
 from sweeps.store import open_folder, print_report
@@ -48,7 +48,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     file = load_robot(config)
     robot = file.robot
     if robot.rig.imposed != "voltage":
-        imposed_words = imposed.IMPOSED_WORDS[robot.rig.imposed].words
+        imposed_words = capabilities.IMPOSED_WORDS[robot.rig.imposed].words
         raise BadConfiguration(
             f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the voltage; "
             'simulate a table, or set imposed = "voltage" in the robot\'s file'
@@ -67,7 +67,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         [f"{source.source}, {column}" for column in columns if column in source.stated]
         for columns in (("slope_deg", "payload_kg", "surface"), ON_SHAFT)
     )
-    imposed.check_acting(robot, ground, shaft)
+    capabilities.check_acting(robot, ground, shaft)
     if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
             f"{source.source}, speed_mm_s: a shaft has no travelling speed; give motor_speed_rpm or duty"
@@ -108,7 +108,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
     if not source.turns:
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
-    imposed.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
+    capabilities.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
     highest = max(
         (float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0
     )
@@ -334,7 +334,7 @@ def _course_rows(
         "time_s": course.time + delay,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
-        "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
+        "slip": np.asarray(contact.slip_ratio(signals.speed, signals.speed_theoretical)),
         "distance_m": course.path,
         "displacement_m": course.distance,
         "voltage_V": signals.voltage,

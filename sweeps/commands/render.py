@@ -9,11 +9,12 @@ from calibration.data.writing import replacing
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage import rendering
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_output, progress_bar
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
-from sweeps.points import imposed, run, scale
+from sweeps.points import run, scale
 from sweeps.store import DONE, SOLVER_FAILED
 
 
@@ -31,7 +32,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     if not file.parent.is_dir():
         raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
     robot = load_robot(config).robot
-    imposed.check_on_ground(robot, "render")
+    capabilities.check_on_ground(robot, "render")
     conditions = run.conditions_of_runs(robot, one_run(robot, picture.stated, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(1, quiet=False) as advance:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from calibration.data import runs as records
 from mmrjax import fidelities
 from mmrjax.model.paper_tables import CONFIGURATIONS
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message
 from sweeps.inputs import load_robot
 from sweeps.paper import data, report
-from sweeps.points import imposed
 from sweeps.store import finish_run_folder, open_folder, print_report
 
 
@@ -17,7 +17,7 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
     """Writes the paper's figures and tables for a robot to a run folder. Returns the exit code."""
     file = load_robot(config)
     robot = file.robot
-    imposed.check_on_ground(robot, "reproduce")
+    capabilities.check_on_ground(robot, "reproduce")
     runs = records.read_runs("measured")
     gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
     with open_folder("reproduce", config, robot, beside) as folder:

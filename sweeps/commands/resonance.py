@@ -27,12 +27,13 @@ from mmrjax.undercarriage.ripple_peaks import (
     peaks_over_speed,
     vibrations_of_runs,
 )
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.pages import words
-from sweeps.points import imposed, run, scale
+from sweeps.points import run, scale
 from sweeps.points.grid import grid_conditions
 from sweeps.report import resonance_report
 from sweeps.report.resonance_report import SLOW, ResonanceResult
@@ -49,7 +50,7 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
     """
     file = load_robot(config)
     robot = file.robot
-    imposed.check_on_ground(robot, "resonance")
+    capabilities.check_on_ground(robot, "resonance")
     name = config.configuration or robot.configurations.names[0]
     check_configurations(robot, (name,), "--configuration")
     config = config.model_copy(

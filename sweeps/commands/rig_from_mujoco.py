@@ -15,8 +15,7 @@ from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import VALUE, check_memory, file_bytes, first_bytes
 from calibration.data.named_arrays import cell_number
 from mmrjax.errors import list_some
-from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
-from sweeps.commands.rig_template import StatedNumber
+from sweeps.commands.rig_numbers import Found, JointNumbers, StatedNumber, hanging_torque_and_angle, is_round
 from sweeps.export import mujoco
 
 #: Largest model file that is read [bytes].

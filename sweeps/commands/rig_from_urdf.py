@@ -11,7 +11,7 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
 from mmrjax.errors import list_some
 from mmrjax.model.signals import GRAVITY
-from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
+from sweeps.commands.rig_numbers import Found, JointNumbers, hanging_torque_and_angle, is_round
 
 #: Joint types that turn.
 TURNS = ("revolute", "continuous")

@@ -11,8 +11,15 @@ from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import file_bytes
 from calibration.data.stated import EXAMPLE, example_numbers
 from calibration.data.writing import write_text
-from sweeps.commands.rig_joint import JointNumbers, free_unstated_losses
-from sweeps.commands.rig_template import KINDS, StatedNumber, fill_rig_template, rig_template
+from sweeps.commands.rig_numbers import (
+    KINDS,
+    JointNumbers,
+    StatedNumber,
+    fill_rig_template,
+    free_unstated_losses,
+    read_data_sheet,
+    rig_template,
+)
 from sweeps.console import print_output
 
 #: Kind of rig if neither an option nor a model states one.
@@ -58,7 +65,7 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
         sheet: numbers of a data sheet by name.
 
     Raises:
-        BadConfiguration: for the same reasons as `joint_numbers` and `rig_from_sheet.read_data_sheet`.
+        BadConfiguration: for the same reasons as `joint_numbers` and `rig_numbers.read_data_sheet`.
     """
     numbers: dict[str, StatedNumber] = {}
     origins = []
@@ -68,9 +75,7 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
         numbers |= joint_model.numbers(kind)
         origins.append(f"joint {joint_model.joint} of {joint_model.file}")
     if sheet is not None:
-        from sweeps.commands import rig_from_sheet
-
-        numbers |= rig_from_sheet.read_data_sheet(sheet)
+        numbers |= read_data_sheet(sheet)
         origins.append("a data sheet")
     kind = kind or USUAL
     if not origins:

@@ -1,4 +1,4 @@
-"""The command `sensitivity`: influence of each parameter on the outputs, and the most informative next runs."""
+"""The command `sensitivity`: influence of each parameter on the outputs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
-from calibration.inference import noise
 from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
-from calibration.sensitivity.next_runs import CandidateRuns
 from calibration.sensitivity.result import METHODS, OperatingPoints
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
@@ -25,13 +23,13 @@ from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
+from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import print_message
-from sweeps.inputs import load_robot, posterior_beside_robot, read_runs
+from sweeps.inputs import load_robot, posterior_beside_robot
 from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
-from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions, grid_configurations
 from sweeps.points.job import showing_turns
 from sweeps.points.run import check_runs_bearable
@@ -78,7 +76,6 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     outputs = chosen_outputs(config.outputs, robot, bool(freed))
     runs = _operating_points(config, robot, ranges)
     inputs = _uncertain_inputs(config, file, runs, ranges)
-    candidates = _candidate_runs(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
     turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turn_columns), config)
@@ -95,7 +92,7 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         adhesion=np.asarray(conditions.adhesion),
     )
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
-        result = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
+        result = analyse_sensitivity(study, config.method, config.evaluations, config.seed)
         folder.write_json("result.json", result.to_json())
         for name, table in result.tables().items():
             folder.write_table(name, table)
@@ -128,7 +125,7 @@ def _operating_points(
     axes = {key: getattr(config, key) or usual_axes.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
         ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
-        imposed.check_acting(robot, ground, shaft)
+        capabilities.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
@@ -150,7 +147,7 @@ def _operating_points(
     for note in notes:
         print_message(note)
     names = grid_configurations(grid, robot)
-    imposed.check_turning(robot, ranges, names, "--vary")
+    capabilities.check_turning(robot, ranges, names, "--vary")
     return grid_conditions(
         grid.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
     )
@@ -168,30 +165,3 @@ def _uncertain_inputs(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
     )
     return uncertain_inputs.inputs_from_priors(robot, names, ranges)
-
-
-def _candidate_runs(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> CandidateRuns:
-    """Candidate runs: those of a table, or Table 8 in every configuration. For a rig or for turns, the operating
-    points.
-    """
-    if config.candidates:
-        runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
-        source = runs.source
-    elif turns or not Layout.of(robot).uses_paper_conditions:
-        runs, source = points, "the operating points"
-    else:
-        runs = grid_conditions(GridPart(surface=config.surface), robot)
-        source = "Table 8"
-    usual = noise.default_noise(robot.channels)
-    noise_sizes = noise.parse_noise(usual, robot.channels)
-    if config.noise:
-        noise_sizes |= noise.parse_noise(config.noise, robot.channels)
-    return CandidateRuns(
-        OperatingPoints.of(runs),
-        runs.conditions(robot),
-        source,
-        noise_sizes,
-        config.noise or usual,
-        runs.deviations(),
-        config.runs,
-    )

@@ -20,8 +20,8 @@ from mmrjax.derived.start_figures import curve_peak, stages_of_histories
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History, RunBatch
 from mmrjax.fidelities.result import result_of_signals
-from mmrjax.model import channels, ground, quantities
-from mmrjax.model.motor import Motor
+from mmrjax.model import channels, contact, quantities
+from mmrjax.model.gearmotor import Motor
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
@@ -30,11 +30,10 @@ from sweeps import config as configuration
 from sweeps.console import progress_bar
 from sweeps.inputs import given_runs, load_robot, posterior_beside_robot
 from sweeps.pages import words
-from sweeps.points import run, scale, uncertainty
+from sweeps.points import run, scale
 from sweeps.points.job import showing_turns
-from sweeps.report import runs_report
+from sweeps.report import runs_report, turn_words
 from sweeps.report.runs_report import PEAK
-from sweeps.report.words import posture_words
 from sweeps.store import RunFolder, open_folder, print_report
 
 _HISTORIES = 1000  # most runs with stored histories
@@ -73,17 +72,17 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         shows_turns = showing_turns(robot, runs.axes)
         table, histories = _simulate_table(folder, shows_turns, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)
-        postures = posture_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
+        postures = turn_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
         further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
         if posterior is not None and config.posterior is not None:
-            draws = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            draws = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
             table |= draws.columns
-            remarks += uncertainty.interval_remarks(draws)
+            remarks += run.interval_remarks(draws)
         if postures is not None:
             folder.write_table("posture.csv", postures.table)
-            further["notes"] += posture_words.tipping_remarks(postures)
+            further["notes"] += turn_words.tipping_remarks(postures)
         if histories is not None and robot.has_ground:
             assert histories.history is not None  # the fidelity was asked for it
             stages = stages_of_histories(robot, histories.history, runs.configurations(robot))
@@ -261,7 +260,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown_channels},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / quantities.MM,
-        "slip": np.ravel(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
+        "slip": np.ravel(contact.slip_ratio(signals.speed, signals.speed_theoretical)),
         "displacement_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),

@@ -18,9 +18,8 @@ from sweeps import config as configuration
 from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot
 from sweeps.pages import words
-from sweeps.points import imposed
-from sweeps.report import size_report
-from sweeps.report.size_report import SizeResult, describe_design
+from sweeps.report import check_report
+from sweeps.report.check_report import SizeResult, describe_design
 from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
@@ -31,7 +30,7 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
     requirements = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
-    imposed.check_on_ground(robot, "size")
+    capabilities.check_on_ground(robot, "size")
     objectives = config.pareto or (config.objective,)
     for name in objectives:
         stated_word(name, OBJECTIVES, "--pareto" if config.pareto else "--objective")
@@ -56,7 +55,7 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
         result = SizeResult(requirements, robot, sizing, objectives, outcomes)
         _write_folder(folder, config, result)
         document = print_report(
-            size_report.size_document(result, capabilities.displayed_name(file)),
+            check_report.size_document(result, capabilities.displayed_name(file)),
             dataclasses.replace(file, robot=best),
             brief=not beside.verbose,
         )

@@ -22,12 +22,12 @@ from sweeps.config_campaign import Campaign, StoreOptions
 from sweeps.console import print_message, print_output, progress_bar
 from sweeps.inputs import load_robot, posterior_beside_robot
 from sweeps.pages import words
-from sweeps.points import axes, grid, run, scale, uncertainty
+from sweeps.points import axes, grid, run, scale
 from sweeps.points.job import prepare_job, showing_turns, store_layout
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of_configuration
 from sweeps.points.zarr_store import STORE, Done, Identity, StoreLayout, SweepStore, job_identity
-from sweeps.report import campaign_report, sweep_report
+from sweeps.report import sweep_report
 from sweeps.report.document import Column, Table
 from sweeps.report.run_tables import endings_table
 from sweeps.report.terminal_renderer import print_table
@@ -75,8 +75,8 @@ def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> 
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
         if posterior is not None and config.posterior is not None:
-            draws = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            notes = uncertainty.interval_ranges(table, draws)
+            draws = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            notes = run.interval_ranges(table, draws)
             table |= draws.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
         document = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
@@ -247,7 +247,7 @@ def finish_sweep(
                     "seed": config.samples.get("seed", 0),
                     "hashes": same["data"],
                 }
-                document = campaign_report.campaign_document(file, store.layout, summary, store.partial / STORE)
+                document = sweep_report.campaign_document(file, store.layout, summary, store.partial / STORE)
                 finish_run_folder(
                     store,
                     config,

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from calibration.data import Columns, Json, sides
+from calibration.data import Columns, Json, contradictions
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import fidelities
@@ -23,9 +23,8 @@ from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress_bar, report_stage
 from sweeps.inputs import load_robot, one_run
-from sweeps.points import imposed, run, scale
-from sweeps.report import turn_report
-from sweeps.report.words import posture_words
+from sweeps.points import run, scale
+from sweeps.report import runs_report, turn_words
 from sweeps.store import open_folder, print_report
 
 #: Duties of the inner side for which settled turns are shown, as shares of the outer side's duty.
@@ -83,13 +82,13 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first_run), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(2, 2, "posture"):
-            postures = posture_words.posture_of_runs(robot, runs, conditions)
+            postures = turn_words.posture_of_runs(robot, runs, conditions)
         notes = []
         if postures is not None:
             folder.write_table("posture.csv", postures.table)
-            notes.append(posture_words.posture_sentences(postures))
+            notes.append(turn_words.posture_sentences(postures))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
-        document = turn_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
+        document = runs_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
         return run.write_run_folder(folder, config, result, print_report(document, file))
 
 
@@ -111,7 +110,7 @@ def check_can_turn(robot: Robot, named: str) -> None:
     Raises:
         BadConfiguration: it cannot turn. The message has the reason.
     """
-    imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
+    capabilities.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
         raise BadConfiguration("--left, --right: the robot's file imposes no voltage")
 
@@ -129,7 +128,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
             f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, the voltage of --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
-    source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))
+    source, duties = contradictions.supply_and_shares(volts, None if supply is None else np.asarray(supply))
     return columns | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 

@@ -13,7 +13,7 @@ from calibration.data.runs import Runs
 from calibration.data.writing import naming_file
 from mmrjax.model.robot import Robot
 from sweeps.export.formats import Export, export_format
-from sweeps.report.words import export_words
+from sweeps.report import export_report
 
 
 def export(
@@ -52,7 +52,7 @@ def export(
     exported = export_format(
         file, to, configuration=configuration, data=data, at=joint, draws=draws, seed=seed, posterior=posterior
     )
-    texts = {**exported.files, "LAW.md": export_words.law_text(exported)}
+    texts = {**exported.files, "LAW.md": export_report.law_text(exported)}
     exported = dataclasses.replace(exported, files=texts)
     if out is not None:
         folder = Path(out)

@@ -15,12 +15,11 @@ from calibration.data import Columns, Json, Names
 from calibration.data.writing import table_text
 from mmrjax import __version__
 from mmrjax.errors import printable
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 from sweeps.export import jax_actuator, mujoco
-from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, EffectFate
+from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, ComparisonRuns, EffectFate
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
-from sweeps.export.situation import ComparisonRuns
 
 #: Points of an axis on each side of rest. Ratio of the axes to the range of the runs.
 POINTS, BEYOND = 20, 1.2

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.input_errors import BadConfiguration, stated_word
-from calibration.data.posterior_file import Posterior
+from calibration.data.posterior_file import FILE, Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.compile.precision import in_double
 from mmrjax.errors import count_noun
 from mmrjax.fidelities.drive import drive_batch
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
-from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco, onnx, randomization
-from sweeps.export.comparison import EffectFate, ExportComparison
+from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco
+from sweeps.export.comparison import ComparisonRuns, EffectFate, ExportComparison, JointResult, situation_of_joint
 from sweeps.export.joint import DriveJoint, joint_of_robot
 from sweeps.export.law_source import LawConstant, law_constants, posterior_next_to
-from sweeps.export.situation import ComparisonRuns, JointResult, situation_of_joint
 
 #: Names of formats and their uses.
 FORMATS = {
@@ -166,10 +168,8 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
         checks |= {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
-        values = randomization.draw_parameters(
-            drive, begun.posterior, begun.constants, compared.refitted, normal, draws, seed
-        )
-        files = randomization.randomization_files(values)
+        values = draw_parameters(drive, begun.posterior, begun.constants, compared.refitted, normal, draws, seed)
+        files = randomization_files(values)
     return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
@@ -204,9 +204,9 @@ def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, s
     elif begun.format == "mjlab":
         files = law_source.mjlab_files(drive, constants, notes)
     else:
-        files = onnx.onnx_files(drive, constants)
+        files = jax_actuator.onnx_files(drive, constants)
         model: Any = files["actuator.onnx"]
-        checks["ONNX against JAX, largest of 10,000 states [relative]"] = onnx.difference_from_jax(
+        checks["ONNX against JAX, largest of 10,000 states [relative]"] = jax_actuator.difference_from_jax(
             drive, constants, model
         )
     compared = comparison.compare_format(
@@ -224,3 +224,63 @@ def _export_tables(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
     compared = comparison.compare_format(runs, law, fates, effect_names, mujoco.approximated_terms)
     files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_for_file_head(runs))
     return dataclasses.replace(begun, files=files, comparison=compared)
+
+
+#: Smallest and largest number of draws, typical numbers of environments in training.
+MOST = 1_000_000
+
+
+def draw_parameters(
+    joint: DriveJoint,
+    posterior: Posterior | None,
+    constants: Sequence[LawConstant],
+    refitted: Mapping[str, float],
+    normal: float,
+    draws: int,
+    seed: int,
+) -> Columns:
+    """Draws by format and name, `mujoco/resistance` and `actuator/motor.resistance`, each of shape (draws,).
+
+    All numbers of a draw belong together, with the correlation of the posterior. A parameter of MuJoCo is translated
+    from the draw, and multiplied by the ratio of its refitted to its translated value at the posterior's centre.
+
+    Raises:
+        BadConfiguration: there is no posterior.
+    """
+    if posterior is None:
+        raise BadConfiguration(
+            f"--to randomization: no {FILE} next to {joint.file.source}; expected FOLDER/robot.toml of calibrate "
+            "or loop"
+        )
+    values = posterior.draw(draws, seed)
+    own_names = {p.name for p in params.walk_parameters(joint.robot)}
+    columns = {name: values[:, k] for k, name in enumerate(posterior.names) if name in own_names}
+    centre = mujoco.translate_law(joint, normal)
+    factors = {
+        n: refitted[n] / x if (x := float(v)) > 0 else 1.0 for n, v in zip(centre.names, centre.start, strict=True)
+    }
+    drawn_values: dict[str, list[float]] = {}
+    for k in range(draws):
+        robot = params.replace(joint.robot, {name: np.asarray(x[k]) for name, x in columns.items()})
+        other = joint.with_robot(robot)
+        law = mujoco.translate_law(other, normal)
+        theta = {n: factors[n] * float(v) for n, v in zip(law.names, law.start, strict=True)}
+        motor = mujoco.mjcf_motor(other, theta)
+        numbers = {
+            "gear": motor.ratio, "motorconst": theta[mujoco.CONSTANT], "resistance": theta[mujoco.RESISTANCE],
+            "inductance": motor.inductance, "armature": motor.armature, "frictionloss": motor.friction,
+            "damping": theta[mujoco.DAMPING], "current_over_act": theta[mujoco.SHARE],
+        }  # fmt: skip
+        for name, value in numbers.items():
+            drawn_values.setdefault(f"mujoco/{name}", []).append(value)
+    law_names = {c.name for c in constants}
+    actuator = {f"actuator/{n}": x for n, x in columns.items() if n in law_names}
+    return {name: np.asarray(x) for name, x in drawn_values.items()} | actuator
+
+
+def randomization_files(found: Columns) -> dict[str, str | bytes]:
+    """The draws as NumPy's archive."""
+    stream = io.BytesIO()
+    arrays: Any = dict(found)
+    np.savez(stream, **arrays)
+    return {"draws.npz": stream.getvalue()}

@@ -20,10 +20,9 @@ from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
-from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, EffectFate
+from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, ComparisonRuns, EffectFate, JointResult
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant
-from sweeps.export.situation import ComparisonRuns, JointResult
 
 #: First version with `<dcmotor>`.
 FIRST = (3, 7, 0)

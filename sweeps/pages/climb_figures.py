@@ -28,7 +28,7 @@ from sweeps.pages.figure_style import (
     new_figure,
 )
 from sweeps.report.climb_report import ClimbResult, footing_coordinates
-from sweeps.report.words.posture_words import Drawn, Postures
+from sweeps.report.turn_words import Drawn, Postures
 
 _GROUND = "#b8a98f"
 #: Most silhouettes on a page.

@@ -1,7 +1,9 @@
-"""Figures of fits: errors over each condition, and the voltage plots of feedforward constants."""
+"""Figures of measured and simulated readings: errors over conditions, overlays over time, voltage plots."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,14 +11,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.data import Columns
+from calibration.data import Columns, Json
+from calibration.data.table import Runs
 from calibration.inference.feedforward import Feedforward
 from mmrjax.model.channels import Channel
 from sweeps.pages.figure_style import (
     BLUE,
+    FAINT,
     INK,
     LOOKS,
     ORANGE,
+    axis_label,
     configuration_looks,
     new_figure,
 )
@@ -113,3 +118,128 @@ def _points(x: np.ndarray, y: np.ndarray, along: str, up: str) -> tuple[Figure, 
     axes.set_xlabel(along)
     axes.set_ylabel(up)
     return fig, axes
+
+
+#: Readings on a page, shared by all its runs and channels; a page stays below 1.5 MB.
+POINTS = 24_000
+COLOURS = (BLUE, ORANGE)
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeOverlay:
+    """Readings of runs over time.
+
+    Attributes:
+        table: columns of the measured channels, of their simulations and `time_s`, each of shape (rows,).
+        channels: channels to show.
+        simulated: prefix of the columns of a simulation → its name in the legend. The first one has the residuals.
+        rows: rows of each run in the order of time.
+    """
+
+    table: Columns
+    channels: Sequence[Channel]
+    simulated: Mapping[str, str]
+    rows: Columns
+
+    @property
+    def worst(self) -> str:
+        """The run with the largest rms residual, relative to the channel's measured rms."""
+        return max(self.rows, key=lambda name: np.nan_to_num(self._misfit(self.rows[name])))
+
+    def _misfit(self, rows: np.ndarray) -> float:
+        shares = []
+        for channel in self.channels:
+            measured = self.table[channel.column]
+            size = np.sqrt(np.nanmean(np.square(measured))) if np.isfinite(measured).any() else np.nan
+            shares.append(np.nanmean(np.square(self._residual(channel)[rows]) / size**2) if size > 0 else np.nan)
+        return float(np.nanmean(shares)) if np.isfinite(shares).any() else float("nan")
+
+    def _residual(self, channel: Channel) -> np.ndarray:
+        first_prefix = next(iter(self.simulated))
+        return np.asarray(self.table[first_prefix + channel.column] - self.table[channel.column])
+
+    def draw(self) -> Figure:
+        """Figure of the worst run: for each channel the readings, and below them simulated minus measured."""
+        name = self.worst
+        rows = self._thinned(self.rows[name], POINTS // (4 * len(self.channels)))
+        time = self.table["time_s"][rows]
+        count = len(self.channels)
+        fig, grid = new_figure(2 * count, 1, 2.9 * count, sharex=True, height_ratios=[3, 1] * count)
+        for k, channel in enumerate(self.channels):
+            reading_axes, residual_axes = grid[2 * k, 0], grid[2 * k + 1, 0]
+            reading_axes.plot(
+                time,
+                self.table[channel.column][rows],
+                ".",
+                ms=3,
+                color=INK,
+                label="measured",
+                rasterized=len(rows) > 500,
+            )
+            for (prefix, words), colour in zip(self.simulated.items(), COLOURS, strict=False):
+                reading_axes.plot(time, self.table[prefix + channel.column][rows], color=colour, lw=1.3, label=words)
+            residual_axes.axhline(0, color=FAINT, lw=0.8)
+            residual_axes.plot(time, self._residual(channel)[rows], color=BLUE, lw=1)
+            reading_axes.set_ylabel(axis_label(channel))
+            residual_axes.set_ylabel("residual")
+        grid[0, 0].legend(loc="best")
+        grid[0, 0].set_title(f"run {name}" if len(self.rows) > 1 else "")
+        grid[-1, 0].set_xlabel("time [s]")
+        return fig
+
+    def to_json(self) -> str:
+        """Data of the interactive figure: for each run its times and, by channel, measured and simulated readings."""
+        points_per_curve = max(200, POINTS // (len(self.rows) * len(self.channels) * (1 + len(self.simulated))))
+        runs: Json = {}
+        spent = 0
+        worst = self.worst
+        for name in (worst, *(name for name in self.rows if name != worst)):
+            rows = self._thinned(self.rows[name], points_per_curve)
+            spent += len(rows) * len(self.channels) * (1 + len(self.simulated))
+            if runs and spent > 2 * POINTS:
+                break
+            runs[name] = {
+                "time": _numbers(self.table["time_s"][rows]),
+                "channels": [
+                    [_numbers(self.table[prefix + c.column][rows]) for prefix in ("", *self.simulated)]
+                    for c in self.channels
+                ],
+            }
+        about: Json = {
+            "labels": ["measured", *self.simulated.values()],
+            "channels": [{"label": c.label, "unit": c.unit} for c in self.channels],
+            "runs": runs,
+        }
+        return json.dumps(about, separators=(",", ":")).replace("<", "\\u003c")
+
+    def _thinned(self, rows: np.ndarray, most: int) -> np.ndarray:
+        """Up to about `most` rows in order: of each group the rows of the extreme readings of every channel."""
+        groups = max(1, most // (2 * len(self.channels)))
+        if len(rows) <= most:
+            return rows
+        kept_rows = {0, len(rows) - 1}
+        for part in np.array_split(np.arange(len(rows)), groups):
+            for channel in self.channels:
+                readings = self.table[channel.column][rows[part]]
+                if np.isfinite(readings).any():
+                    kept_rows |= {int(part[np.nanargmin(readings)]), int(part[np.nanargmax(readings)])}
+        return rows[np.array(sorted(kept_rows))]
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """Numbers with six digits, None for a missing one."""
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
+
+
+def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping[str, str]) -> TimeOverlay:
+    """Overlay of a table of time histories, run by run.
+
+    Args:
+        table: table with `time_s`, `run_id` where there are several runs, measured and simulated columns.
+        channels: channels to show. Those without any reading are left out.
+        simulated: prefixes of the simulated columns and their names, as in `TimeOverlay`.
+    """
+    runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
+    shown_channels = [c for c in channels if np.isfinite(table[c.column]).any()]
+    rows = {str(name): ordered for name, ordered in runs.rows_by_run().items()}
+    return TimeOverlay(table, shown_channels, simulated, rows)

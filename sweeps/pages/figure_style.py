@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import io
 import itertools
-import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,7 +12,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_rgb
@@ -22,9 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
-from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
 
-from calibration.data import Json
 from mmrjax.model.channels import Channel
 
 WIDTH = 10.0  # inches, the width of the page's text
@@ -105,10 +100,7 @@ LEAST, CONTRAST = 8.5, 4.6
 
 
 def figure_as_svg(fig: Figure) -> str:
-    """The figure as a self-contained SVG document. Its text is stored as text.
-
-    `data-axes` of the document has the positions and ranges of its axes, so that a page can show values.
-    """
+    """The figure as a self-contained SVG document. Its text is stored as text."""
     for written in fig.findobj(lambda artist: isinstance(artist, Text)):
         assert isinstance(written, Text)
         written.set_fontsize(max(written.get_fontsize(), LEAST))
@@ -128,11 +120,8 @@ def figure_as_svg(fig: Figure) -> str:
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text)
-    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S).replace(
-        "'DejaVu Sans'", "'DejaVu Sans', Verdana"
-    )
-    axes = html.escape(json.dumps([_axes_geometry(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
-    return text.replace("<svg ", f'<svg data-axes="{axes}" ', 1)
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S)
+    return text.replace("'DejaVu Sans'", "'DejaVu Sans', Verdana")
 
 
 def _hide_crowded_numbers(fig: Figure) -> None:
@@ -149,35 +138,6 @@ def _luminance(channels: np.ndarray) -> float:
     """Relative luminance of sRGB, as WCAG 2 defines it."""
     linear = np.where(channels <= 0.03928, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
     return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
-def _axes_geometry(fig: Figure, axes: Axes) -> Json:
-    """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
-    width, height = 72 * fig.get_size_inches()
-    box = axes.get_position(original=False)
-    axes_box = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]
-    # an inner axis has its label at the edge of its row or column, or of the figure
-    column = [a.xaxis for a in fig.axes if a.get_position().x0 == axes.get_position().x0]
-    row = [a.yaxis for a in fig.axes if a.get_position().y0 == axes.get_position().y0]
-    positions = {}
-    for name, axis, beside, whole in (
-        ("x", axes.xaxis, column, fig.get_supxlabel()),
-        ("y", axes.yaxis, row, fig.get_supylabel()),
-    ):
-        labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
-        ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
-        axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
-        if _has_names(axis):
-            names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
-            if names and all(name for _, name in names):
-                axis_facts["names"] = names
-        positions[name] = {**axis_facts, "label": next(filter(None, labels), "").split("\n")[0]}
-    return {"box": [round(v, 1) for v in axes_box], **positions}
-
-
-def _has_names(axis: Axis) -> bool:
-    """True if the ticks of an axis have names, not numbers."""
-    return not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter)
 
 
 def label_line_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:

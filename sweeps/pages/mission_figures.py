@@ -11,6 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from calibration.data import Columns, Json
 from mmrjax.model.channels import SIDES
 from mmrjax.model.robot import Robot
+from sweeps.capabilities import UNLIMITED
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -22,7 +23,6 @@ from sweeps.pages.figure_style import (
     add_corner_note,
     new_figure,
 )
-from sweeps.points.imposed import UNLIMITED
 
 _SIDE_COLOURS = (("left", BLUE), ("right", VERMILION))
 #: Units of a time axis: shortest mission [s], size [s], name.

@@ -28,9 +28,9 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import SURFACES
 from mmrjax.model.rig import IMPOSED
 from mmrjax.model.robot import Robot
+from sweeps import capabilities
 from sweeps.config_campaign import Campaign
 from sweeps.options import parse_axis
-from sweeps.points import imposed
 from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, Samples, in_blocks
 from sweeps.points.tasks import task_of_configuration
 
@@ -119,14 +119,14 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
     configuration_names = [robot.configurations.names[int(k)] for k in configuration_indices]
-    imposed.check_turning(robot, {*fixed, *design.names}, configuration_names, where)
+    capabilities.check_turning(robot, {*fixed, *design.names}, configuration_names, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
         for name in configuration_names:
             if why := reason_without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own_axis = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own_axis not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
-        level = imposed.imposed_default(robot, f"{where}, conditions.{own_axis}")
+        level = capabilities.imposed_default(robot, f"{where}, conditions.{own_axis}")
         fixed[own_axis] = level * OF_IMPOSED[own_axis][1]
     if surface is not None and "adhesion" in {*fixed, *design.names}:
         raise BadConfiguration(
@@ -153,7 +153,7 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
         )
     ground = {*names, *([SURFACE] if surface is not None else [])} & {*ON_GROUND, SURFACE}
     shaft = [f"{where}, {name}" for name in ON_SHAFT if name in names]
-    imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
+    capabilities.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
     if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
             f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations "

@@ -14,9 +14,9 @@ from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.runs import Runs
 from mmrjax.model.paper_tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
 from mmrjax.model.robot import Robot
+from sweeps import capabilities
 from sweeps.config import GridPart
 from sweeps.inputs import check_configurations
-from sweeps.points import imposed
 
 G = TypeVar("G", bound=GridPart)
 
@@ -50,19 +50,19 @@ def resolve_grid(config: G, robot: Robot, battery: bool, notes: list[str] | None
     own_axis = AXIS[layout.imposed]
     for key in AXIS.values():
         if key != own_axis and getattr(config, key) is not None:
-            raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[key], OPTIONS[own_axis]))
+            raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[key], OPTIONS[own_axis]))
     ground, shaft = (
         [OPTIONS[key] for key in keys if getattr(config, key) is not None] for keys in (ON_GROUND, ON_SHAFT)
     )
-    imposed.check_acting(robot, ground, shaft)
+    capabilities.check_acting(robot, ground, shaft)
     surface = config.surface
     if surface is not None and robot.rig.scales_adhesion:
         stated_word(surface, SURFACES, OPTIONS["surface"], f"got {surface!r}")
     update: dict[str, object] = {"configurations": grid_configurations(config, robot)}
     if battery:
-        imposed.check_battery(robot)
+        capabilities.check_battery(robot)
     elif getattr(config, own_axis) is None:
-        update[own_axis] = imposed.imposed_levels(robot, OPTIONS[own_axis], notes)
+        update[own_axis] = capabilities.imposed_levels(robot, OPTIONS[own_axis], notes)
     if robot.has_ground:
         inherits = robot.rig.inherits
         update |= {

@@ -1,13 +1,22 @@
-"""Report of `export`: comparison of the exported drive with the native model, and what the format omits."""
+"""Report of `export`: comparison with the native model, what the format omits, and the file LAW.md."""
 
 from __future__ import annotations
 
+import re
+
+import numpy as np
+
+from calibration.data.input_errors import three_digits
+from mmrjax import __version__
+from mmrjax.errors import count_noun, printable
 from mmrjax.model import channels
-from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD
-from sweeps.export.formats import Export
+from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
+from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, EffectFate
+from sweeps.export.formats import FORMATS, Export
+from sweeps.export.joint import INSIDE, DriveJoint
+from sweeps.export.law_source import jax_source, module_from_source
 from sweeps.report import catalogue
 from sweeps.report.document import Cell, Document, Note, Section, Table, remarks
-from sweeps.report.words import export_words as words
 
 #: Tone of a verdict's cell.
 TONES = {HELD: "good", APPROXIMATED: "fair", DROPPED: "bad"}
@@ -16,14 +25,14 @@ TONES = {HELD: "good", APPROXIMATED: "fair", DROPPED: "bad"}
 def export_document(found: Export) -> Document:
     """Report of an exported drive."""
     compared = found.comparison
-    usage = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
+    usage = USE[found.format].format(name=found.joint.name, at="drive", armature=rotor_inertia(found))
     fate_rows = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
     fates = catalogue.table("export.fates", fate_rows)
     sections = [
         Section("What the format represents", (fates, catalogue.note("export.kept")), "holds"),
         Section(
             "Errors",
-            (_errors(found), catalogue.note("export.rim", words.errors_title(found).capitalize())),
+            (_errors(found), catalogue.note("export.rim", errors_title(found).capitalize())),
             "errors",
         ),
     ]
@@ -35,13 +44,13 @@ def export_document(found: Export) -> Document:
         checks = catalogue.table("export.checks", list(found.checks.items()))
         sections.append(Section("Checks of the files", (checks,)))
     conditions = (
-        Note(tuple(words.conditions_seen(found)), name="seen"),
-        Note(tuple(words.not_tested(found)), name="untested"),
+        Note(tuple(conditions_seen(found)), name="seen"),
+        Note(tuple(not_tested(found)), name="untested"),
     )
     return Document(
         f"{found.joint.file.name} for {found.format}",
-        words.export_statement(found),
-        (Note(usage, "lead"), *remarks(words.export_remarks(found))),
+        export_statement(found),
+        (Note(usage, "lead"), *remarks(export_remarks(found))),
         (*sections, _constants(found), Section("Conditions in the data, and what was not tested", conditions)),
     )
 
@@ -51,9 +60,285 @@ def _errors(found: Export) -> Table:
     names = list(next(iter(errors.values())))
     heads = (f"{channels.find_channel(n).label} [%] | .3g" for n in names)
     rows = [(label, *map(percent.get, names)) for label, percent in errors.items()]
-    return catalogue.table("export.error-table", rows, *heads, title=words.errors_title(found))
+    return catalogue.table("export.error-table", rows, *heads, title=errors_title(found))
 
 
 def _constants(found: Export) -> Section:
     rows = [(f"`{c.name}`", c.value, c.unit, c.interval or None, c.meaning, c.source) for c in found.constants]
     return Section("Constants", (catalogue.table("export.constants", rows),))
+
+
+#: Use of a file of each format, as a paragraph of LAW.md.
+USE = {
+    "mujoco": (
+        'Put `<include file="drive.xml"/>` before `<worldbody>` of your model and `class="{name}_drive"` on the '
+        "joint. The control is the voltage at the driver's output: duty times supply voltage. `scene.xml` runs as it "
+        "is: `python -m mujoco.viewer --mjcf=scene.xml`, key frame `run`."
+    ),
+    "jax": (
+        "`from actuator import PARAMS, actuator, initial_state`, or without any source "
+        '`jax.export.deserialize(open("actuator.jaxexport", "rb").read()).call`, in single precision, for arrays of '
+        "joints. Add the torque to `qfrc_applied` of the joint at each step, and set the joint's armature to "
+        "`armature(PARAMS)` once."
+    ),
+    "onnx": (
+        "Inputs are the state, `command` [V], `joint_position` [rad], `joint_velocity` [rad/s], each of shape "
+        "(joints,), and `dt` [s] of shape (1,). Outputs are `torque` [N·m], the next state, and the power taken [W]. "
+        "The state at rest is 0. All numbers are single precision. The joint needs the rotor's inertia as armature: "
+        "{armature:.4g} kg·m²."
+    ),
+    "mjlab": (
+        '`from mjlab_actuator import DriveActuatorCfg`, then `DriveActuatorCfg(target_names_expr=("{at}",))` '
+        "among the actuators of an entity. The effort target is the voltage [V]. It was tested with a stand-in "
+        "for mjlab."
+    ),
+    "table": (
+        "Read the voltage for a speed and a torque of the joint, and divide by the supply's voltage to get the "
+        "duty. Add inertia · acceleration of the rotating parts to the torque: the rotor has {armature:.4g} "
+        "kg·m² at the joint."
+    ),
+    "randomization": (
+        '`numpy.load("draws.npz")`: each array has one value per sample. Use all values of one sample '
+        "together, since they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco "
+        "writes it. `actuator/…` are keys of `PARAMS`."
+    ),
+}
+#: Readings that a controller compares with its setpoint, their units, and the last term of its duty.
+GOALS = {
+    "goal_angle": ("angle", "rad", "- K_d ω"),
+    "goal_speed": ("ω", "rad/s", "+ K_f goal"),
+    "goal_current": ("I", "A", "+ K_f goal"),
+}
+NOT_TESTED = (
+    "Voltages, loads and temperatures outside the runs above.",
+    "Fast changes: only settled runs are compared.",
+)
+BACKWARD = "Runs in which the load drives the motor."
+
+
+def export_statement(found: Export) -> str:
+    """One sentence: the exported drive, and its error compared with the native model."""
+    compared = found.comparison
+    exported, native = compared.errors[EXPORTED], compared.errors[NATIVE]
+    channels_shown = ", ".join(
+        f"{channels.find_channel(n).label} {three_digits(exported[n])} %"
+        + (f" (native {three_digits(native[n])} %)" if compared.situation.is_measured else "")
+        for n in exported
+    )
+    drive = found.joint
+    return (
+        f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
+        f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is "
+        f"{channels_shown or 'unknown: these runs have neither current nor speed'}."
+    )
+
+
+def share_kept(fate: EffectFate) -> str:
+    """Share of an effect that is kept, in percent, empty if it was not computed."""
+    return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
+
+
+def errors_title(found: Export) -> str:
+    """Title of the table of errors."""
+    compared = found.comparison
+    return f"error against {compared.reference}, rms over rms"
+
+
+def export_remarks(found: Export) -> list[str]:
+    compared, drive = found.comparison, found.joint
+    said = []
+    if not compared.situation.is_measured:
+        said.append("the reference is the native model. Give measured runs with --data")
+    else:
+        said.append(
+            "the refit used no measurements. Errors are hold-out errors unless the robot was fitted to these runs"
+        )
+    dropped_names = [f.name for f in compared.fates if f.verdict == DROPPED]
+    if dropped_names:
+        said.append(f"dropped: {', '.join(dropped_names)}")
+    if drive.idle:
+        said.append(f"{', '.join(drive.idle)}: not exported: no effect in {drive.configuration}")
+    if found.posterior is None and drive.file.source.endswith(".toml"):
+        said.append("no posterior.nc next to the robot's file: intervals come from the priors")
+    return said
+
+
+def conditions_seen(found: Export) -> list[str]:
+    """Ranges of the compared runs, one line for each."""
+    runs = found.comparison.situation
+    lines = [
+        f"{count_noun(len(runs.command), 'settled run')} of {runs.source}",
+        f"voltage at the driver's output {_span(runs.command)} V",
+        f"torque at the joint {_span(runs.load)} N·m",
+        f"speed of the joint {_span(runs.inside.speed)} rad/s",
+        f"current of one motor {_span(runs.inside.current)} A",
+    ]
+    if found.joint.robot.has_ground:
+        lines.append(f"slope {_span(np.degrees(np.asarray(runs.signals.slope)))} deg")
+        lines.append(f"normal load of one side {_span(np.asarray(runs.signals.normal))} N")
+    return lines
+
+
+def _span(values: np.ndarray) -> str:
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
+
+
+def not_tested(found: Export) -> list[str]:
+    """Limits of the comparison, one sentence for each."""
+    runs = found.comparison.situation
+    backward = bool(np.any(runs.load * runs.inside.speed < 0))
+    return [*NOT_TESTED, *([] if backward else [BACKWARD])]
+
+
+def rotor_inertia(found: Export) -> float:
+    """Inertia of the rotor at the joint [kg·m²], or armature of an exported law."""
+    robot = found.joint.robot
+    if found.format == "onnx":
+        law = module_from_source(jax_source(found.joint, found.constants))
+        return float(law.armature(law.PARAMS))
+    value = float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2 * float(robot.gearbox.efficiency_load)
+    return value + sum(float(e.amplitude) for e in found.joint.inside if e.balance == "inertia")
+
+
+def law_equations(found: Export) -> list[str]:
+    """Equations of the law in words, in the order of computation, with the symbols of the constants."""
+    robot = found.joint.robot
+    sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
+             "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
+    places = {sections[p.balance] for p in found.joint.parts if p.effect and p.balance in INSIDE}
+    less = {place: f" - {place} effects" if place in places else "" for place in sections.values()}
+    dry, viscous = ("M_t0", "K_ft") if robot.has_ground else ("M_0", "K")
+    rotor = "" if found.joint.loose else " - J_d i_r dω/dt"
+    backward = "2 - 1/η_rm, at least 0.02" if robot.gearbox.mesh_theory else "η_rm"
+    lines = [
+        "ω is the speed of the joint [rad/s], ω_m = i_r ω that of the motor. U is the voltage at the driver's "
+        "output, I the current of the motor. sign ω fades to 0 at rest.",
+        f"Winding: L_d dI/dt = U - C_m ω_m - R_rot I{less['winding']}. [V]",
+        f"Motor: M_d = C_m I - (M_df0 sign ω + K_fd ω_m){less['motor']}, at its shaft. [N·m]",
+        f"Gearbox: M_r = i_r η_rm (M_d - M_rf0 sign ω - K_fr ω_m{rotor}){less['gearbox']}, at its output. 1/η_b "
+        f"replaces η_rm while the sum in brackets brakes; η_b is {backward}. [N·m]",
+        f"Output: M = M_r - ({dry} sign ω + {viscous} ω){' - guides' if robot.has_ground else ''}{less['output']}: "
+        "the torque on the joint. [N·m]",
+    ]
+    if robot.has_ground:
+        lines.append("Guides: μ_t · share · normal load · radius · sign ω. [N·m]")
+    for part in found.joint.parts:
+        if part.effect and part.balance in INSIDE:
+            lines.append(
+                f"`{part.name}`, in {sections[part.balance]}: {part.equation} [{part.unit}] {part.meaning}".rstrip()
+            )
+    lines += _further_equations(found.joint)
+    if found.format == "mujoco":
+        lines += [
+            "MuJoCo's form of it: U = R' I' + L' dI'/dt + i_r K ω and M = i_r K I' - f sign ω - d ω. Here "
+            "R' = R_rot/η_rm (resistance), L' = L_d/η_rm, K = C_m (motorconst), f (frictionloss), d (damping), and "
+            "the motor's current I = c I' (current over act). Its numbers are refitted to the law above.",
+        ]
+    return lines
+
+
+def _further_equations(joint: DriveJoint) -> list[str]:
+    """Equations of a controller, and of a load that turns separately from the motor."""
+    lines = []
+    if joint.controller is not None:
+        goal, unit, rate = GOALS[joint.robot.rig.imposed]
+        own = joint.controller
+        sampled = f" It acts at {own.rate:g} Hz, {own.samples_late:g} samples late, and holds D." * (own.rate > 0)
+        lines.append(
+            f"Controller: e = goal - {goal} [{unit}], D = K_p e + K_i ∫ e dt {rate} within ± limit, U = D times the "
+            "supply. At the limit, an error that drives D further is not integrated. With a lag T, the duty follows: "
+            f"T dD'/dt = D - D'.{sampled} [-]"
+        )
+    if joint.loose:
+        lines.append(
+            "Play: motor and load turn apart by φ. s = φ less half of the backlash towards 0, and 0 within it. "
+            "M_r = k s + d ds/dt is the torque between them, and flanks never pull. Without a stated stiffness, "
+            f"k and d give {MESH_FREQUENCY:g} Hz and a damping ratio of {MESH_DAMPING:g}. The motor's side: "
+            "J i_r² dω/dt = i_r (M_d - M_rf0 sign ω - K_fr ω) - M_r/η - gearbox effects. [N·m]"
+        )
+    return lines
+
+
+def command_sentence(found: Export) -> str:
+    """Sentence on the command of an exported controller, empty if the command is a voltage."""
+    imposed = found.joint.robot.rig.imposed
+    if found.joint.controller is None or found.format == "table":
+        return ""
+    if found.format != "mujoco":
+        return f"\n\nThe command is the controller's goal [{GOALS[imposed][1]}], not a voltage."
+    if imposed != "goal_angle":
+        return ""
+    ratio = float(found.joint.robot.gearbox.ratio)
+    return (
+        f"\n\nThe control is the goal angle of the motor, {ratio:.6g} times that of the joint [rad], not a voltage."
+    )
+
+
+def escape_markdown(text: str) -> str:
+    """User's name escaped for Markdown, so that it ends no line, cell or code, and begins no HTML."""
+    words = " ".join(printable(text).split())
+    return words.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
+
+
+def law_text(found: Export) -> str:
+    """Text of LAW.md."""
+    drive, compared = found.joint, found.comparison
+    law_values = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
+    verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
+    constants = "\n".join(
+        f"| `{escape_markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
+        f"{escape_markdown(c.source)} |"
+        for c in found.constants
+    )
+    refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
+    table = f"\n| of the format | translated | refitted |\n|---|---|---|\n{refitted}\n" if refitted else ""
+    errors = "\n".join(
+        f"| {label} | {' | '.join(f'{x:.3g}' for x in percent.values())} |"
+        for label, percent in compared.errors.items()
+    )
+    names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[NATIVE]]
+    fates = "\n".join(
+        f"* {f.name}: {verdicts[f.verdict]} "
+        f"{f.how}{f' ({share_kept(f)} of its change is kept)' if share_kept(f) else ''}"
+        for f in compared.fates
+    )
+    cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
+    paper = "\nNumbers of equations and tables are those of the paper that describes this robot.\n" if cited else ""
+    bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
+    origin = escape_markdown(f"{drive.file.name}, {drive.configuration}")
+    return f"""# The law of this drive
+A motor with its gearbox on one joint: {origin}. The program mmrjax {__version__}
+obtained the parameters of this drive from measurements or data sheets, and exported the drive as
+{FORMATS[found.format]}. You need no other file of that program. All units are SI.
+The joint is the driven wheel or output shaft.
+
+## How to use it
+{USE[found.format].format(**law_values)}{command_sentence(found)}
+
+## Equations
+{bullets(law_equations(found))}
+
+## Constants
+| name | value | unit | interval | meaning | source |
+|---|---|---|---|---|---|
+{constants}
+{paper}{table}
+## What this format holds
+{fates}
+
+Percentages compare currents and speeds of settled runs with and without the effect.
+
+## How good it is
+{errors_title(found).capitalize()}:
+
+| model | {" | ".join(names)} |
+|---|{"---|" * len(names)}
+{errors}
+
+## Conditions seen
+{bullets(map(escape_markdown, conditions_seen(found)))}
+
+## Not tested
+{bullets(not_tested(found))}
+"""

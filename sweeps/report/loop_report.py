@@ -209,7 +209,6 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
     """Sections on the certainty of the answer and its limits."""
     standing = loop_words.support_sentence(found)
     also = [] if found.unnamed is None else [loop_words.proposed_formula(found.unnamed)]
-    also += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]

@@ -21,12 +21,12 @@ from mmrjax.errors import printable
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
+from sweeps.pages.comparison_figures import TimeOverlay
 from sweeps.pages.figure_style import (
     figure_as_svg,
     figure_settings,
     has_colour_scale,
 )
-from sweeps.pages.time_overlay import TimeOverlay
 from sweeps.report import run_tables
 from sweeps.report.document import PAGE_ROWS as ROWS
 from sweeps.report.document import SIDE_BY_SIDE, Column, Document, Figure, Note, Section, Table, cell_tone

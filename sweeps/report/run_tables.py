@@ -18,9 +18,9 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import SET, TABLE, Condition
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
+from sweeps.capabilities import UNLIMITED
 from sweeps.pages import words
-from sweeps.points import uncertainty
-from sweeps.points.imposed import UNLIMITED
+from sweeps.points import run
 from sweeps.report import catalogue
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
@@ -87,12 +87,10 @@ def quantity_column(name: str, **options: Any) -> Column:
 
 def quantity_cells(table: Columns, name: str) -> list[Any]:
     """Cells of a column, each with its standard deviation if the table has one. Infinite numbers are in words."""
-    values, spread = table[name], table.get(name + uncertainty.SD)
+    values, spread = table[name], table.get(name + run.SD)
     if spread is not None:
         digits = _REGISTERED[name].resolution
-        return [
-            None if math.isnan(v) else uncertainty.with_sd(v, s, digits) for v, s in zip(values, spread, strict=True)
-        ]
+        return [None if math.isnan(v) else run.with_sd(v, s, digits) for v, s in zip(values, spread, strict=True)]
     if name == "status":
         return [Cell(s, "" if s in words.SETTLED else "slides") for s in map(str, values)]
     if values.dtype.kind != "f":

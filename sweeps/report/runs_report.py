@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
-from mmrjax.fidelities.base import RunBatch
-from mmrjax.model.channels import Channel
+from mmrjax.fidelities.base import History, RunBatch
+from mmrjax.model.channels import SIDES, Channel, channels_named
 from mmrjax.model.quantities import MM, RPM, VOLTAGE
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.report import catalogue, run_tables
+from sweeps.report import catalogue, run_tables, turn_words
 from sweeps.report.document import SIDE_BY_SIDE, Block, Column, Document, Note, Section, Table, remarks
 from sweeps.report.run_tables import imposed_column
-from sweeps.report.words import posture_words
-from sweeps.report.words.posture_words import Postures
+from sweeps.report.turn_words import Postures
 
 #: Column of the largest total motor current in a run over time.
 PEAK = "peak_current_A"
@@ -66,7 +65,7 @@ def runs_document(
     )  # fmt: skip
     of_runs = Section("The run" if single else "The runs", (shown_table,), "runs-section")
     blocks += [] if single and first_run["status"] in words.SETTLED else [endings]
-    blocks += remarks([*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])])
+    blocks += remarks([*notes, *([] if stands is None else [turn_words.posture_sentences(stands)])])
 
     def sections() -> Iterable[Section]:
         if histories is not None:
@@ -130,7 +129,7 @@ def conditions_in_words(table: Columns, row: int) -> str:
 
 def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatch) -> Iterable[Section]:
     """Section on runs over time: readings of instruments, or starts on a ground, with effects of the running gear."""
-    from sweeps.pages import gear_figures, history_figures
+    from sweeps.pages import history_figures, resonance_figures
 
     configuration_indices = [robot.configurations.index(str(c)) for c in runs["configuration"]]
     history, status = histories.history, np.asarray(histories.result.status)
@@ -157,7 +156,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
-    gears = gear_figures.gear_runs(robot, history, status, share, configuration_indices, names[:GEARS])
+    gears = resonance_figures.gear_runs(robot, history, status, share, configuration_indices, names[:GEARS])
     # Ripple is evaluated in steady travel: contacts stop sliding before the evaluated part.
     ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
     if ripples:
@@ -185,13 +184,13 @@ def starts_table(starts: Sequence[Any]) -> Table:
 
 def ripple_table(ripples: Sequence[Any]) -> Table:
     """Table of the ripple at the end of each run."""
-    from sweeps.pages import gear_figures
+    from sweeps.pages import resonance_figures
 
-    return catalogue.table("runs.ripple-table", [gear_figures.ripple_row(g) for g in ripples])
+    return catalogue.table("runs.ripple-table", [resonance_figures.ripple_row(g) for g in ripples])
 
 
 def _posture(stands: Postures, names: Sequence[str]) -> Section:
-    table = posture_words.posture_table(stands, names)
+    table = turn_words.posture_table(stands, names)
     return Section("Posture", (catalogue.figure("runs.posture", stands), table), "posture-section")
 
 
@@ -261,3 +260,68 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
     return used_limits
+
+
+#: Quantities of each side: name, column, format.
+_ROWS = (
+    ("voltage [V]", "motor_voltage_{}_V", "z.2f"),
+    ("current [A]", "motor_current_{}_A", "z.3f"),
+    ("motor speed [rpm]", "motor_speed_{}_rpm", "z.0f"),
+    ("electrical power [W]", "power_{}_W", "z.1f"),
+    ("winding, long running [°C]", "winding_{}_C", "z.0f"),
+)
+
+
+def turn_document(
+    file: RobotFile,
+    model: str,
+    run: Columns,
+    ended: Mapping[str, float] | None,
+    history: History | None,
+    turns: Columns | None,
+    notes: Sequence[str],
+) -> Document:
+    """Report of a turn.
+
+    Args:
+        run: row of the turn in `runs.csv`.
+        ended: time, distance and angle at the end of a run over time.
+        history: history over time, if the fidelity keeps it.
+        turns: settled turns at other duties of the slower side.
+        notes: further remarks.
+    """
+    robot, row = file.robot, {name: values[0] for name, values in run.items()}
+    sides, going = sides_table(robot, row), turn_words.has_motion(row)
+    sections = []
+    if sides.rows and history is not None:
+        path = (np.asarray(history.reading[name])[0] for name in ("place_x", "place_y", "yaw"))
+        sections.append(Section("From above", (catalogue.figure("turn.path", robot, row, *path),)))
+    if history is not None:
+        names = [f"motor_{what}_{side}" for what in ("current", "speed") for side in SIDES]
+        shown = channels_named((*names, "yaw_rate"))
+        rows = {c.column: np.asarray(history.reading[c.name])[0] / c.factor for c in shown}
+        rows["time_s"] = np.asarray(history.time)[0]
+        sections.append(Section("Over time", (catalogue.figure("turn.course", rows),)))
+    elif turns is not None:
+        sections.append(Section("Other turns", (catalogue.figure("turn.turns", turns, row),)))
+    return Document(
+        f"Turn of {run_headings(run)[0]}",
+        turn_words.turn_answer(row, ended),
+        (
+            run_tables.note_on_robot(file, model),
+            sides,
+            *remarks([*(turn_words.turn_notes(robot, row) if going else []), *notes]),
+        ),
+        tuple(sections),
+    )
+
+
+def sides_table(robot: Robot, row: Columns) -> Table:
+    """Table of both sides, without rows if no motion is known."""
+    idle, yaw_known = capabilities.inapplicable_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
+    rows = []
+    for label, column, form in _ROWS if yaw_known else ():
+        values = [float(row[column.format(side)]) for side in SIDES]
+        if column.format(SIDES[0]) not in idle:
+            rows.append((label, *(words.NONE_SETTLES if math.isinf(v) else format(v, form) for v in values)))
+    return catalogue.table("turn.sides", rows)

@@ -1,4 +1,4 @@
-"""Report of a sensitivity study: the answer, then each output, interactions and next runs."""
+"""Report of a sensitivity study: the answer, then each output and the inputs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from calibration.data.robot_file import RobotFile
-from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
+from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult
 from calibration.words import sensitivity_words
 from sweeps.pages.words import short_name
 from sweeps.report import catalogue, run_tables
@@ -36,9 +36,6 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
     )  # fmt: skip
     idle = "less than {:g} % everywhere: {}".format(100 * NEGLIGIBLE, ", ".join(found.negligible))
     said = [idle] * bool(found.negligible)
-    if (n := found.next_runs) is not None:
-        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
-        said.append(f"next runs, of {n.candidates} candidates ({n.source}), measured to {n.noise}: {labels}")
     # the most important inputs for each output
     rows = []
     for study in found.outputs.values():
@@ -66,8 +63,6 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
         if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _any_influence(study):
             folded = "tornado" if k >= UNFOLDED else ""
             yield Section("", tuple(_output(name, study, found)), folded=folded)
-    if found.next_runs is not None:
-        yield Section("What to measure next", tuple(_next_runs(found, found.next_runs)), "measure")
     yield Section("Inputs", (_inputs(found), catalogue.note("sensitivity.largest")), "inputs")
 
 
@@ -113,30 +108,3 @@ def _inputs(found: SensitivityResult) -> Table:
         interval = "{:.3g} to {:.3g}".format(*x.interval)
         rows.append((f"`{name}`", x.meaning, x.unit, x.distribution, x.median, interval, largest))
     return catalogue.table("sensitivity.inputs", rows)
-
-
-def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
-    """Section on the most informative runs, and the uncertainty that remains after them."""
-    yield catalogue.note("sensitivity.optimal", n.candidates, n.source, n.noise)
-    points = n.points
-    imposed = "supply [V] | g" if points.motor_speed is None else "motor speed [rpm] | g"
-    ground = {"payload [kg] | g": points.payload, "slope [°] | g": points.slope_deg} if points.has_ground else {}
-    rows = [
-        (k + 1, str(points.configuration[k]), points.imposed[1][k], *(x[k] for x in ground.values()), n.gain[k])
-        for k in range(len(points))
-    ]
-    yield catalogue.table("sensitivity.next-runs", rows, imposed, *ground)
-    runs_left = []
-    for name, sds in n.output_sd.items():
-        row = found.outputs[name].row
-        if np.isfinite(sds).all() and sds[0] > 0:
-            unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
-            ends = sds[0] / row.factor, sds[-1] / row.factor
-            runs_left.append((row.label, *(f"±{_two_digits(sd)}{unit}" for sd in ends), 100 * ends[1] / ends[0]))
-    yield catalogue.table("sensitivity.left", runs_left)
-    yield catalogue.note("sensitivity.first-order")
-
-
-def _two_digits(sd: float) -> str:
-    """Sd as text with two digits, without an exponent."""
-    return f"{sd:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))}f}"

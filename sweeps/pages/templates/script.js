@@ -1,4 +1,4 @@
-// Tables are sorted by a click on a heading, and stacked on a phone; figures say what is under the pointer. Nothing is fetched.
+// Tables are sorted by a click on a heading, and stacked on a phone. Nothing is fetched.
 document.querySelectorAll("table").forEach(table => {
   const heads = [...table.rows].filter(row => row.cells.length && [...row.cells].every(cell => cell.tagName === "TH"));
   const body = [...table.rows].filter(row => !heads.includes(row));
@@ -36,36 +36,3 @@ const stack = () => document.querySelectorAll(".scroll > table").forEach(table =
 stack();
 addEventListener("resize", stack);
 addEventListener("toggle", stack, true);
-const reading = document.body.appendChild(Object.assign(document.createElement("div"), {id: "reading", hidden: true}));
-document.querySelectorAll("svg[data-axes]").forEach(svg => {
-  const all = JSON.parse(svg.dataset.axes);
-  let places;
-  const found = () => {  // markers and corners of lines and bars, in the drawing's own units
-    if (places) return places;
-    places = [...svg.querySelectorAll("g use")].map(u => [u.x.baseVal.value, u.y.baseVal.value]);
-    svg.querySelectorAll("g > path").forEach(path => {
-      const at = [...(path.getAttribute("d") || "").matchAll(/[ML] (\S+) (\S+)/g)].map(m => [+m[1], +m[2]]);
-      if (at.length > 2 && at.length < 2000 && !path.closest("g[id^=text], defs")) places.push(...at);
-    });
-    return places;
-  };
-  const value = (axis, share) => {
-    const [low, high] = axis.ends, x = axis.log ? low * (high / low) ** share : low + (high - low) * share;
-    const nearest = (a, b) => Math.abs(b[0] - x) < Math.abs(a[0] - x) ? b : a;
-    return (axis.label ? axis.label + ": " : "") + (axis.names ? axis.names.reduce(nearest)[1] : Number(x.toPrecision(4)));
-  };
-  svg.addEventListener("pointermove", event => {
-    const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
-    const axes = all.find(({box: [x, y, w, h]}) => point.x >= x && point.x <= x + w && point.y >= y && point.y <= y + h);
-    reading.hidden = !axes;
-    if (!axes) return;
-    const [x, y, w, h] = axes.box, within = ([a, b]) => a > x + .1 && a < x + w - .1 && b > y + .1 && b < y + h - .1;
-    const far = ([a, b]) => Math.hypot(a - point.x, b - point.y);
-    const near = found().filter(within).reduce((a, b) => far(b) < far(a) ? b : a, [Infinity, Infinity]);
-    const [a, b] = far(near) < 9 ? near : [point.x, point.y];
-    reading.textContent = [value(axes.x, (a - x) / w), value(axes.y, 1 - (b - y) / h)].join("; ");
-    reading.style.left = Math.min(event.clientX + 14, innerWidth - reading.offsetWidth - 8) + "px";
-    reading.style.top = Math.max(event.clientY - 34, 4) + "px";
-  });
-  svg.addEventListener("pointerleave", () => { reading.hidden = true; });
-});

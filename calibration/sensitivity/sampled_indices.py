@@ -1,0 +1,332 @@
+"""Sobol' indices (Sobol' 1993, Homma and Saltelli 1996) and elementary effects (Morris 1991), from replicates.
+
+S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that vanishes if x_i is known. T_i = E[Var(y | all but
+x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions. S_ij is the joint
+effect of x_i and x_j in addition to their single effects. Designs (Saltelli's scheme on a scrambled Sobol sequence)
+and estimators are those of SALib: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first order and, after Jansen
+(1999), for the total, and Saltelli, ibid. 145 (2002) for second order, as the mean of both orders.
+
+Every index is a ratio of means: a numerator over a variance. A bootstrap over the points of a scrambled Sobol
+sequence would treat them as independent, but they are correlated by construction. Whole replicates with different
+scramblings are independent (Owen, Monte Carlo variance of scrambled net quadrature, SIAM J. Numer. Anal. 34 (1997)).
+The spread between replicates is therefore that of the estimate, and Student's t gives the interval.
+
+μ* is the mean magnitude of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22
+(2007)). σ is the standard deviation of the change between places, due to nonlinearity or interactions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+#: Replicates of a design.
+REPLICATES = 32
+#: Probability of the intervals.
+LEVEL = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class IntervalEstimate:
+    """Estimates with their 95 % intervals.
+
+    Attributes:
+        value: estimates, any shape.
+        low, high: ends of the 95 % interval.
+    """
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __getitem__(self, k: Any) -> IntervalEstimate:
+        return IntervalEstimate(self.value[k], self.low[k], self.high[k])
+
+
+def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEstimate:
+    """Ratio of the means of two quantities over replicates, with its interval.
+
+    Its variance is that of the linearised ratio, e = (numerator - ratio · denominator) / mean denominator (Cochran,
+    Sampling Techniques (1977), eq. 6.9). The bias of the ratio decreases with the total number of points, not with
+    the number in a replicate.
+
+    Args:
+        numerator: shape (replicates, ...).
+        denominator: shape (replicates,), not negative.
+
+    Returns:
+        NaN if the denominator is 0: without variance there are no shares.
+    """
+    count = len(numerator)
+    mean_denominator = float(np.mean(denominator))
+    shape = (-1,) + (1,) * (numerator.ndim - 1)
+    if not mean_denominator > 0:
+        undefined = np.full(numerator.shape[1:], np.nan)
+        return IntervalEstimate(undefined, undefined, undefined)
+    mean_numerator = np.mean(numerator, 0)
+    value = mean_numerator / mean_denominator
+    error = (numerator - mean_numerator - value * (denominator - mean_denominator).reshape(shape)) / mean_denominator
+    sd = np.sqrt(np.sum(error**2, 0) / (count * (count - 1)))
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, count - 1)) * sd
+    return IntervalEstimate(value, value - width, value + width)
+
+
+#: Fewest points of a replicate.
+FEWEST = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class SobolDesign:
+    """Points of the unit cube for Sobol indices, grouped by replicates.
+
+    Attributes:
+        points: points, shape (replicates · size · blocks, inputs). Blocks follow one another: A, then A with the k-th
+            column of B for each k, then (with `second`) B with the k-th column of A for each k, then B.
+        size: number of base points of a replicate, a power of 2.
+        second: True for designs with second-order indices.
+    """
+
+    points: np.ndarray
+    size: int
+    second: bool
+    replicates: int = REPLICATES
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs."""
+        return self.points.shape[1]
+
+    @property
+    def blocks(self) -> int:
+        """Number of evaluations for each base point."""
+        return (2 * self.inputs if self.second else self.inputs) + 2
+
+
+def base_point_count(evaluations: float, inputs: int) -> int:
+    """Number of base points of a replicate for at least this many evaluations: a power of 2."""
+    blocks = 2 * inputs + 2
+    return 2 ** max(math.ceil(math.log2(max(evaluations / (REPLICATES * blocks), FEWEST))), 0)
+
+
+def sobol_design(inputs: int, size: int, seed: int, second: bool = True) -> SobolDesign:
+    """Design of independent replicates, each a Sobol sequence with its own scrambling.
+
+    Args:
+        size: base points of a replicate, a power of 2.
+        seed: random seed.
+    """
+    from SALib.sample import sobol as sampling
+
+    problem = {
+        "num_vars": inputs,
+        "names": [str(k) for k in range(inputs)],
+        "bounds": [[0.0, 1.0]] * inputs,
+    }
+    generators = np.random.default_rng(seed).spawn(REPLICATES)
+    parts = [sampling.sample(problem, size, calc_second_order=second, seed=rng) for rng in generators]
+    return SobolDesign(np.concatenate(parts), size, second, REPLICATES)
+
+
+@dataclasses.dataclass(frozen=True)
+class VarianceTerms:
+    """Parts of an output's variance in each replicate [unit² of the output]. Their ratios are the indices.
+
+    Attributes:
+        variance: total variance, shape (replicates,).
+        first, total: parts for the first-order and total indices, shape (replicates, inputs).
+        second: part of each pair including its single effects, shape (replicates, inputs, inputs). None if not
+            computed.
+        rows: number of included base points.
+        lost: number of base points omitted because the model has no value.
+    """
+
+    variance: np.ndarray
+    first: np.ndarray
+    total: np.ndarray
+    second: np.ndarray | None
+    rows: int
+    lost: int
+
+    def __add__(self, other: VarianceTerms) -> VarianceTerms:
+        """Terms of both outputs together, as for a vector of outputs (Gamboa et al., Electron. J. Stat. 8 (2014))."""
+        second = None if self.second is None or other.second is None else self.second + other.second
+        return VarianceTerms(
+            self.variance + other.variance,
+            self.first + other.first,
+            self.total + other.total,
+            second,
+            self.rows + other.rows,
+            self.lost + other.lost,
+        )
+
+    def widened(self, places: Sequence[int], inputs: int) -> VarianceTerms:
+        """Terms for more inputs: these terms at `places`, the others without influence."""
+
+        first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
+        first[:, places], total[:, places] = self.first, self.total
+        second = None
+        columns = np.asarray(places)
+        if self.second is not None:
+            second = first[:, :, None] + first[:, None, :]  # without interaction
+            second[np.ix_(np.arange(len(second)), columns, columns)] = self.second
+        return dataclasses.replace(self, first=first, total=total, second=second)
+
+
+def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None:
+    """Parts of the variance of an output.
+
+    A base point is omitted if the output is not finite in one of its blocks. If this depends on a single input (such
+    as too small an adhesion), the indices are exact for the distribution of that input truncated there. Otherwise
+    they are approximate.
+
+    Args:
+        values: values of the output at the points of the design.
+
+    Returns:
+        None if some replicate has fewer than two base points left.
+    """
+    d = design.inputs
+    values_by_block = np.reshape(values, (design.replicates, design.size, design.blocks))
+    finite = np.asarray(np.isfinite(values_by_block).all(-1))
+    count = finite.sum(1)
+    if count.min() < 2:
+        return None
+    values_by_block = np.where(finite[..., None], values_by_block, 0.0)
+    a, b = values_by_block[..., 0], values_by_block[..., -1]
+    centre = (a + b)[finite].mean() / 2
+    values_by_block = np.where(finite[..., None], values_by_block - centre, 0.0)
+    a, b, ab = values_by_block[..., 0], values_by_block[..., -1], values_by_block[..., 1 : d + 1]
+    # A replicate with more rows has a larger weight: sums are divided by the mean number of rows.
+    weight = 1.0 / count.mean()
+    second = None
+    if design.second:
+        ba = values_by_block[..., d + 1 : 2 * d + 1]
+        # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
+        mixed = np.einsum("rnj,rnk->rjk", ba, ab)
+        square_of_means = np.einsum("rn,rn->r", a, b)[:, None, None]
+        closed = weight * (mixed - square_of_means)
+        second = (closed + np.swapaxes(closed, 1, 2)) / 2
+    return VarianceTerms(
+        variance=weight * np.sum(a**2 + b**2, 1) / 2,
+        first=weight * np.einsum("rn,rnk->rk", b, ab - a[..., None]),
+        total=weight * np.sum((a[..., None] - ab) ** 2, 1) / 2,
+        second=second,
+        rows=int(count.sum()),
+        lost=int(finite.size - count.sum()),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class SobolIndices:
+    """Sobol indices of one output, shape (inputs,). `second` has the shape (inputs, inputs) or is None. `variance`:
+    [unit²].
+    """
+
+    first: IntervalEstimate
+    total: IntervalEstimate
+    second: IntervalEstimate | None
+    variance: float
+
+
+def indices_of_terms(terms: VarianceTerms) -> SobolIndices:
+    """Sobol indices from the parts of the variance."""
+    variance, first, second = terms.variance, terms.first, None
+    if terms.second is not None:
+        second = ratio_estimate(terms.second - first[:, :, None] - first[:, None, :], variance)
+    return SobolIndices(
+        ratio_estimate(first, variance), ratio_estimate(terms.total, variance), second, float(variance.mean())
+    )
+
+
+#: Levels of the grid of the trajectories.
+LEVELS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class ElementaryEffects:
+    """Elementary effects of each input on an output [unit of the output per range of the input], shape (inputs,).
+
+    Attributes:
+        mean: μ, mean of the effects.
+        size: μ*, mean magnitude of the effects, with its interval.
+        spread: σ, standard deviation of the effects.
+        trajectories: number of included trajectories.
+        lost: number of omitted trajectories, at a point of which the model has no value.
+    """
+
+    mean: np.ndarray
+    size: IntervalEstimate
+    spread: np.ndarray
+    trajectories: int
+    lost: int
+
+
+def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
+    """Trajectories in the unit cube, shape (trajectories · (inputs + 1), inputs)."""
+    from SALib.sample import morris as sampling
+
+    # The sampler uses NumPy's global generator despite its seed argument, so the state is restored.
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        return sampling.sample(_problem(inputs), trajectories, num_levels=LEVELS, seed=seed)
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def elementary_effects(points: np.ndarray, values: np.ndarray) -> ElementaryEffects | None:
+    """Elementary effects of each input on one output.
+
+    Args:
+        points: points from `morris_design`.
+        values: values of the output there.
+
+    Returns:
+        None if fewer than two trajectories have values at all points.
+    """
+    from SALib.analyze.morris import analyze
+
+    count, steps = len(points) // (points.shape[1] + 1), points.shape[1] + 1
+    values_by_path = values.reshape(count, steps)
+    finite = np.isfinite(values_by_path).all(1)
+    finite_points = np.repeat(finite, steps)
+    if finite.sum() < 2:
+        return None
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        analysis = analyze(
+            _problem(points.shape[1]), points[finite_points], values[finite_points], num_levels=LEVELS, seed=0
+        )
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    size = np.asarray(analysis["mu_star"], float)
+    # change of the output per change of the moved input, shape (trajectories, inputs)
+    steps_taken = np.diff(points[finite_points].reshape(-1, steps, points.shape[1]), axis=1)
+    moved_input = np.abs(steps_taken).argmax(-1)
+    change = (
+        np.diff(values_by_path[finite], axis=1) / np.take_along_axis(steps_taken, moved_input[..., None], -1)[..., 0]
+    )
+    elementary = np.zeros_like(change)
+    np.put_along_axis(elementary, moved_input, change, 1)
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
+    error = width * np.abs(elementary).std(0, ddof=1)
+    return ElementaryEffects(
+        np.asarray(analysis["mu"], float),
+        IntervalEstimate(size, size - error, size + error),
+        np.asarray(analysis["sigma"], float),
+        int(finite.sum()),
+        int(count - finite.sum()),
+    )
+
+
+def _problem(inputs: int) -> dict[str, object]:
+    return {
+        "num_vars": inputs,
+        "names": [str(k) for k in range(inputs)],
+        "bounds": [[0.0, 1.0]] * inputs,
+        "groups": None,
+    }

@@ -1,0 +1,391 @@
+"""Numbers of a driven joint or a data sheet, and templates of rig files that they fill in."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping
+from importlib import resources
+
+import numpy as np
+
+from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number, three_digits
+from calibration.data.stated import HEADER
+
+#: Number, and the element of the model that states it.
+Found = tuple[float, str]
+
+#: Kinds of rig on the ground, and kinds for a joint that turns.
+VEHICLES = ("wheeled", "tracked")
+TURNING = (*VEHICLES, "bench", "dyno", "pendulum", "servo")
+#: Smallest gravity torque that counts as an arm [N·m].
+LEAST_WEIGHT = 1e-9
+#: Largest distance between wheel centre and joint axis, as a share of the radius, and largest sine between the axes.
+OFF_AXIS = 0.02
+#: Upper limit of a loss that the model does not state, as a share of the stall torque.
+UNSTATED = 0.05
+#: Sd of each number: models round masses and guess losses.
+WIDTHS = {
+    "mass": "20 %", "radius": "5 %", "inertia": "50 %", "ratio": "5 %", "armature": "50 %", "friction": "100 %",
+    "damping": "100 %", "weight": "20 %", "angle": "0.1",
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class JointNumbers:
+    """Numbers of a joint and its load [SI]. None if the model has no value.
+
+    Attributes:
+        file, joint: names of the file and the joint.
+        rolls: True if the joint turns a wheel of a body that is free to move.
+        mass: mass of the whole model.
+        sides: number of equal joints, such as wheels on both sides.
+        inertia: moment of inertia about the joint's axis of everything that turns with it, without `armature`.
+        radius: radius of the wheel.
+        ratio: motor turns per turn of the joint.
+        friction, damping, armature: friction, damping and armature at the joint.
+        weight: largest gravity torque [N·m].
+        angle: angle of the load at rest under gravity.
+        drive: numbers of the motor by dotted name. They take precedence over values that follow from the others.
+    """
+
+    file: str
+    joint: str
+    rolls: bool
+    mass: Found | None
+    inertia: Found
+    sides: Found | None = None
+    radius: Found | None = None
+    ratio: Found | None = None
+    friction: Found | None = None
+    damping: Found | None = None
+    armature: Found | None = None
+    weight: Found | None = None
+    angle: Found | None = None
+    drive: Mapping[str, StatedNumber] = dataclasses.field(default_factory=dict)
+
+    def kind(self, stated: str | None) -> str:
+        """Kind of rig: `stated`, or else the kind that fits the joint's load.
+
+        Raises:
+            BadConfiguration: the load of this kind slides.
+        """
+        if stated is None:
+            return "wheeled" if self.rolls else "bench" if self.weight is None else "pendulum"
+        if stated not in TURNING:
+            raise BadConfiguration(f"--kind: got {stated} with --from, which reads a revolute joint; "
+                                   f"{allowed_words(stated, TURNING)}")  # fmt: skip
+        return stated
+
+    def numbers(self, kind: str) -> dict[str, StatedNumber]:
+        """Numbers for the rig file of this kind, by dotted name."""
+        by_name: dict[str, StatedNumber] = {}
+
+        def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
+            if number is not None:
+                by_name[name] = StatedNumber(
+                    number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, "")
+                )
+
+        moving = kind in VEHICLES
+        losses = "load.track" if moving else "load"
+        if moving:
+            put("load.mass", "kg", "mass", self.mass)
+            put("load.radius", "m", "radius", self.radius)
+        else:
+            put("load.torque_gravity", "N·m", "weight", self.weight)
+            put("load.angle_zero", "rad", "angle", self.angle)
+        if self.sides is not None:
+            by_name["sides"] = StatedNumber(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
+        put(f"{losses}.loss_coulomb", "N·m", "friction", self.friction)
+        put(f"{losses}.loss_viscous", "N·m·s", "damping", self.damping)
+        put("gearbox.ratio", "-", "ratio", self.ratio)
+        inertia = self.inertia
+        if self.armature is not None and self.ratio is not None:
+            rotor = (self.armature[0] / self.ratio[0] ** 2, self.armature[1])
+            put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
+        elif self.armature is not None:
+            inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
+            by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", "no ratio found: the load inertia includes it")
+        put("load.inertia", "kg·m^2", "inertia", inertia)
+        return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
+
+
+def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict[str, StatedNumber]:
+    """Numbers of a rig, with those losses of the joint free that its model lacks or leaves at the default 0.
+
+    Each may be up to `UNSTATED` of the stall torque k n U / R, the speed-dependent loss at no-load speed U / (k n).
+    Without motor constants and ratio, or without the voltage U for the constant loss, the template's line is kept,
+    and a value of 0 is fixed.
+    """
+    freed = dict(numbers)
+    constant, resistance, ratio, limit = (
+        freed[name].value if name in freed else 0.0
+        for name in ("motor.torque_constant", "motor.resistance", "gearbox.ratio", "motor.voltage_limit")
+    )
+    torque = UNSTATED * constant * ratio / resistance if resistance > 0 else 0.0  # [N·m/V]
+    losses = "load.track" if kind in VEHICLES else "load"
+    for key, unit, width in (
+        ("loss_coulomb", "N·m", torque * limit),
+        ("loss_viscous", "N·m·s", torque * constant * ratio),
+    ):
+        name, reason = f"{losses}.{key}", f"not in the model, ± is {100 * UNSTATED:g} % of the stall torque"
+        if name in freed and freed[name].value != 0:
+            continue
+        if width > 0:
+            freed[name] = StatedNumber(0.0, unit, reason, f"{width:.2g}")
+        elif name in freed:
+            source = f'{freed[name].source}; a value of 0 stays fixed, "0.0 ± 0.01" is fitted'
+            freed[name] = dataclasses.replace(freed[name], source=source)
+    return freed
+
+
+def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:
+    """Amplitude M [N·m] and rest angle θ_0 [rad] of the gravity torque -M sin(θ - θ_0). None: M is negligible.
+
+    Args:
+        torque, torque_quarter: gravity torques about the axis at θ = 0 and at a quarter turn [N·m].
+    """
+    weight = math.hypot(torque, torque_quarter)
+    angle = math.atan2(torque, -torque_quarter) + 0.0  # avoids -0.0 in the file
+    return (weight, angle) if weight > LEAST_WEIGHT else None
+
+
+def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndarray | None) -> bool:
+    """True if a cylinder or sphere turns about its own axis.
+
+    Args:
+        centre: centre relative to a point on the joint's axis.
+        axis: axis of the joint.
+        along: axis of the cylinder. None: a sphere. Axes are unit vectors, shape (3,).
+    """
+    distance = np.linalg.norm(np.cross(axis, centre))
+    tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))
+    return bool(distance <= OFF_AXIS * radius and tilted <= OFF_AXIS)
+
+
+#: Kinds of rig, in words.
+KINDS = {
+    "bench": "a motor with gearbox that drives a shaft: brake, disk, worm, winch",
+    "dyno": "a motor on a dynamometer: a brake whose torque is set and measured",
+    "pendulum": "a servo with an arm under gravity",
+    "servo": "a servo driven by PWM, with its angle logged",
+    "linear": "a carriage on a screw, a belt or a rope",
+    "carriage": "a carriage on an amplifier that controls the current, with its position logged",
+    "wheeled": "a robot on wheels",
+    "tracked": "a robot on tracks",
+}
+#: Name of the load's table in dotted names, which the template's own name replaces.
+LOAD = "load"
+
+
+@dataclasses.dataclass(frozen=True)
+class StatedNumber:
+    """A number for a line of a rig file.
+
+    Attributes:
+        value: value in `unit`.
+        source: file and element that state it.
+        width: text after ±, empty if there is none.
+    """
+
+    value: float
+    unit: str
+    source: str
+    width: str = ""
+
+    @property
+    def text(self) -> str:
+        """Number as text for the file. A relative sd of 0 is omitted."""
+        number = repr(self.value if isinstance(self.value, int) else float(f"{self.value:.12g}"))
+        exact = not self.width or (self.value == 0 and self.width.endswith("%"))
+        return number if exact else f'"{number} ± {self.width}"'
+
+
+def rig_template(kind: str) -> str:
+    """Template for a kind of rig."""
+    return resources.files("calibration.data").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
+
+
+def fill_rig_template(kind: str, numbers: Mapping[str, StatedNumber], heading: str) -> str:
+    """Template of a kind of rig, filled in with numbers.
+
+    Numbers without a line in the template are added at the end of their table.
+
+    Args:
+        numbers: numbers by dotted name, with `load.` for the table of the load.
+        heading: sentence for the first line.
+    """
+    lines = rig_template(kind).splitlines()
+    load_line = next(k for k, line in enumerate(lines) if line.startswith("load = "))
+    load = lines[load_line - 1].strip("[]")
+    for name, number in numbers.items():
+        table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
+        line = f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}"
+        if table and f"[{table}]" not in lines:
+            lines += ["", f"[{table}]"]
+        start = lines.index(f"[{table}]") + 1 if table else 0
+        end = next((k for k in range(start, len(lines)) if HEADER.match(lines[k])), len(lines))
+        key_lines = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
+        if key_lines:
+            lines[key_lines[0]] = line
+            continue
+        while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
+            end -= 1  # comments below belong to the next table
+        lines.insert(end, line)
+    return "\n".join([f"# {_one_line(heading)}", *lines]) + "\n"
+
+
+def _one_line(text: str) -> str:
+    """Text on one line, because line breaks in names of a model would end a comment."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+_GRAVITY, _POUND_FORCE, _INCH = 9.80665, 4.4482216, 0.0254
+#: Units of torque: normalised spelling, and value in N·m.
+TORQUES = {
+    "Nm": 1.0, "mNm": 1e-3, "Ncm": 1e-2, "kg·cm": 1e-2 * _GRAVITY, "kgf·cm": 1e-2 * _GRAVITY,
+    "g·cm": 1e-5 * _GRAVITY, "gf·cm": 1e-5 * _GRAVITY, "oz·in": _POUND_FORCE / 16 * _INCH,
+    "ozf·in": _POUND_FORCE / 16 * _INCH, "lb·in": _POUND_FORCE * _INCH, "lbf·in": _POUND_FORCE * _INCH,
+}  # fmt: skip
+_CURRENTS = {"A": 1.0, "mA": 1e-3}
+#: Numbers of a data sheet, by the name of their option: units in SI.
+NUMBERS: dict[str, dict[str, float]] = {
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "no-load-speed": {"rpm": math.pi / 30, "1/min": math.pi / 30, "rad/s": 1.0},
+    "no-load-current": _CURRENTS,
+    "stall-torque": TORQUES,
+    "stall-current": _CURRENTS,
+    "resistance": {"ohm": 1.0, "Ω": 1.0, "mohm": 1e-3, "mΩ": 1e-3},
+}
+#: Largest relative difference between two values of a number.
+APART = 0.1
+#: Smallest sds of resistance and torque constant [%]. Makers print three digits and allow 5 to 10 % between motors.
+WIDTH_RESISTANCE, WIDTH_CONSTANT = 5.0, 3.0
+
+
+def _unit_list(text: str) -> str:
+    return re.sub(r"[\s·.*-]", "", text).casefold()
+
+
+def _parse_quantity(name: str, text: str) -> float:
+    units = NUMBERS[name]
+    expected = f"expected a positive number with a unit: {', '.join(units)}"
+    split = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
+    factor = None if split is None else {_unit_list(u): f for u, f in units.items()}.get(_unit_list(split[2]))
+    try:
+        value = parse_number(split[1]) if split is not None and factor is not None else math.nan
+    except ValueError:
+        value = math.nan
+    if not (0 < value < math.inf) or factor is None:
+        raise BadConfiguration(f"--{name}: got {text}; {expected}")
+    return value * factor
+
+
+def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
+    """Resistance, torque constant and friction of a motor as lines of a rig file.
+
+    At stall U = R I_s and M_s = k (I_s - I_0). At no load U = R I_0 + k ω_0, with friction torque k I_0.
+
+    Args:
+        stated: text with unit for each of `NUMBERS`.
+
+    Raises:
+        BadConfiguration: a text has no number or unit, there are too few numbers, or numbers differ by more than
+            `APART` although these equations make them equal.
+    """
+    if not stated:
+        other_options = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
+        raise BadConfiguration(
+            f"--from-sheet: no motor data; expected --no-load-current and at least three of {other_options}"
+        )
+    sheet = {name: _parse_quantity(name, text) for name, text in stated.items()}
+    drop = _stall_minus_no_load_current(sheet)
+    voltage, speed, idle, torque, stall, stated_resistance = map(sheet.get, NUMBERS)
+    assert idle is not None
+    resistances = [(stated_resistance, "resistance"), (_ratio_or_none(voltage, stall), "voltage / stall current")]
+    if stated_resistance is None and stall is None:
+        resistances.append((_ratio_or_none(voltage, idle + drop), "voltage and power at no load"))
+    if voltage is None and stated_resistance is None and speed is not None and torque is not None:
+        resistances.append((torque * speed / drop**2, "stall torque, no-load speed and stall current"))
+    known_resistances = [(value, source) for value, source in resistances if value is not None]
+    resistance = known_resistances[0][0]
+    back_emf = resistance * drop if voltage is None else voltage - resistance * idle
+    constants = [
+        (_ratio_or_none(back_emf, speed), "voltage / no-load speed"),
+        (_ratio_or_none(torque, drop), "stall torque / stall current"),
+    ]
+    stated_constants = [(value, source) for value, source in constants if value is not None]
+    _reject_contradictions((known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
+    constant = stated_constants[0][0]
+
+    def line(value: float, unit: str, source: str, width: float) -> StatedNumber:
+        return StatedNumber(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
+
+    spread = [100 * _largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
+    return {
+        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], max(WIDTH_RESISTANCE, spread[0])),
+        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], max(WIDTH_CONSTANT, spread[1])),
+        "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
+        "motor.friction_viscous": StatedNumber(
+            0.0,
+            "N·m·s",
+            "Coulomb and viscous friction are not separated, ± as if half were viscous",
+            f"{0.5 * constant**2 * idle / back_emf:.2g}",
+        ),
+    }
+
+
+def _ratio_or_none(one: float | None, other: float | None) -> float | None:
+    return None if one is None or other is None else one / other
+
+
+def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
+    """Stall current minus no-load current [A].
+
+    Raises:
+        BadConfiguration: the numbers do not determine it, or the no-load current is not the smaller one.
+    """
+    voltage, speed, idle, torque, stall, resistance = map(sheet.get, NUMBERS)
+    if idle is None:
+        raise BadConfiguration("--no-load-current: missing; the motor friction needs it")
+    missing = [name for name in NUMBERS if name not in sheet]
+    if speed is None and torque is None:
+        raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
+    totals = [x for x in (stall, _ratio_or_none(voltage, resistance)) if x is not None]
+    if totals and min(totals) <= idle:
+        raise BadConfiguration(f"--no-load-current: got {three_digits(idle)} A, but the stall current is "
+                               f"{three_digits(min(totals))} A; expected less")  # fmt: skip
+    total = totals[0] if totals else None
+    if total is not None and (resistance is not None or voltage is not None):
+        return total - idle
+    if speed is not None and torque is not None:
+        power = torque * speed
+        if total is not None:
+            return total - idle
+        if resistance is not None:
+            return math.sqrt(power / resistance)
+        if voltage is not None:  # U D² = M_s ω_0 (D + I_0)
+            return (power + math.sqrt(power**2 + 4 * voltage * power * idle)) / (2 * voltage)
+    lacking = ", ".join(f"--{name}" for name in missing)
+    raise BadConfiguration(f"--from-sheet: missing {lacking}; resistance and torque constant need one more")
+
+
+def _largest_difference(pairs: list[tuple[float, str]]) -> float:
+    values = [value for value, _ in pairs]
+    return max(values) / min(values) - 1
+
+
+def _reject_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
+    faults = [
+        f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
+        f"{100 * _largest_difference(pairs):.0f} % apart"
+        for pairs, name, unit in groups
+        if _largest_difference(pairs) > APART
+    ]
+    if faults:
+        raise BadConfiguration(
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %; give "
+            "data of the motor shaft at one voltage"
+        )

@@ -1,1 +1,0 @@
-"""English sentences on results, built once for terminal, JSON and page. Modules that compute return data."""
