@@ -218,8 +218,8 @@ def test_a_torque_that_changes_slowly_does_not_look_like_an_effect(answered):
 
 def test_a_friction_that_falls_within_each_run_is_a_curve_over_time(answered, monkeypatch):
     """Stairs of voltage tell most of the time, but not all of it."""
-    monkeypatch.setattr(discover, "LONG", 0)
-    given = discover.equations_of_log(answered.input_of(cold=1.0))
+    monkeypatch.setattr(log_stages, "LONG", 0)
+    given = log_stages.windows_of_log(answered.input_of(cold=1.0))
     observe = given.equations.bare.observe
     bases = observe.bases({}, np.ones(len(given.runs), bool), given.robot)
     scores = np.asarray(score_tests.score_tests(observe.linear, bases).curve)
