@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.data import rig_facts, robot_file, unused_readings
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import loop_input
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
@@ -313,8 +313,3 @@ def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
     }  # fmt: skip
     figure = comparison_figures.draw_errors_over_conditions(table, robot.channels)
     assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
-
-
-def test_a_table_without_its_current_is_refused(robot, tmp_path):
-    with pytest.raises(BadData, match="column motor_current_A is missing"):
-        read_table(tmp_path, "motor_speed_rpm\n100\n", robot, "runs.csv")

@@ -24,8 +24,6 @@ from mmrjax.model.rig import Instrument, Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STALLED
-from sweeps import config as configuration
-from sweeps.points import run
 from tests.commands import csv_text, read_rig, read_table, text_file
 
 DRIVE = {
@@ -504,16 +502,6 @@ def test_a_gear_ratio_upside_down_is_said(tmp_path):
 
 
 @pytest.mark.slow
-def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
-    robot = bench("voltage", ("motor_speed",))
-    columns = {"supply_voltage_V": np.array([6.0, 9, 12, 24])}
-    runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=columns["supply_voltage_V"]), columns)
-    off = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] * np.pi / 30})
-    with pytest.raises(BadData, match=r"motor_speed_rpm: about .* are they in rad/s"):
-        check_ranges(off, robot)
-
-
-@pytest.mark.slow
 def test_a_slow_speed_where_the_stated_friction_holds_the_robot_is_no_matter_of_units(tmp_path):
     # Between a robot that stands and one of a tenth of its friction any speed is possible, also a sixtieth of that
     # one's, which was refused: "are they in turns/s?".
@@ -537,15 +525,6 @@ def test_an_arm_has_no_steady_state(tmp_path):
     ) as refusal:
         calibrate(runs, robot, noise="motor_speed=1%")
     assert "\n" not in str(refusal.value)
-
-
-def test_an_arm_is_simulated_over_time_alone():
-    robot = bench("voltage", ("motor_speed",), load={"torque_gravity": 0.2})
-    config = configuration.Simulate(model="steady")
-    with pytest.raises(
-        BadConfiguration, match=r"--model steady: rig has a gravity torque .* --model drive, and tables with time_s"
-    ):
-        run.check_runs_bearable(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
 
 
 def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):

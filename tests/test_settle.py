@@ -373,16 +373,6 @@ def test_signs_and_units_that_are_right_are_not_doubted(tmp_path):
     assert len(settled(tmp_path, robot).kept) == 4
 
 
-def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
-    columns = stairs()
-    robot = bench(tmp_path, columns | {"duty": np.where(np.arange(600) == 7, 1.2, 1.0)})
-    with pytest.raises(BadData, match=r"row 8, duty: got 1\.2; expected -1 to 1"):
-        settled(tmp_path, robot)
-    robot = bench(tmp_path, columns | {"duty": np.full(600, 255)})
-    with pytest.raises(BadData, match=r"row 1, duty: got 255; is the command scaled\? divide .*; expected -1 to 1"):
-        settled(tmp_path, robot)
-
-
 def test_missing_samples_divide_a_level_and_are_said(tmp_path):
     columns = stairs(levels=(12.0,), hold=600)
     robot = bench(tmp_path, cut(columns, np.r_[0:300, 400:600]))
