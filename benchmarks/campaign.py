@@ -109,7 +109,7 @@ def begun(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | Non
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
-    from calibration.discovery.discover import prepare_loop
+    from calibration.discovery.loop_input import prepare_loop
 
     with tempfile.TemporaryDirectory() as folder:
         case.write(Path(folder))
@@ -122,7 +122,9 @@ def looped(case: Any, task: Task, stated: Mapping[str, tuple[float, float]] | No
     """The loop's problem, its result, and the line of a case: its label with verdict and findings."""
     began, spent = time.perf_counter(), time.process_time()
     given = begun(case, task, stated)
-    found = given.trace()
+    from calibration.discovery.discover import trace_verdict
+
+    found = trace_verdict(given)
     line = {
         "seconds": time.perf_counter() - began,
         "processor_seconds": time.process_time() - spent,

@@ -256,14 +256,13 @@ def carried_out(case: Case, found, settings) -> list[dict]:
 
 def program(task: Task) -> tuple | dict:
     """Properties that tables with the same programs share, or the line of an invalid case."""
-    from calibration.discovery.discover import padded_rows
     from calibration.inference.observers.settled import SettledRuns
 
     case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
     names = () if case.world is None else case.world.machine.names.values()
-    return len(padded_rows(len(case.conditions.U), SettledRuns.sizes_padded)[0]), *names
+    return len(SettledRuns.padded_rows(len(case.conditions.U))[0]), *names
 
 
 def summary(lines: list[dict]) -> list[str]:

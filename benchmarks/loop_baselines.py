@@ -56,7 +56,7 @@ class Ladder:
     """
 
     def __init__(self, runs, fitted, settings) -> None:
-        from calibration.discovery.discover import bases_at_fit
+        from calibration.discovery.outliers import bases_at_fit
 
         self.space, self.base, self.settings = fitted.space, fitted.candidate, settings
         self.bases = bases_at_fit(runs, fitted)
@@ -204,9 +204,9 @@ def sindy_refit(space, linear, scores, sees=None) -> list[str]:
 
 
 def base_of(given):
-    """The base fit of the result of `discover.prepare_loop`, with which the loop begins: `candidates.BaseFit`."""
+    """The base fit of the result of `prepare_loop`, with which the loop begins: `candidates.BaseFit`."""
     from calibration.discovery.candidates import fit_base
-    from calibration.discovery.discover import build_candidate_space
+    from calibration.discovery.loop_input import build_candidate_space
 
     space = build_candidate_space(
         given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library

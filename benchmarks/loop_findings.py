@@ -73,7 +73,7 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
     """Effects of the model, tests of each, the noise, and the written model.
 
     Args:
-        given: result of `discover.prepare_loop`.
+        given: result of `prepare_loop`.
         found: the `LoopStages` of it.
     """
     alike, best, base = found.alike, found.best, found.screened.base.candidate
@@ -180,7 +180,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     """
     from calibration.discovery import findings as results
     from calibration.discovery import prediction
-    from calibration.discovery.discover import build_candidate_space
+    from calibration.discovery.loop_input import build_candidate_space
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
     if best is base:

@@ -25,7 +25,7 @@ from shaking import SET_S  # noqa: E402
 
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference.calibration import calibrate  # noqa: E402
-from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
+from mmrjax.effects.travel_effects import VibrationSlip  # noqa: E402
 from mmrjax.fidelities.track import STEP, track_batch  # noqa: E402
 from mmrjax.model import channels, paper_robots, params  # noqa: E402
 from mmrjax.model.robot import Robot  # noqa: E402

@@ -90,7 +90,7 @@ def work(task: Task) -> dict:
         line["simulated"] = {"promised": run.promised, "gained": run.gained, "misfit": misfit, "readings": count}
     if not task.brief:
         from calibration.data import robot_file
-        from calibration.discovery.discover import assemble_result
+        from calibration.discovery.assembly import assemble_result
 
         began = time.perf_counter()
         whole = assemble_result(given, found)

@@ -47,7 +47,7 @@ class Posed:
     """A record in the form that every method gets.
 
     Attributes:
-        given: `discover.prepare_loop`.
+        given: `prepare_loop`.
         fitted: our base fit, `candidates.BaseFit`.
         folds: the blocks left out.
         measured, sd: [SI], shape (rows, channels).
@@ -113,7 +113,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
-    from calibration.discovery.discover import prepare_loop
+    from calibration.discovery.loop_input import prepare_loop
     from calibration.inference import blocks
     from calibration.inference.held_out import fit_from_each_start
 
@@ -150,10 +150,11 @@ def refit(p: Posed) -> Found:
 
 def verdict(p: Posed) -> Found:
     """Our loop: the robot that it writes, and the claim of its verdict."""
-    from calibration.discovery.discover import assemble_result
+    from calibration.discovery.assembly import assemble_result
+    from calibration.discovery.discover import trace_verdict
 
     began, given = time.perf_counter(), p.given
-    stages = given.trace()
+    stages = trace_verdict(given)
     spent = time.perf_counter() - began
     whole = assemble_result(given, stages)
     seen = whole.readings_of_rows.held_out

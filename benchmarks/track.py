@@ -25,7 +25,7 @@ from mmrjax.fidelities.track import TIME_ROLLED, _simulate_batch, track
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import STATUSES
-from mmrjax.undercarriage.stability import largest_step
+from mmrjax.undercarriage.modes import largest_step
 
 #: Parameters of the derivatives: the first four, or all twelve, five of them of the contacts.
 DERIVED = (

@@ -42,16 +42,16 @@ from jaxtyping import Array  # noqa: E402
 from measure import machine  # noqa: E402
 from scipy.optimize import least_squares  # noqa: E402
 
-from calibration.data import own_mass  # noqa: E402
+from calibration.data import inferred_facts  # noqa: E402
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
 from calibration.inference.held_out import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import MemberObservations, simulate_members  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
-from mmrjax.effects.electrical_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
-from mmrjax.effects.slip_effects import VibrationSlip  # noqa: E402
+from mmrjax.effects.travel_effects import VibrationSlip  # noqa: E402
+from mmrjax.effects.voltage_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.fidelities.steady import steady  # noqa: E402
 from mmrjax.fidelities.track import STEP, track  # noqa: E402
 from mmrjax.model import channels, paper_robots, params  # noqa: E402
@@ -248,7 +248,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     table = read_runs("measured")
     if what == "slip":
         table = table.where(table["configuration"] == "6T2A")
-    robot = own_mass.with_table_mass(paper_robots.nominal(), read_runs("measured"))
+    robot = inferred_facts.with_table_mass(paper_robots.nominal(), read_runs("measured"))
     if what == "slip":
         robot = params.replace(robot, {"6T2A.track.guide_friction": 0.06})
         names, stated = FRICTION + GEAR, {}
@@ -439,7 +439,7 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
 def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     """Time of one generation of gears over all twenty rows, with wheeled ones also by the track model."""
     table = read_runs("measured")
-    robot = own_mass.with_table_mass(
+    robot = inferred_facts.with_table_mass(
         params.replace(paper_robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table
     )
     coordinates = priors.parameter_coordinates(robot, FRICTION + GEAR, any_surface=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.data.effect_file import OWN_MODULE
-from mmrjax.effects.scaled import restore_effect, scaled_effect
+from mmrjax.effects.base import restore_effect, scaled_effect
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 

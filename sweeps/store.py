@@ -23,7 +23,7 @@ from calibration.data import Columns, Json, Names, robot_file, writing
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from calibration.discovery.kept import REFIT_FILE
+from calibration.discovery import REFIT_FILE
 from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot

@@ -12,9 +12,9 @@ from worlds import settled
 
 from calibration.data.runs import Runs
 from calibration.data.runs import read_runs as read_runs
-from calibration.discovery import discover
+from calibration.discovery import assembly, discover, loop_input
 from calibration.discovery.candidates import fit_base
-from calibration.discovery.discover import LoopInput
+from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.outliers import screen_outliers
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
@@ -63,7 +63,7 @@ class Analyst:
 
     def space(self, runs):
         """What can be fitted to a table."""
-        return discover.build_candidate_space(
+        return loop_input.build_candidate_space(
             runs, paper_robots.nominal(), known(runs).sd, self.settings, self.stated, self.library
         )
 
@@ -73,7 +73,7 @@ class Analyst:
 
     def screened(self, runs):
         """The base fitted to a table, rows that stand alone set aside."""
-        return screen_outliers(self.base(runs), lambda base: discover.bases_at_fit(runs, base), runs, self.settings)
+        return screen_outliers(self.base(runs), runs, self.settings)
 
     def given(self, runs):
         """What the loop is given for a table."""
@@ -82,11 +82,11 @@ class Analyst:
 
     def trace(self, runs):
         """The stages of the loop up to its verdict."""
-        return self.given(runs).trace()
+        return discover.trace_verdict(self.given(runs))
 
     def result(self, traced, runs):
         """What the loop makes of its stages."""
-        return discover.assemble_result(self.given(runs), traced)
+        return assembly.assemble_result(self.given(runs), traced)
 
     def discover(self, runs):
         """The whole loop."""

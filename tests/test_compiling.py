@@ -13,13 +13,13 @@ from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.discovery import candidates, discover, scales
+from calibration.discovery import candidates, loop_input, scales
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
 from mmrjax import effects
 from mmrjax.compile.compiling import compiled, for_equations
-from mmrjax.effects.scaled import scaled_effect
+from mmrjax.effects.base import scaled_effect
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
@@ -34,7 +34,7 @@ def space_of(world, folder):
     observer = observers.observer_kind(runs)
     library = scales.scale_library(robot, runs.conditions(robot), effects.BY_NAME)
     sd = noise.noise_from_table(runs, observer.sizes(runs)).sd
-    return discover.build_candidate_space(runs, robot, sd, settings_for(observer), library=library)
+    return loop_input.build_candidate_space(runs, robot, sd, settings_for(observer), library=library)
 
 
 @pytest.mark.nightly

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calibration.data.runs import Runs
-from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.loop_notes import MissedChannel, MissingEffect, VerdictSummary
+from calibration.discovery.verdict import missed_channels, remaining_errors, unused_inputs
 from calibration.inference.blocks import predictable_blocks
 from calibration.inference.observers import Histories
 from calibration.words import loop_words

@@ -14,7 +14,7 @@ from synthetic import FEW, SETTLED, known, parts, small, table
 from worlds import settled, tables
 
 from calibration.data.runs import read_runs as read_runs
-from calibration.discovery import discover
+from calibration.discovery import loop_input, outliers
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.outliers import screen_outliers
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
@@ -101,17 +101,6 @@ def test_effect_outside_the_library_gets_no_name(outside):
     assert found.searched is not None and not found.standing.stands and found.standing.why
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.alike)
     assert where.variable in bases.VARIABLES and found.families == (where.family,)
-
-
-@pytest.mark.slow
-def test_effect_outside_the_library_is_a_curve_in_the_result(outside):
-    found = SETTLED.result(outside.traced, outside.runs)
-    assert found.verdict in WITHOUT_NAME and found.effects == () and found.after.adequate
-    where = found.unnamed
-    assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.balances_alike)
-    assert where.variable in bases.VARIABLES and [e.name for e in found.robot.effects] == [where.effect]
-    assert where.score == found.chi2[0] - found.chi2[1] > 50
-    assert where.variable.replace("_", " ") in found.statement and where.variable in found.next_experiment.name
 
 
 def test_two_effects_are_both_found(looks):
@@ -204,7 +193,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
     """Of the whole library, against differentiation of the steady model in every amplitude, at two points a shape."""
     problem = clean.space.bare
     z = jnp.asarray(clean.base.z[: clean.space.free])
-    library = discover.visible_effects(looks.library, problem.base, SettledRuns)
+    library = loop_input.visible_effects(looks.library, problem.base, SettledRuns)
     names, shapes = [e.name for e in library], [free_shape_parameter(e) for e in library]
     unit = jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in library])
     instances = tuple(with_shape_grid(e, (-1.5, 0.75)) for e in library)
@@ -360,8 +349,6 @@ def test_bootstrap_of_the_measured_runs_settles(robot):
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
     sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.build_candidate_space(runs, robot, sd, settings, {}, SETTLED.library)
-    screened = screen_outliers(
-        fit_base(space, settings, "measured"), lambda b: discover.bases_at_fit(runs, b), runs, settings
-    )
-    assert len(discover.diagnose_base_by_bootstrap(screened, settings).test.null.single) >= 0.98 * settings.replicates
+    space = loop_input.build_candidate_space(runs, robot, sd, settings, {}, SETTLED.library)
+    screened = screen_outliers(fit_base(space, settings, "measured"), runs, settings)
+    assert len(outliers.diagnose_base_by_bootstrap(screened, settings).test.null.single) >= 0.98 * settings.replicates

@@ -14,7 +14,7 @@ from test_implausible import unnamed
 from worlds import settled, tables
 
 from calibration.data import robot_file
-from calibration.discovery import discover, discrepancy, formula
+from calibration.discovery import discrepancy, formula, outliers
 from calibration.discovery.discrepancy import (
     BaseCurve,
     fit_discrepancy,
@@ -47,7 +47,7 @@ def found(request):
     fitted = SETTLED.base(runs)
     space, base = fitted.space, fitted.candidate
     bare = space.problem(base.active)
-    seen = diagnose_fit(bare, jnp.asarray(base.z), space.library.scored, discover.bases_at_fit(runs, fitted))
+    seen = diagnose_fit(bare, jnp.asarray(base.z), space.library.scored, outliers.bases_at_fit(runs, fitted))
     linear = jax.device_get(seen[0])
     what = fit_discrepancy(space, base, linear, *CASES[request.param])
     truth, sound = settled.readings(case.conditions, case.constants, case.terms)

@@ -5,7 +5,7 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import discover
+from calibration.discovery import loop_input
 from calibration.discovery.candidates import candidate_of_fit, supplying_effects
 from calibration.discovery.settings import settings_for
 from calibration.inference import observers
@@ -46,7 +46,7 @@ def space(tmp_path_factory):
     runs = Runs("runs.csv", columns).of(robot)
     library = {n: BY_NAME[n] for n in ("backdriving_loss", "brush_drop", "stribeck_motor")}
     settings = settings_for(observers.observer_kind(runs))
-    return discover.build_candidate_space(runs, robot, np.full((12, 1), 0.01), settings, {}, library), settings
+    return loop_input.build_candidate_space(runs, robot, np.full((12, 1), 0.01), settings, {}, library), settings
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from test_events import NAMES, SAMPLES
 from worlds.events import Bench, through
 
 from calibration.data import runs as records
-from calibration.discovery import discover
+from calibration.discovery import discover, loop_input
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive_batch, drive_rates, drive_start, drive_units
@@ -168,8 +168,8 @@ def test_the_loop_names_no_effect_for_a_joint_that_twists(log):
     robot = read_rig(folder, RIG)
     runs = records.read_runs(folder / "log.csv", robot=robot)
     names = ("bristle_load_loss", "stick_slip", "directional_friction", "series_resistance")
-    given = discover.prepare_loop(runs, robot, library={n: BY_NAME[n] for n in names})
-    traced = dataclasses.replace(given, settings=dataclasses.replace(given.settings, slots=1)).trace()
+    given = loop_input.prepare_loop(runs, robot, library={n: BY_NAME[n] for n in names})
+    traced = discover.trace_verdict(dataclasses.replace(given, settings=dataclasses.replace(given.settings, slots=1)))
     (test,) = traced.standing.tests
     assert test.root > 10 * test.needed and not test.established
     assert traced.verdict in ("place", "undescribed") and traced.members == ()

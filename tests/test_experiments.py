@@ -16,7 +16,7 @@ from worlds import laws, settled, tables
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.described import describe
-from calibration.discovery import discover, experiments, menu, predicted
+from calibration.discovery import assembly, experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
 from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.location import DiscrepancyLocation
@@ -563,6 +563,6 @@ def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
     base = types.SimpleNamespace(rig=Rig(imposed="goal_angle"))
     space = types.SimpleNamespace(bare=types.SimpleNamespace(observe=seen, base=base))
     traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
-    proposal = discover._next_experiment(space, traced, None)
+    proposal = assembly._next_experiment(space, traced, None)
     assert proposal.experiments == (experiments.NONE,)
     assert describe(proposal.instruction).endswith("no experiments for goals of a controller")

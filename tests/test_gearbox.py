@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import paper
 
-from mmrjax.model.gearbox import Gearbox
+from mmrjax.model.gearmotor import Gearbox
 
 RNG = np.random.default_rng(19)
 

@@ -6,9 +6,9 @@ import pytest
 from synthetic import LOST_MOTION
 
 from calibration.described import describe
-from calibration.discovery.headline import headline
 from calibration.discovery.loop_notes import Mechanism, MissingEffect, VerdictSummary
 from calibration.discovery.result import DiscoveryResult
+from calibration.discovery.verdict import headline
 from calibration.words import loop_words
 
 DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import rig_facts, robot_file, thinning
-from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.discovery import discover
+from calibration.data import rig_facts, robot_file, unused_readings
+from calibration.data.input_errors import BadConfiguration
+from calibration.discovery import loop_input
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
 from calibration.inference.calibration import calibrate
@@ -89,7 +89,9 @@ def test_a_thinned_log_of_a_varying_current_turns_the_load_as_its_rows_do(tmp_pa
     current = np.round(2.0 * np.sin(2 * np.pi * (0.2 + 0.08 * time) * time), 3)
     angle = turned(current, every)
     rows = "".join(f"{t:.3f},{i},{np.degrees(x)}\n" for t, i, x in zip(time, current, angle, strict=True))
-    runs = thinning.thin_rows(read_table(tmp_path, "time_s,motor_current_A,output_angle_deg\n" + rows, robot), 1000)
+    runs = unused_readings.thin_rows(
+        read_table(tmp_path, "time_s,motor_current_A,output_angle_deg\n" + rows, robot), 1000
+    )
     observe = time_histories.Histories.of(runs, robot)
     assert len(runs) < 1100 and observe.times.size < len(time)
     simulated = np.asarray(jax.jit(lambda robot: observe(robot).reading)(robot))[:, 0]
@@ -126,7 +128,7 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
     rows = [f"{factor * i},{x * 9.549}\n" for i, x in zip(current, settles(current), strict=True)]
     runs = read_table(tmp_path, "motor_current_A,motor_speed_rpm\n" + "".join(rows), robot, "runs.csv")
     monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
-    ready = discover.prepare_loop(runs, robot)
+    ready = loop_input.prepare_loop(runs, robot)
     assert any("Is it in another unit" in str(note) for note in ready.at_first) == doubted
     said = []
     monkeypatch.setattr(observers, "pose_problem", lambda *given: said.append("fit") or 1 / 0)
@@ -311,8 +313,3 @@ def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
     }  # fmt: skip
     figure = comparison_figures.draw_errors_over_conditions(table, robot.channels)
     assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
-
-
-def test_a_table_without_its_current_is_refused(robot, tmp_path):
-    with pytest.raises(BadData, match="column motor_current_A is missing"):
-        read_table(tmp_path, "motor_speed_rpm\n100\n", robot, "runs.csv")

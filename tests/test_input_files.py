@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from calibration.data import input_files
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
-from calibration.discovery.discover import remove_copies
+from calibration.discovery.loop_input import remove_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun

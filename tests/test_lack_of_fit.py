@@ -12,7 +12,8 @@ from synthetic import table
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.discovery.discover import VerdictNoise, noise_remarks_before_verdict
+from calibration.discovery.result_remarks import noise_remarks_before_verdict
+from calibration.discovery.verdict import VerdictNoise
 from calibration.inference import lack_of_fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import AdequacyFinding

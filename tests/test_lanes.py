@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mmrjax.numerics import lanes
+from mmrjax.numerics import batch_flow
 
 
 def halves(own):
     """How often a number is halved until it is below one, and what is left. `own` is the number and the divisor."""
     begun = lambda own: (own[0], jnp.asarray(0))  # noqa: E731
-    return lanes.loop_until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
+    return batch_flow.loop_until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
 
 
 @pytest.mark.quick("50")
 @pytest.mark.parametrize("size", [1, 3, 8, 50])
 def test_members_of_a_batch_end_as_each_by_itself(monkeypatch, size):
-    monkeypatch.setattr(lanes, "LANES", 8)
+    monkeypatch.setattr(batch_flow, "LANES", 8)
     numbers = jnp.asarray(2.0 ** np.random.default_rng(0).integers(-1, 40, size) * 1.5)
     left, turns = jax.jit(jax.vmap(lambda x: halves((x, 2.0))))(numbers)
     alone = [halves((x, 2.0)) for x in numbers]
@@ -31,14 +31,14 @@ def test_members_of_a_batch_end_as_each_by_itself(monkeypatch, size):
 @pytest.fixture
 def counted(monkeypatch):
     """A member that takes as many turns as it is told, four lanes, and the turns that are taken."""
-    monkeypatch.setattr(lanes, "LANES", 4)
+    monkeypatch.setattr(batch_flow, "LANES", 4)
     taken = []
 
     def turn(_, state):
         jax.debug.callback(lambda: taken.append(1))
         return state[0], state[1] + 1
 
-    return lambda x: lanes.loop_until(lambda own: (own, own * 0), turn, lambda s: s[1] >= s[0], x)[1], taken
+    return lambda x: batch_flow.loop_until(lambda own: (own, own * 0), turn, lambda s: s[1] >= s[0], x)[1], taken
 
 
 def test_a_batch_takes_as_many_turns_as_its_lanes_need(counted):
@@ -61,7 +61,7 @@ def test_members_that_have_ended_when_they_begin_cost_no_turn(counted):
 
 def test_of_the_last_state_only_what_is_kept_is_returned():
     turn, ended = (lambda own, s: (s[0] + own, s[1] + 1)), (lambda s: s[1] >= 3)
-    sums = jax.vmap(lambda x: lanes.loop_until(lambda own: (own, own * 0), turn, ended, x, lambda s: s[0], 2))(
+    sums = jax.vmap(lambda x: batch_flow.loop_until(lambda own: (own, own * 0), turn, ended, x, lambda s: s[0], 2))(
         jnp.arange(5.0)
     )
     assert_array_equal(sums, 4 * np.arange(5.0))

@@ -8,13 +8,13 @@ import pytest
 from test_log_kinds import carriage, servo, written
 from test_weak_form import RIG, motor
 
-from calibration.data import invalid_readings, rig_facts, robot_file
+from calibration.data import rig_facts, robot_file, unused_readings
 from calibration.data import runs as records
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
-from calibration.discovery import discover
+from calibration.discovery import discover, loop_input, result_remarks, verdict
 from calibration.inference import calibration
 from calibration.inference.conduct import error_after_steps
 from mmrjax.model import channels
@@ -106,9 +106,9 @@ def test_readings_that_are_held_at_the_last_value_are_left_out(robot, column, le
     columns = motor()
     columns["output_angle_deg"] = np.cumsum(columns[SPEED])
     runs = Runs("log.csv", columns, layout=dataclasses.replace(Layout.of(robot), channels=shown))
-    assert invalid_readings.without_held(runs).notes == ()
+    assert unused_readings.without_held(runs).notes == ()
     faulty = dataclasses.replace(runs, columns={**columns, column: held(columns[column])})
-    found = invalid_readings.without_held(faulty)
+    found = unused_readings.without_held(faulty)
     lost = {c.column: np.isnan(found[c.column]) for c in shown}
     assert {name: rows.sum() for name, rows in lost.items()} == dict.fromkeys(lost, 0) | {column: left_out}
     assert lost[column].reshape(4, 150)[:, 81:].all() == bool(left_out)
@@ -139,7 +139,7 @@ def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, ma
 def test_a_delay_at_the_end_of_its_search_is_reported(robot, delay, stated, words):
     runs = Runs("log.csv", motor()).of(robot)
     assert runs["time_s"].max() == pytest.approx(1.49)
-    remarks = discover.delay_remarks(runs, SimpleNamespace(after=delay, sd_after=1e-3), stated)
+    remarks = result_remarks.delay_remarks(runs, SimpleNamespace(after=delay, sd_after=1e-3), stated)
     assert words in "".join(map(describe, remarks)) and bool(remarks) == bool(words)
 
 
@@ -218,9 +218,9 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
 
 def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
     runs = Runs("log.csv", motor()).of(robot)
-    assert discover.missing_states_remarks(runs, robot) == []
+    assert loop_input.missing_states_remarks(runs, robot) == []
     silent = Runs("log.csv", {**motor(), SPEED: np.full(600, np.nan)}).of(robot)
-    (note,) = discover.missing_states_remarks(silent, robot)
+    (note,) = loop_input.missing_states_remarks(silent, robot)
     assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)
 
 
@@ -246,22 +246,26 @@ def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(rob
         progress: object = None
 
         def trace(self, ahead):
+            """Stands for the stages of the table."""
             assert ahead and self.keep("ranking", lambda: 1) == self.keep("search 0", lambda: 1) == 1
-            return discover.LoopStages("none", None, None, None)
+            return verdict.LoopStages("none")
 
-    monkeypatch.setattr(discover, "equations_of_log", lambda *_: None)
-    monkeypatch.setattr(discover, "_trace_readings", lambda *_: "readings")
-    given = discover.LoopInput(
+    readings = discover.Stage("readings", (), lambda given: verdict.LoopStages("place"))
+    base_and_settled = [s for s in discover.STAGES if s.name in ("base", "settled")]
+    monkeypatch.setattr(discover, "STAGES", (*base_and_settled, readings))
+    trace_verdict = discover.trace_verdict
+    monkeypatch.setattr(discover, "trace_verdict", Table.trace)
+    given = loop_input.LoopInput(
         runs, None, robot, *[None] * 4, keep=keep, progress=lambda note: told.append(describe(note)),
-        prepare=lambda runs, settled: Table(settled, runs),
+        settled=lambda: loop_input.settled_input(given, lambda runs, settled: Table(settled, runs)),
     )  # fmt: skip
-    found = given.trace()
+    found = trace_verdict(given)
     if converged or levels < 6:
-        assert (found, kept, told) == ("readings", ["base"], [])
+        assert (found.verdict, found.settled, kept, told) == ("place", False, ["base"], [])
         return
-    assert kept == ["base", "ranking", "settled search 0"]
-    table, notes = found.settled
+    assert found.settled and kept == ["base", "ranking", "settled search 0"]
+    table, notes = given.settled().runs, given.settled().at_first
     assert told == [describe(note) for note in notes] and "no fit over time converges, so the fit uses" in told[0]
     assert len(table) == levels and not table.sampled
-    again = discover.prepare_loop(table, robot, settled=notes)
+    again = loop_input.prepare_loop(table, robot, settled=notes)
     assert {*notes} <= {*again.notes} and {*notes} <= {*again.at_first}

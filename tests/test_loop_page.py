@@ -19,7 +19,6 @@ from test_stated_values import traced as leads
 from worlds import settled, tables
 
 from calibration.data.writing import json_value
-from calibration.discovery.discover import FAR
 from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.loop_notes import NameSupport, NameTest, RuledOut
 from calibration.discovery.outliers import OutlierCluster
@@ -29,6 +28,7 @@ from calibration.discovery.result import (
     WorseChannel,
 )
 from calibration.discovery.settings import WITHOUT_NAME
+from calibration.discovery.verdict import FAR
 from calibration.inference.fit_notes import Remark, remarks_with_codes
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words

@@ -10,7 +10,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.described import describe
-from calibration.discovery import discover
+from calibration.discovery import discover, log_stages, loop_input, stages, verdict
 from calibration.inference.lost_motion import lost_motion_notes
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
@@ -137,10 +137,14 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
         return (base, rejected) if name == "bootstrap 0" else (base, rejected, SimpleNamespace(diagnosis=None))
 
     task = SimpleNamespace(
-        settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, shows_unmodelled_backlash=lost
+        settings=SimpleNamespace(replicates=1),
+        keep=keep,
+        ranked=[],
+        progress=lambda step: None,
+        shows_unmodelled_backlash=lost,
     )
-    monkeypatch.setattr(discover.findings, "rank_library", lambda *_: None)
-    searched = discover._search_until_clean(task, base, None, [])[2]
+    monkeypatch.setattr(stages.findings, "rank_library", lambda *_: None)
+    searched = stages.search_until_clean(task, base, None)[2]
     assert (searched is None) == lost
     assert steps == (["bootstrap 0"] if lost else ["bootstrap 0", "ranking", "search 0"])
 
@@ -153,13 +157,18 @@ def test_a_rigid_base_that_leaves_only_noise_refutes_the_lost_motion(rejected, m
         SimpleNamespace(test=SimpleNamespace(rejected=rejected), linear=None),
         SimpleNamespace(space=None),
     )
-    monkeypatch.setattr(discover, "_search_until_clean", lambda given, screened, *_: (screened, diagnosis, None))
-    monkeypatch.setattr(discover, "missed_channels", lambda *_: ())
-    monkeypatch.setattr(discover, "equations_of_log", lambda *_: None)
+    monkeypatch.setattr(verdict, "missed_channels", lambda *_: ())
+    search = discover.Stage(
+        "search", ("screened",), lambda given, base: (base, diagnosis, None), ("screened", "left", "searched")
+    )
+    steps = {s.name: s for s in discover.STAGES} | {"search": search}
+    monkeypatch.setattr(
+        discover, "STAGES", [steps[name] for name in ("base", "settled", "readings", "search", "no search")]
+    )
     notes = tuple(lost_motion_notes(runs, robot))
-    given = discover.LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
+    given = loop_input.LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
         SimpleNamespace(base=base), SimpleNamespace(noise=None)))  # fmt: skip
-    assert given.trace().verdict == ("undescribed" if rejected else "none")
+    assert discover.trace_verdict(given).verdict == ("undescribed" if rejected else "none")
 
 
 def test_a_loop_that_runs_out_of_time_answers_with_the_lost_motion(tmp_path, mmrjax, monkeypatch):
@@ -178,7 +187,7 @@ def test_a_loop_that_runs_out_of_time_answers_with_the_lost_motion(tmp_path, mmr
 def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
     for play in (1.0, 0.0):
         runs, robot = read(tmp_path, servo(play=play))
-        given = discover.prepare_loop(runs, robot, noise="output_angle=0.1deg")
+        given = loop_input.prepare_loop(runs, robot, noise="output_angle=0.1deg")
         assert given.shows_unmodelled_backlash == (play > 0)
 
 
@@ -194,10 +203,12 @@ class Windows:
 
 def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(monkeypatch):
     """Windows without a finding left their base fit to the simulated path, which ended with an internal error."""
-    monkeypatch.setattr(discover, "equations_of_log", lambda *_: Windows())
-    monkeypatch.setattr(discover, "_confirm_by_simulation", lambda given, windows, traced: traced.names)
-    monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
+    confirmed = []
+    monkeypatch.setattr(log_stages, "windows_of_log", lambda *_: Windows())
+    monkeypatch.setattr(log_stages, "confirm_windows", lambda given, windows, traced: confirmed.extend(traced.names))
+    monkeypatch.setattr(log_stages, "delayed_by_rows", lambda given, fit: fit)
+    monkeypatch.setattr(discover, "trace_verdict", Windows.trace)
     robot = SimpleNamespace(has_ground=False)
-    given = discover.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
+    given = loop_input.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
     given.__dict__["space"] = SimpleNamespace(with_room=lambda names: None)
-    assert given.trace_windows() == (["ranking", "windows base", "windows search 0"], "fit")
+    assert discover.trace_windows(given) == "fit" and confirmed == ["ranking", "windows base", "windows search 0"]

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from worlds import paper
 
-from mmrjax.model.motor import Motor
+from mmrjax.model.gearmotor import Motor
 
 RNG = np.random.default_rng(14)
 

@@ -15,7 +15,7 @@ from mmrjax.model.driver import Driver
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import State
-from mmrjax.numerics import one_sided
+from mmrjax.numerics import elementary
 
 #: Numbers compared [SI].
 OUTPUTS = ("speed", "total_current", "output_torque", "adhesion_used", "efficiency_gear", "efficiency_chassis")
@@ -125,15 +125,15 @@ def test_a_shaft_without_inertia_speeds_up_less_with_some(name):
 @pytest.mark.parametrize(
     ("function", "at", "slope"),
     [
-        (lambda x: one_sided.clip(x, -1.0, 1.0), 1.0, 1.0),
-        (lambda x: one_sided.clip(x, -1.0, 1.0), -1.0, 1.0),
-        (lambda x: one_sided.clip(x, -1.0, 1.0), 1.1, 0.0),
-        (lambda x: one_sided.at_least(x, 0.0), 0.0, 1.0),
-        (lambda x: one_sided.at_least(0.0, x), 0.0, 0.0),
-        (lambda x: one_sided.at_most(x, 0.0), 0.0, 1.0),
-        (lambda x: one_sided.magnitude(x, 1.0), 0.0, 1.0),
-        (lambda x: one_sided.magnitude(x, -1.0), 0.0, -1.0),
-        (lambda x: one_sided.magnitude(x, -1.0), 2.0, 1.0),
+        (lambda x: elementary.clip(x, -1.0, 1.0), 1.0, 1.0),
+        (lambda x: elementary.clip(x, -1.0, 1.0), -1.0, 1.0),
+        (lambda x: elementary.clip(x, -1.0, 1.0), 1.1, 0.0),
+        (lambda x: elementary.at_least(x, 0.0), 0.0, 1.0),
+        (lambda x: elementary.at_least(0.0, x), 0.0, 0.0),
+        (lambda x: elementary.at_most(x, 0.0), 0.0, 1.0),
+        (lambda x: elementary.magnitude(x, 1.0), 0.0, 1.0),
+        (lambda x: elementary.magnitude(x, -1.0), 0.0, -1.0),
+        (lambda x: elementary.magnitude(x, -1.0), 2.0, 1.0),
     ],
 )
 def test_bounds_have_the_derivative_from_inside(function, at, slope):

@@ -9,7 +9,8 @@ from worlds import tables
 
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import preference
-from calibration.discovery.result import HeldOutAlternative, WorseChannel
+from calibration.discovery.prediction import HeldOutAlternative
+from calibration.discovery.result import WorseChannel
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels

@@ -8,7 +8,7 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import discover
+from calibration.discovery import discover, loop_input
 from calibration.inference.calibration import calibrate
 from calibration.inference.foresight import predict_identifiability
 from tests.commands import csv_text, read_table, text_file
@@ -16,7 +16,7 @@ from tests.commands import csv_text, read_table, text_file
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
     "discover": lambda runs, robot: discover.discover(runs, robot),
-    "a campaign": lambda runs, robot: discover.prepare_loop(runs, robot),
+    "a campaign": lambda runs, robot: loop_input.prepare_loop(runs, robot),
     "rig check": lambda runs, robot: predict_identifiability(runs, robot),
 }
 
@@ -42,7 +42,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     volts = np.concatenate([np.linspace(-12, -4, 12), np.linspace(4, 12, 12)])
     current = np.round(0.3 + 0.01 * np.abs(volts), 2)
     columns = {"supply_voltage_V": volts, "total_current_A": current}
-    given = discover.prepare_loop(
+    given = loop_input.prepare_loop(
         read_table(
             tmp_path,
             csv_text(columns),

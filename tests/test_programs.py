@@ -18,7 +18,7 @@ from mmrjax.compile import programs
 from mmrjax.compile.compiling import for_equations
 from mmrjax.effects import UNNAMED
 from mmrjax.model import paper_robots
-from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.numerics.elementary import cosine, sine
 
 MATRIX = np.array([[4.0, 1.0], [1.0, 3.0]])
 

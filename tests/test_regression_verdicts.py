@@ -8,9 +8,21 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import active_set, candidates, discover, findings, score_tests, screening, standing
+from calibration.discovery import (
+    active_set,
+    candidates,
+    discover,
+    findings,
+    log_stages,
+    loop_input,
+    score_tests,
+    search,
+    standing,
+    verdict,
+)
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
+from calibration.inference.bases import family_names
 from calibration.inference.observers import Histories, windows
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
@@ -27,8 +39,9 @@ SETTINGS = settings_for(Histories, 333)
 
 
 def log(
-    seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0
-):
+    seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0,
+    cold=0.0,
+):  # fmt: skip
     """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
 
     Args:
@@ -37,6 +50,7 @@ def log(
         rough: friction of the third run alone is larger by this share.
         swings: the voltage swings, and is held from row to row.
         slow: sd of a torque that nobody knows and that changes every 0.4 s [N·m].
+        cold: friction is larger by it at the start of each run, and falls within 0.5 s.
     """
     rng = np.random.default_rng(seed)
     levels = np.where(np.arange(5) % 2, rng.uniform(1.2, 4.0, (4, 5)), rng.uniform(4.0, 24.0, (4, 5)))
@@ -54,6 +68,7 @@ def log(
             dry = (
                 0.02
                 * (1 + rough * (np.arange(4) == 2) + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60))
+                * (1 + cold * np.exp(-n * EVERY / 0.5))
                 * np.tanh(speed / 0.05)
             )
             torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed + unknown[:, n]
@@ -83,17 +98,17 @@ def answered(tmp_path_factory):
         noise = (
             f"motor_speed={SD[0] / RPM}rpm,{next(c.name for c in runs.channels if c.name != 'motor_speed')}={SD[1]}A"
         )
-        return discover.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
+        return loop_input.prepare_loop(runs, robot, noise=noise, library=library, replicates=SETTINGS.replicates)
 
     @functools.cache
     def space_of(**faults):
         runs = Runs("log.csv", log(**faults)).of(robot)
         sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
-        return discover.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
+        return loop_input.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
 
     def of(**faults):
         space = space_of(**faults)
-        return findings.rank_effects_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
+        return findings.rank_effects_by_weak_form(space, search.screen_by_weak_form(space, SETTINGS), SETTINGS)
 
     @functools.cache
     def windows_of(**faults):
@@ -201,10 +216,20 @@ def test_a_torque_that_changes_slowly_does_not_look_like_an_effect(answered):
     assert 0 < scores.max() < 2.0
 
 
+def test_a_friction_that_falls_within_each_run_is_a_curve_over_time(answered, monkeypatch):
+    """Stairs of voltage tell most of the time, but not all of it."""
+    monkeypatch.setattr(log_stages, "LONG", 0)
+    given = log_stages.windows_of_log(answered.input_of(cold=1.0))
+    observe = given.equations.bare.observe
+    bases = observe.bases({}, np.ones(len(given.runs), bool), given.robot)
+    scores = np.asarray(score_tests.score_tests(observe.linear, bases).curve)
+    assert family_names(bases)[np.argmax(scores)] == ("track", "time")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fault, family", [({"forward": 0.3}, "loss torque that changes with direction"), ({}, "")])
 def test_the_windows_of_a_log_decide_and_one_simulation_confirms(answered, monkeypatch, fault, family):
-    monkeypatch.setattr(discover, "LONG", 0)
-    traced, begin = answered.input_of(**fault).trace_windows()
-    assert (traced is None) == (not fault) and begin is not None
+    monkeypatch.setattr(log_stages, "LONG", 0)
+    traced = discover.trace_windows(answered.input_of(**fault))
+    assert isinstance(traced, verdict.LoopStages if fault else candidates.Candidate)
     assert not fault or (family in traced.families and traced.run.gained > 0.5 * traced.run.promised > 0)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
-from calibration.discovery import discover
+from calibration.discovery import result_remarks
 from calibration.inference import noise, repeats
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers import SettledRuns
@@ -83,4 +83,4 @@ def test_every_command_takes_the_larger_noise():
     ],
 )
 def test_runs_beside_a_row_are_at_levels_that_a_person_sets(levels, here, beside):
-    assert discover.neighbouring_levels(np.array(levels), here) == pytest.approx(beside)
+    assert result_remarks.neighbouring_levels(np.array(levels), here) == pytest.approx(beside)

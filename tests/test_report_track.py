@@ -14,7 +14,7 @@ from mmrjax import fidelities
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED
-from mmrjax.undercarriage.stability import largest_step
+from mmrjax.undercarriage.modes import largest_step
 from sweeps.pages import resonance_figures
 from sweeps.paper import report
 from sweeps.points import run as simulation

@@ -14,9 +14,9 @@ import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
-from calibration.discovery import discover, scales
+from calibration.discovery import loop_input, scales
 from mmrjax import effects
-from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
+from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import paper_robots, params
 from mmrjax.model.quantities import RPM
@@ -261,7 +261,7 @@ def metered(tmp_path, off):
 
 def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
     runs, robot = metered(tmp_path, 0.0)
-    scored = [e for e in discover.prepare_loop(runs, robot).library.values() if e.balance == "sensor"]
+    scored = [e for e in loop_input.prepare_loop(runs, robot).library.values() if e.balance == "sensor"]
     assert {e.channel for e in scored} == set(robot.rig.channels)
     (torque,) = (e for e in scored if e.name == "output_torque_offset")
     size = np.sqrt(np.mean(runs["output_torque_Nm"] ** 2))

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import candidates, discover, log_simulation, search
+from calibration.discovery import candidates, log_simulation, log_stages, search, verdict
 from calibration.discovery.active_set import candidate_space
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
@@ -222,23 +222,23 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
         space=SimpleNamespace(weight=np.ones(9)), base=base, best=best, disturbed=False, contradicts=False,
         diagnosis=lambda fit, left: SimpleNamespace(linear=fit),
     )  # fmt: skip
-    monkeypatch.setattr(discover, "simulate_models", lambda *_, **__: run)
-    monkeypatch.setattr(discover, "_delayed_by_rows", lambda given, fit: fit)
-    monkeypatch.setattr(discover, "excess_misfit", lambda *_: 1e3)
-    monkeypatch.setattr(discover, "unused_inputs", lambda _: ("angle",))
+    monkeypatch.setattr(log_stages, "simulate_models", lambda *_, **__: run)
+    monkeypatch.setattr(log_stages, "delayed_by_rows", lambda given, fit: fit)
+    monkeypatch.setattr(log_stages, "excess_misfit", lambda *_: 1e3)
+    monkeypatch.setattr(log_stages, "unused_inputs", lambda _: ("angle",))
     missed_by = {id(base): (MissedChannel("position", 0.8, 0.0),), id(best): missed}
-    monkeypatch.setattr(discover, "missed_channels", lambda space, runs, noise, fit: missed_by[id(fit)])
+    monkeypatch.setattr(log_stages, "missed_channels", lambda space, runs, noise, fit: missed_by[id(fit)])
     given = SimpleNamespace(
         known=None, shows_unmodelled_backlash=False, progress=lambda _: None, runs=None, noise=None, settings=None,
         space=SimpleNamespace(with_room=lambda _: None),
     )  # fmt: skip
     screened = SimpleNamespace(base=SimpleNamespace(candidate=base))
     left = SimpleNamespace(test=SimpleNamespace(confirmed=lambda _: SimpleNamespace(rejected=True)))
-    traced = discover.LoopStages(
+    traced = verdict.LoopStages(
         "class", screened, left, None, SimpleNamespace(best=best, room=()), alike="classes", beside="curve"
     )
-    found = discover._confirm_by_simulation(given, given, traced)
-    other = discover._confirm_by_simulation(SimpleNamespace(**{**vars(given), "known": found}), given, traced)
+    found = log_stages.confirm_windows(given, given, traced)
+    other = log_stages.confirm_windows(SimpleNamespace(**{**vars(given), "known": found}), given, traced)
     assert {found.verdict, other.verdict} == {"undescribed" if missed else "class"}
     assert found.missed == other.missed == (missed_by[id(base)] if missed else ()) and found.run is run
     assert (found.alike is None) == bool(missed) and found.unused == ("angle",) * bool(missed)
@@ -328,16 +328,16 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, c
     ladder = [one("a", cost=10.0), one("b", cost=11.0), one("a", "c", cost=5.0)]
     simulated = {("a",): 9.0, ("b",): 6.0, ("a", "c"): 5.0}
     monkeypatch.setattr(
-        discover, "refine_by_simulation", lambda space, c, *_: one(*c.effects, cost=simulated[c.effects])
+        log_stages, "refine_by_simulation", lambda space, c, *_: one(*c.effects, cost=simulated[c.effects])
     )
     rest = iter(remain)
-    monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: diagnosis(next(rest)))
+    monkeypatch.setattr(log_stages, "diagnose_candidate", lambda *_: diagnosis(next(rest)))
     space = SimpleNamespace(room=tuple(room))
     space.with_noise = space.with_room = lambda *_: space
     screened = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(weight=None)), bases=())
     searched = search.SearchResult(tuple(ladder), ladder[2], diagnosis(False))
     noise = SimpleNamespace(sd=None)
-    best = discover._smallest_confirmed(space, None, screened, diagnosis(True), searched, noise).best
+    best = log_stages.smallest_confirmed(space, None, screened, diagnosis(True), searched, noise).best
     assert " ".join(best.effects) == chosen
 
 
@@ -348,14 +348,14 @@ def test_windows_propose_no_larger_set_whose_simulation_leaves_more(cost, chosen
         SimpleNamespace(effects=e, z=0, cost=x, plausible=True) for e, x in ((("a",), 9.0), (("a", "c"), 5.0))
     )
     monkeypatch.setattr(
-        discover, "refine_by_simulation",
+        log_stages, "refine_by_simulation",
         lambda space, c, *_: SimpleNamespace(cost=cost if c is large else 100.0),
     )  # fmt: skip
-    monkeypatch.setattr(discover, "diagnose_candidate", lambda *_: "diagnosis")
+    monkeypatch.setattr(log_stages, "diagnose_candidate", lambda *_: "diagnosis")
     space = SimpleNamespace(room=(), with_room=lambda _: space)
     screened = SimpleNamespace(base=SimpleNamespace(space=None), bases=())
     left = SimpleNamespace(test=SimpleNamespace(null=None))
     searched = search.SearchResult((small, large), large, "of both")
-    found = discover._best_simulated_size(space, None, screened, left, searched, None)
+    found = log_stages.best_simulated_size(space, None, screened, left, searched, None)
     assert " ".join(found.best.effects) == chosen
     assert found.diagnosis == ("of both" if found.best is large else "diagnosis")

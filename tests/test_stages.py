@@ -17,7 +17,7 @@ from calibration.discovery import menu
 from calibration.inference.noise import Noise
 from mmrjax import effects
 from mmrjax.effects import curve
-from mmrjax.effects.scaled import scaled_effect
+from mmrjax.effects.base import scaled_effect
 from mmrjax.model import channels, paper_robots
 from sweeps import stage_files
 from sweeps.store import RunFolder

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from synthetic import SETTLED, table
 from worlds import laws, settled, tables
 
-from calibration.discovery import discover, standing
+from calibration.discovery import preference, standing
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.discovery.discrepancy import locate_discrepancy
 from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
@@ -518,23 +518,23 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         tests = [NameTest(e, 9.0 if e in established else 1.0, 3.0, (), evidence.get(e, 0.0)) for e in those.effects]
         return NameSupport(bool(established), "beside", tests=tuple(tests))
 
-    monkeypatch.setattr(discover, "judge_names", judged)
-    monkeypatch.setattr(discover.prediction, "smallest_predictive_set", lambda *a: few)
-    monkeypatch.setattr(discover, "diagnose_candidate", lambda *a: seen)
-    monkeypatch.setattr(discover, "start_of_fit", lambda *a: None)
+    monkeypatch.setattr(preference, "judge_names", judged)
+    monkeypatch.setattr(preference.prediction, "smallest_predictive_set", lambda *a: few)
+    monkeypatch.setattr(preference, "diagnose_candidate", lambda *a: seen)
+    monkeypatch.setattr(preference, "start_of_fit", lambda *a: None)
     monkeypatch.setattr(
-        discover,
+        preference,
         "fit_candidates",
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
-    monkeypatch.setattr(discover.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
+    monkeypatch.setattr(preference.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, over_time=False, blocks=("slope",)))
     screened = SimpleNamespace(
         base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
     )
     left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
     searched = SearchResult((candidate_of("a"), candidate_of("b"), best), best, seen)
-    found, _, stood = discover.choose_effects(
+    found, _, stood = preference.choose_effects(
         None, screened, left, searched, SETTLED.settings, lambda note: None, None, None
     )
     assert (None if found is None else tuple(sorted(found[0].effects))) == model

@@ -8,7 +8,7 @@ import pytest
 from synthetic import FEW, SETTLED, small, table
 from worlds import laws, settled, tables
 
-from calibration.discovery import discover, findings
+from calibration.discovery import findings, verdict
 from calibration.discovery.classes import find_prior_shifts, prior_shift_scores
 from calibration.discovery.loop_notes import AlternativeValue
 from calibration.words import loop_words as words
@@ -122,6 +122,6 @@ def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated
     assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]
-    (missing,) = discover.verdict_summary(found, np.arange(1, 100)).missing
+    (missing,) = verdict.verdict_summary(found, np.arange(1, 100)).missing
     (value,) = missing.values
     assert missing.names == members and value.name == "motor.resistance" and f"{value.value:.1f}" == "1.4"

@@ -247,15 +247,15 @@ def discovery_keeps_its_stages(path, tree):
 KEPT = {
     ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
     ("mmrjax/undercarriage/mjcf.py", "_template"): "pure: the topology of the track model",
-    ("mmrjax/effects/scaled.py", "scaled_effect"): "pure: a class of a class and its factors",
+    ("mmrjax/effects/base.py", "scaled_effect"): "pure: a class of a class and its factors",
     ("mmrjax/model/params.py", "rig_spec"): "pure, of hashable arguments",
     ("mmrjax/compile/programs.py", "_is_supported"): "pure: whether this XLA has a compile option",
     ("calibration/data/effect_file.py", "_test_points"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
-    ("calibration/data/parts.py", "packaged_motors"): "a packaged table",
+    ("calibration/sizing/part_options.py", "packaged_motors"): "a packaged table",
     ("calibration/data/stated.py", "_template_numbers"): "packaged files",
-    ("calibration/data/parts.py", "packaged_gearboxes"): "a packaged table",
-    ("calibration/data/parts.py", "packaged_cells"): "a packaged table",
+    ("calibration/sizing/part_options.py", "packaged_gearboxes"): "a packaged table",
+    ("calibration/sizing/part_options.py", "packaged_cells"): "a packaged table",
     ("calibration/discovery/scales.py", "_nominal_signals"): "pure: signals of the nominal robot",
     ("sweeps/report/catalogue.py", "_content"): "a packaged file",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
@@ -588,7 +588,7 @@ def test_front_door_loads_nothing_heavy():
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "values_of_surface_configurations", "with_table_mass",
     "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "scale_library", "settings_for",
-    "remove_copies", "pose", "pose_problem", "build_candidate_space", "fit_base", "trace",
+    "remove_copies", "pose", "pose_problem", "build_candidate_space", "fit_base", "LoopInput",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED = {
@@ -620,39 +620,34 @@ def test_modules_have_base_names_of_their_own():
 
 
 def inner_calls(source):
-    """Calls of `INNER` functions in a module, but of methods of what `prepare_loop` gives."""
+    """Calls of `INNER` functions in a module."""
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in INNER:
-            whose, _, name = ast.unparse(node.func).rpartition(".")
-            prepared = whose == "given" or whose.startswith("prepare_loop(")
-            if not (name == "trace" and prepared):
-                yield node.lineno, name
+        name = getattr(node.func, "attr", getattr(node.func, "id", "")) if isinstance(node, ast.Call) else ""
+        if name in INNER:
+            yield node.lineno, name
 
 
 def test_campaigns_and_notebooks_take_the_way_of_users():
     """A campaign that prepares a table by itself measures a program that nobody runs."""
-    own = {"fastsim_comparison": {"trace"}}  # a driving trace
     found = {
         (file.stem, name)
         for folder in ("benchmarks", "notebooks")
         for file in sorted((ROOT / folder).glob("*.py"))
         for _, name in inner_calls(file.read_text(encoding="utf-8"))
-        if name not in own.get(file.stem, ()) and not file.stem.startswith("test_")
+        if not file.stem.startswith("test_")
     }
     assert found == set(CALLED)
     shared = dict.fromkeys(("loop", "loop_series", "rigs", "rig_logs"), "campaign.looped")  # which takes the one way
-    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.discover.prepare_loop"}
+    ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.loop_input.prepare_loop"}
     for campaign, name in ways.items():
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
         assert name in {imported for imported, _ in names_imported(tree, "")}, campaign
 
 
 def test_a_campaign_of_its_own_way_is_found():
-    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.infer_noise(runs)"
-    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "infer_noise"]
-    assert not [
-        *inner_calls("given = prepare_loop(runs, robot)\ngiven.trace()\nprepare_loop(runs).trace()\ncalibrate(runs)")
-    ]
+    bad = "space = pose(runs, robot)\ngiven = LoopInput(runs, robot)\nnoise.infer_noise(runs)"
+    assert [name for _, name in inner_calls(bad)] == ["pose", "LoopInput", "infer_noise"]
+    assert not [*inner_calls("given = prepare_loop(runs, robot)\ntrace_verdict(given)\ncalibrate(runs)")]
 
 
 def test_one_preparation_serves_all():
@@ -667,7 +662,7 @@ def test_one_preparation_serves_all():
         if name in inner
     }
     assert found == allowed
-    for room in ("inference/calibration", "inference/foresight", "discovery/discover"):
+    for room in ("inference/calibration", "inference/foresight", "discovery/loop_input"):
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
         calls = {_dotted(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
         assert "prepare_input" in calls, room

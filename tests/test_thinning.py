@@ -11,7 +11,7 @@ from worlds import rigs
 from calibration.data import columns, input_files
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.data.thinning import FIRST, thin_rows
+from calibration.data.unused_readings import FIRST, thin_rows
 from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration as calibrate
@@ -201,21 +201,23 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("rows", [100, None])
-@pytest.mark.parametrize("way", [(calibrate, "prepare_input"), (discover, "preparation.prepare_input")])
+@pytest.mark.parametrize(
+    "way",
+    [
+        (calibrate.calibrate, "calibration.inference.calibration.prepare_input"),
+        (discover.discover, "calibration.discovery.loop_input.preparation.prepare_input"),
+    ],
+)
 def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     """Of the same log the same rows, whoever asks. Each row once thinned is still of the whole log."""
-    room, before = way
+    call, before = way
     runs, seen = log(rows=2500), []
 
     def prepared(table, *_, **__):
         seen.append(table)
         raise InterruptedError
 
-    monkeypatch.setattr(f"{room.__name__}.{before}", prepared)
-    call = {
-        calibrate: calibrate.calibrate,
-        discover: discover.discover,
-    }[room]
+    monkeypatch.setattr(before, prepared)
     with pytest.raises(InterruptedError):
         call(runs, paper_robots.nominal(), **({} if rows is None else {"rows": rows}))
     (used,) = seen

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import paper
 
-from mmrjax.model.track_friction import Track
+from mmrjax.model.contact import Track
 
 RNG = np.random.default_rng(24)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mmrjax.numerics.trigonometry import cosine, sine, sine_third
+from mmrjax.numerics.elementary import cosine, sine, sine_third
 
 FUNCTIONS = {
     "sine": (sine, np.sin, np.cos),

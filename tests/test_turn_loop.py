@@ -12,7 +12,8 @@ from worlds import turns as planted
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.discovery.discover import build_candidate_space, discover, prepare_loop
+from calibration.discovery.discover import discover
+from calibration.discovery.loop_input import build_candidate_space, prepare_loop
 from calibration.inference import bases as bases_room
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers.turns import TurnLinearization

@@ -10,7 +10,7 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import describe
-from calibration.discovery import discover
+from calibration.discovery import loop_input
 from calibration.inference import checks, noise, observers, ranges
 from tests.commands import read_table, text_file
 
@@ -85,7 +85,7 @@ def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, ro
     assert (found.column, found.tied) == (column, False) and said in describe(found)
     foreseen(shown(runs))
     with pytest.raises(BadData, match=rf"t\.csv, {column}: equals .* remove it from the channels"):
-        discover.prepare_loop(runs, robot, replicates=192)
+        loop_input.prepare_loop(runs, robot, replicates=192)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
     if not varies:
         assert (found.rows, found.column, found.unused) == (12, "motor_speed_rpm", ("wind_V",))
         with pytest.raises(BadData, match=r"t\.csv: these 12 runs differ only by noise\. wind_V varies and is"):
-            discover.prepare_loop(
+            loop_input.prepare_loop(
                 runs, robot, noise="motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm", replicates=192
             )
 

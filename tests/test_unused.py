@@ -7,7 +7,7 @@ from test_load_torque import RIG as IDEAL
 from calibration.data.columns import LOAD, Layout
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
-from calibration.discovery import description
+from calibration.discovery import verdict
 from calibration.inference import noise
 from calibration.inference.checks import unexplained_torque_notes, unused_notes
 from calibration.inference.observers import SettledRuns
@@ -58,7 +58,7 @@ def test_numbers_that_vary_and_have_no_role_are_said(tmp_path):
         "runs.csv: brake_torque_Nm varies from row to row and is not used. If brake_torque_Nm is load_torque_Nm, set "
         '[columns] load_torque_Nm = "brake_torque_Nm" in the robot\'s file',
     )
-    assert description.unused_inputs(runs) == ("brake_torque_Nm",)
+    assert verdict.unused_inputs(runs) == ("brake_torque_Nm",)
     assert unused_notes(table(tmp_path, CHANNELS, load_torque_Nm=TORQUE)) == ()
 
 
@@ -66,7 +66,7 @@ def test_a_torque_that_no_load_gives_may_be_a_brakes(tmp_path):
     imposed = 'imposed = "motor_speed"\nchannels = ["motor_current", "output_torque"]'
     runs = table(tmp_path, imposed, output_torque_Nm=TORQUE)
     (note,) = unexplained_torque_notes(runs)
-    assert note.share > 0.99 and description.unused_inputs(runs) == ("output_torque_Nm as a condition",)
+    assert note.share > 0.99 and verdict.unused_inputs(runs) == ("output_torque_Nm as a condition",)
     for friction in (0.3 + 1e-4 * SPEED, np.full(6, 0.3), 0.5 - 1e-9 * SPEED):
         assert unexplained_torque_notes(table(tmp_path, imposed, output_torque_Nm=friction)) == ()
     backward = table(tmp_path, imposed, motor_speed_rpm=-SPEED, motor_current_A=-CURRENT, output_torque_Nm=-TORQUE)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from calibration.data.runs import Runs
 from calibration.discovery.discover import discover
-from mmrjax.effects.slip_effects import VibrationSlip
+from mmrjax.effects.travel_effects import VibrationSlip
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
@@ -18,7 +18,7 @@ from tests.commands import ROOT
 
 
 @pytest.mark.parametrize(
-    "place", ["docs/explanation/vibration.md", "docs/reference/effects.md", "mmrjax/effects/slip_effects.py"]
+    "place", ["docs/explanation/vibration.md", "docs/reference/effects.md", "mmrjax/effects/travel_effects.py"]
 )
 def test_the_equation_that_is_written_is_the_one_that_runs(place, robot):
     """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""

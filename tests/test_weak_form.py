@@ -12,11 +12,11 @@ from worlds import logs
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.runs import Runs
-from calibration.discovery import discover, findings, screening
+from calibration.discovery import discover, findings, loop_input, search, stages
 from calibration.discovery.settings import settings_for
 from calibration.inference import shown_states, weak_form
 from calibration.inference.observers import Histories
-from mmrjax.effects import BY_NAME, sensor_effects
+from mmrjax.effects import BY_NAME, signal_effects
 from tests.commands import csv_text, motor_on_bench, read_rig, read_table
 
 STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
@@ -66,14 +66,14 @@ def space(tmp_path_factory):
 
 def posed(runs, robot, sd=SD, library=None):
     library = library or {n: BY_NAME[n] for n in NAMES}
-    return discover.build_candidate_space(
+    return loop_input.build_candidate_space(
         runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library
     )
 
 
 @pytest.fixture(scope="module")
 def before(space):
-    return screening.screen_by_weak_form(space, SETTINGS)
+    return search.screen_by_weak_form(space, SETTINGS)
 
 
 def test_a_window_integrates_by_parts():
@@ -120,11 +120,13 @@ def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before,
         kept.append(name)
         return found
 
-    monkeypatch.setattr(discover, "fit_base", fit_base)
+    monkeypatch.setattr(stages, "fit_base", fit_base)
     runs, library = Runs("synthetic", motor()).of(space.bare.base), {n: BY_NAME[n] for n in NAMES}
     noise = SimpleNamespace(sd=np.broadcast_to(SD, runs.measured().shape))
     with pytest.raises(InterruptedError):
-        discover.LoopInput(runs, None, space.bare.base, noise, {}, SETTINGS, library, keep=keep).trace()
+        discover.trace_verdict(
+            loop_input.LoopInput(runs, None, space.bare.base, noise, {}, SETTINGS, library, keep=keep)
+        )
     assert kept == ["ranking"]
     assert not begun[0].simulated and begun[0].z == pytest.approx(before.base.z)
 
@@ -217,7 +219,7 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
     del columns["supply_voltage_V"]
     mine = posed(read_table(tmp_path, csv_text(columns), robot).of(robot), robot, SD[int(channel == "motor_current")])
-    found = screening.screen_by_weak_form(mine, SETTINGS)
+    found = search.screen_by_weak_form(mine, SETTINGS)
     names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
     ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]
     assert ratio == pytest.approx(TRUE["inertia"] / TRUE["torque_constant"], rel=0.03)
@@ -247,7 +249,7 @@ def test_noise_of_an_angle_alone_is_neither_an_inertia_nor_a_gain(tmp_path, impo
         records.read_runs(tmp_path / "table.csv", robot=robot).of(robot),
         case.rig.noise("output_angle") * np.pi / 180,
     )
-    space = posed(runs, robot, sd, {"output_angle_gain": sensor_effects.OF_CHANNELS["output_angle_gain"]})
+    space = posed(runs, robot, sd, {"output_angle_gain": signal_effects.OF_CHANNELS["output_angle_gain"]})
     problem = space.bare
     fit, k = weak_form.fit_weak_form(problem, space.library.scored), problem.coordinates.names.index("bench.inertia")
     sds = np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian)))

@@ -14,13 +14,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.contact import Friction
-from mmrjax.model.ground import Ground
+from mmrjax.model.contact import Friction, Ground, Track
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STATUSES
-from mmrjax.model.track_friction import Track
 
 ROWS = 64  # of all tables once padded, so that few programs are compiled
 

@@ -25,12 +25,11 @@ from calibration.data.input_errors import (
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
-from mmrjax.compile.precision import in_double
-from mmrjax.effects.scaled import scaled_effect
+from mmrjax.compile.compiling import in_double
+from mmrjax.effects.base import scaled_effect
 from mmrjax.errors import list_some, printable
 from mmrjax.model import paper_robots, params, power
-from mmrjax.model.controller import Controller
-from mmrjax.model.driver import DECAYS
+from mmrjax.model.driver import DECAYS, Controller
 from mmrjax.model.quantities import GOALS
 from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
@@ -184,7 +183,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             SWITCHES (true or false) and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
-            `effects.scaled`).
+            `effects.base.scaled_effect`).
 
     Args:
         notes: as for `find_robot_file`.

@@ -37,8 +37,7 @@ from calibration.discovery.result import (
     UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.screening import WeakFormScreening
-from calibration.discovery.search import refit_without_each, single_p_value
+from calibration.discovery.search import WeakFormScreening, refit_without_each, single_p_value
 from calibration.discovery.settings import Settings
 from calibration.inference import bases
 from calibration.inference.estimates import SIDE_OF_BOUND

@@ -17,14 +17,21 @@ from scipy.special import ndtr, ndtri
 from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty_slots, fit_base
 from calibration.discovery.experiments import predict_menu
-from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap_statistics, diagnose_fit
+from calibration.discovery.score_tests import (
+    Diagnosed,
+    ScoreTable,
+    StrongestStatistics,
+    bootstrap_statistics,
+    diagnose_fit,
+)
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import fit_from_each_start
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import Threads
 
 # --- clusters of outliers in time, angle, order or condition --------------------------------------
 
@@ -158,9 +165,7 @@ class Screening:
 
 
 @contextlib.contextmanager
-def compile_ahead(
-    space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings
-) -> Iterator[Callable[[BaseFit], None]]:
+def compile_ahead(space: CandidateSpace, runs: Runs, settings: Settings) -> Iterator[Callable[[BaseFit], None]]:
     """Context manager that compiles programs for later steps, on other cores, during the base fit.
 
     To compile them, it runs a diagnosis and, except for long runs, one bootstrap replicate and a fit with slots, all
@@ -175,7 +180,7 @@ def compile_ahead(
 
     def compile_diagnosis() -> None:
         try:
-            bases, (linear, _, _) = _diagnose_base(start, bases_at, settings)
+            bases, (linear, _, _) = _diagnose_base(start, runs, settings)
         finally:
             looked.set()
         if not space.bare.observe.long:
@@ -200,23 +205,21 @@ def compile_ahead(
         job.result()
 
 
-def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
+def screen_outliers(base: BaseFit, runs: Runs, settings: Settings) -> Screening:
     """Excludes rows with a single wrong reading: its shift is more significant than any effect or curve.
 
     Outliers that form a cluster are not excluded. `cluster` of the result describes it.
 
     Args:
-        bases_at: function that returns the bases of curves at a fit of the base.
         runs: the runs.
     """
-    source = runs.source
-    screened = _exclude_outliers(base, bases_at, settings, source)
+    screened = _exclude_outliers(base, runs, settings)
     cluster_rows = np.zeros(len(base.space.included), bool)
     cluster_rows[list(screened.outliers)] = True
     together = _common_property(screened, cluster_rows, runs, settings)
     if together is None:
         return screened
-    bases, diagnosis = _diagnose_base(base, bases_at, settings)
+    bases, diagnosis = _diagnose_base(base, runs, settings)
     return Screening(base, (), bases, diagnosis, together)
 
 
@@ -232,9 +235,7 @@ def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, setting
     return find_cluster(outliers[:rows], included[:rows], axes, levels, settings.outlier_error, settings.seed)
 
 
-def screen_with_effects(
-    found: Screening, left: ScoreTable, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings
-) -> Screening | None:
+def screen_with_effects(found: Screening, left: ScoreTable, runs: Runs, settings: Settings) -> Screening | None:
     """Excludes rows that are outliers only after effects are added.
 
     None if there are no such rows, or if they form a cluster.
@@ -248,7 +249,7 @@ def screen_with_effects(
     if not far.size or found.cluster is not None:
         return None
     base = _refit_without(found.base, far, settings, runs.source)
-    more = Screening(base, (*found.outliers, *map(int, far)), *_diagnose_base(base, bases_at, settings))
+    more = Screening(base, (*found.outliers, *map(int, far)), *_diagnose_base(base, runs, settings))
     outliers = np.zeros(len(base.space.included), bool)
     outliers[list(more.outliers)] = True
     return None if _common_property(more, outliers, runs, settings) is not None else more
@@ -266,27 +267,23 @@ def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int
     return far[(alone[far] >= level) & (alone[far] >= together)]
 
 
-def _exclude_outliers(
-    base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str
-) -> Screening:
+def _exclude_outliers(base: BaseFit, runs: Runs, settings: Settings) -> Screening:
     """Base fit without rows whose own shift is more significant than any effect or curve."""
     allowed = settings.outliers(int(base.space.included.sum()))
-    base, outliers = _exclude_gross_errors(base, settings, where)
-    bases, diagnosis = _diagnose_base(base, bases_at, settings)
+    base, outliers = _exclude_gross_errors(base, settings, runs.source)
+    bases, diagnosis = _diagnose_base(base, runs, settings)
     while len(outliers) < allowed:
         far = _isolated_rows(base, diagnosis[1], bases, allowed - len(outliers), settings)
         if not far.size:
             break
         outliers = (*outliers, *map(int, far))
-        base = _refit_without(base, far, settings, where)
-        bases, diagnosis = _diagnose_base(base, bases_at, settings)
+        base = _refit_without(base, far, settings, runs.source)
+        bases, diagnosis = _diagnose_base(base, runs, settings)
     return Screening(base, outliers, bases, diagnosis)
 
 
-def _diagnose_base(
-    base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings
-) -> tuple[Bases, Diagnosed]:
-    space, bases = base.space, bases_at(base)
+def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases, Diagnosed]:
+    space, bases = base.space, bases_at_fit(runs, base)
     problem, z = space.problem(empty_slots(settings)), base.candidate.z
     if problem.observe.long:  # by the program of its fit
         problem, z = space.bare, z[: space.free]
@@ -324,3 +321,37 @@ def _exclude_gross_errors(base: BaseFit, settings: Settings, where: str) -> tupl
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()
     return _refit_without(base, np.flatnonzero(gross), settings, where), tuple(map(int, np.flatnonzero(gross)))
+
+
+def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
+    """Bases of smooth curves over the fitted readings. Curves over measured readings would share their noise."""
+    problem, z, active = base.space.fit_of(base.candidate.active, base.candidate.z)
+    problem = problem if active is None else base.space.problem(base.candidate.active)
+    index, _ = problem.observe.padded_rows(len(runs))
+    columns = dict(runs.where(index).columns)
+    reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
+    columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
+    observe = problem.observe.at_fit(problem, z)
+    return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))
+
+
+def diagnose_base_by_bootstrap(
+    screened: Screening,
+    settings: Settings,
+    freedom: np.ndarray | None = None,
+    null: StrongestStatistics | None = None,
+) -> Diagnosis:
+    """Diagnosis of the base fit, tested against a bootstrap of this fit.
+
+    Args:
+        freedom: degrees of freedom of the sd of each channel.
+        null: statistics of the bootstrap replicates. None: they are computed here.
+    """
+    space, base = screened.base.space, screened.base.candidate
+    linear, scores, statistics = screened.diagnosed
+    if null is None:
+        null = bootstrap_statistics(
+            space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
+            settings.seed, freedom,
+        )  # fmt: skip
+    return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))

@@ -5,21 +5,30 @@ found.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from calibration.data import Columns
 from calibration.data.runs import Runs
-from calibration.discovery import experiments
+from calibration.discovery import experiments, prediction
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, families_of_members
-from calibration.discovery.result import Errors, HeldOutAlternative, WorseChannel
-from calibration.discovery.search import SearchResult, diagnose_candidate
+from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.loop_input import Tell
+from calibration.discovery.loop_notes import NameSupport
+from calibration.discovery.outliers import Screening
+from calibration.discovery.prediction import HeldOutAlternative, Predicted
+from calibration.discovery.result import Errors, WorseChannel
+from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
 from calibration.discovery.settings import Settings
+from calibration.discovery.standing import judge_names
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
+from calibration.inference.fit_notes import progress_remark
 from calibration.inference.held_out import predict_unseen
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
@@ -163,4 +172,70 @@ def _classes_with_leader(
             for name, others in zip(leader.effects, alike.families, strict=True)
         ),
         (best, *alike.ladder, *fitted),
+    )
+
+
+def choose_effects(
+    runs: Runs,
+    screened: Screening,
+    left: Diagnosis,
+    searched: SearchResult,
+    settings: Settings,
+    progress: Tell,
+    beside: BaseCurve,
+    predicted: Predicted,
+) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
+    """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
+
+    The effects are those whose names are established, and those of the smallest set that predicts as well as any.
+    Effects that only imitate a curve are left out. If the largest set leaves no discrepancy, its effects are tested,
+    otherwise those of the predictive set.
+
+    Args:
+        left: diagnosis of the base fit.
+        beside: smooth curve of its discrepancy.
+        predicted: cache of hold-out predictions of fits. This function adds to it.
+    """
+    base, space, bases = screened.base.candidate, screened.base.space, screened.bases
+    best, after = searched.best, searched.diagnosis
+    if best is None or after is None:
+        return None, searched, judge_names(space, base, searched, left, bases, settings)
+    adequate = not after.test.rejected_with_margin
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
+    blocks = [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
+    support_of = functools.partial(
+        judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
+    )
+    stood = support_of() if adequate else None
+    if stood is not None and all(stood.established(e) for e in best.effects):
+        return (best, after), searched, stood
+    progress(progress_remark("held out"))
+    few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
+    if stood is None:
+        judged = best if few is None else few
+        proposed = (
+            judged,
+            after if judged is best else diagnose_candidate(space, judged, bases, left.test.null, settings),
+        )
+        stood = support_of(proposed=proposed)
+    else:
+        proposed = best, after
+    names = [e for e in proposed[0].effects if stood.established(e)]
+    added_effects = [
+        e for e in (() if few is None else few.effects) if e not in names and not stood.imitates_curve(e)
+    ]
+    names += added_effects[: settings.slots - len(names)]
+    if not names:
+        return None, searched, stood
+    fits_of_names = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
+    if not fits_of_names:
+        active = fill_slots(names, settings)
+        begins = start_of_fit(space, proposed[0], active, settings, left.scores)
+        fits_of_names = fit_candidates(space, [(active, begins)], settings)
+        searched = dataclasses.replace(searched, ladder=(*searched.ladder, *fits_of_names))
+    diagnosis = next((d for c, d in (proposed, (best, after)) if c is fits_of_names[0]), None)
+    return (
+        (fits_of_names[0], diagnosis or diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)),
+        searched,
+        stood,
     )

@@ -14,16 +14,15 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import entries_of, json_value, write_json, write_table
 from calibration.described import describe, sentences
-from calibration.discovery import formula
+from calibration.discovery import REFIT_FILE, formula
 from calibration.discovery.experiments import Proposal
-from calibration.discovery.headline import headline
 from calibration.discovery.hidden import HiddenEffect
-from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Headline, NameSupport, RuledOut, VerdictSummary
 from calibration.discovery.outliers import OutlierCluster
-from calibration.discovery.prediction import Gain
+from calibration.discovery.prediction import Gain, HeldOutAlternative
 from calibration.discovery.settings import Settings
+from calibration.discovery.verdict import headline
 from calibration.inference.details import Detail
 from calibration.inference.fit_notes import DependentPair, Notes, Remark, remarks_with_codes
 from calibration.inference.identifiability import determined_together
@@ -313,27 +312,6 @@ class WorseChannel:
     rows: int
     before: float
     after: float
-
-
-@dataclasses.dataclass(frozen=True)
-class HeldOutAlternative:
-    """An alternative set of effects, refitted without each block of runs.
-
-    Attributes:
-        effects: names of its effects.
-        leads: True if it is the proposed one.
-        rise_chi2: χ² of its fit to all rows, minus that of the best one [σ²].
-        rms_sigma: rms hold-out error over the readings that every alternative predicts [σ].
-        by_kind: the same error for each kind of block [σ].
-        lost: number of held-out readings that it cannot predict, because its robot slides or fails there.
-    """
-
-    effects: Names
-    leads: bool
-    rise_chi2: float
-    rms_sigma: float
-    by_kind: dict[str, float]
-    lost: int
 
 
 @dataclasses.dataclass(frozen=True)

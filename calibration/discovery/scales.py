@@ -26,7 +26,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
 from calibration.inference.operating import travel_of_rows
 from mmrjax.effects import Effect
-from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
+from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.balances import BALANCES, absent_balances, effects_sum
 from mmrjax.model.conditions import Conditions

@@ -16,14 +16,14 @@ from jaxtyping import Array, Float
 from calibration.data import Names
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects import Effect
+from mmrjax.effects.base import amplitude_of as amplitude_of
+from mmrjax.effects.base import free_shape_parameter as free_shape_parameter
 from mmrjax.effects.curve import in_travel_frame
-from mmrjax.effects.scaled import amplitude_of as amplitude_of
-from mmrjax.effects.scaled import free_shape_parameter as free_shape_parameter
 from mmrjax.model import balances, params
 from mmrjax.model.params import Parameter, Scalar, parameter
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.one_sided import clip
+from mmrjax.numerics.elementary import clip
 
 #: Balances with a defect that changes the readings of settled travel. Those on one line act on the readings in the
 #: same way except for the variables that they depend on: three channels close three equations.

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Names, Priors
+from calibration.data.configuration_tables import GROUND
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
 from mmrjax.model.params import Parameter, parameters_by_name
 from mmrjax.model.robot import Robot
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 
 #: Free by default in each configuration with rows: friction. The makers' electrical values, the gearbox and motor
 #: losses of Table 2, the ratio and radii and masses stay at the values of their tables.

@@ -24,7 +24,6 @@ from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 if TYPE_CHECKING:
-    from calibration.discovery.discover import LoopStages
     from calibration.discovery.result import (
         DiscoveryResult,
         EffectRanking,
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
         UnnamedDiscrepancy,
         WorseChannel,
     )
+    from calibration.discovery.verdict import LoopStages
 
 # --- the verdict ----------------------------------------------------------------------------------------
 

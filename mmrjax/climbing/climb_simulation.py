@@ -20,20 +20,20 @@ from jaxtyping import Array, Float
 
 from mmrjax.climbing import footing
 from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, ContactShape, Footing
-from mmrjax.climbing.lever_drives import LeverDrive, LeverStep, lever_drive, step_levers
+from mmrjax.climbing.levers import LeverDrive, LeverStep, lever_drive, step_levers
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SMALL, compiled
 from mmrjax.fidelities.drive import current_after
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.contact import Track
 from mmrjax.model.masses import HalfRobotMasses, without_levers
 from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, Signals, State
-from mmrjax.model.track_friction import Track
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
-from mmrjax.numerics.one_sided import value_and_slope
 from mmrjax.undercarriage.running_gear import RunningGear
 from mmrjax.undercarriage.side_contacts import contact_damping
 

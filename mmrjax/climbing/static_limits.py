@@ -19,7 +19,7 @@ from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Po
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 
 #: Number of pitches searched first, then near the best one, and rounds; for one posture, and for any.
 _PITCHES, _POSTURES = (181, 33, 4), (13, 9, 1)

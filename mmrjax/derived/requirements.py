@@ -21,7 +21,7 @@ from mmrjax.model.params import Index, Scalar
 from mmrjax.model.quantities import CONDITIONS, TABLE, Quantity
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, CUT_OFF, Signals
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.turning.circling import circling_signals
 
 #: Quantities that depend on the temperature of the windings.

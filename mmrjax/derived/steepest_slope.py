@@ -16,7 +16,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, Signals
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 
 #: The steepest slope considered [deg], returned for robots that hold it.
 STEEPEST = CONDITIONS["slope_deg"].range[1]

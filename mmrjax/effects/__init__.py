@@ -1,41 +1,22 @@
-"""The library of effects, one file for each balance. A new effect is a class in the file of its balance."""
+"""The library of effects. A new effect is a class in the file that names its balance in the first line."""
 
 from mmrjax.effects import (
-    duty_effects,
-    electrical_effects,
-    gearbox_effects,
-    ground_effects,
-    inductance_effects,
-    inertia_effects,
+    drive_effects,
     mass_effects,
-    motor_effects,
-    sensor_effects,
-    slip_effects,
-    supply_effects,
+    signal_effects,
     track_effects,
+    travel_effects,
     turning_effects,
+    voltage_effects,
 )
 from mmrjax.effects.base import Effect, amplitude, effects_of_module
 from mmrjax.effects.curve import CURVES, CURVES_ROUND, CURVES_SHOWN, WAVES
-from mmrjax.effects.sensor_effects import OF_CHANNELS
+from mmrjax.effects.signal_effects import OF_CHANNELS
 
-_FILES = (
-    mass_effects,
-    inertia_effects,
-    supply_effects,
-    electrical_effects,
-    inductance_effects,
-    motor_effects,
-    gearbox_effects,
-    track_effects,
-    ground_effects,
-    slip_effects,
-    sensor_effects,
-    duty_effects,
-)
+_FILES = (mass_effects, voltage_effects, drive_effects, track_effects, travel_effects, signal_effects)
 
 #: All effects of the library by balance, in the order of each file. Tables of scores and the random numbers of a
-#: bootstrap depend on the position: add a new effect at the end of its file.
+#: bootstrap depend on the position: add a new effect after the others of its balance.
 ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in effects_of_module(file))
 
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}

@@ -1,12 +1,18 @@
-"""Base class of effects: one equation that enters one balance with one linear amplitude."""
+"""Base classes of effects: an equation that enters one balance with one linear amplitude.
+
+Further bases repeat with the angle of a shaft, or bend a bristle. `scaled_effect` changes priors and limits for
+other sizes of rig.
+"""
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import inspect
 import math
 import re
+from collections.abc import Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,8 +20,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from mmrjax.model import params, power
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.params import Index, Parameter, Scalar, parameter
 from mmrjax.model.quantities import Names
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
@@ -77,7 +84,7 @@ class Effect(eqx.Module):
             temperature, a phase). None: no memory. A run starts with memory 0.
         memory_unit: unit of its memory.
         plain: for a class with its own priors, the class of the library that it is made from.
-        factors: ratios of its priors to the library's, see `effects.scaled`.
+        factors: ratios of its priors to the library's, see `effects.base.scaled_effect`.
         configurations: names of the configurations that it acts on. Empty: all, or those with its `movers`. A
             field: the class states the default, and a robot file may state `configurations = ["4W2T"]`.
 
@@ -197,3 +204,141 @@ def effects_of_module(module: ModuleType) -> tuple[type[Effect], ...]:
     """The effects that a module defines, in its order. Classes without a `term` are left out."""
     classes = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
     return tuple(v for v in classes if issubclass(v, Effect) and not inspect.isabstract(v))
+
+
+STEPS = 12  # integration steps per period: derivatives at amplitude 0 are then accurate to 1e-5
+
+
+def phase_parameter() -> Scalar:
+    """The phase of a wave, a field of every periodic effect."""
+    return parameter(
+        0.0, "rad", "phase φ of the wave at the start of the run", (-4.0, 4.0),
+        "position of the parts at the start: arbitrary", sd=2.0,
+    )  # fmt: skip
+
+
+class Periodic(Effect):
+    """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
+
+    The memory is the phase ψ [rad]. Without a memory (`steady`) the wave has its mean, zero.
+    """
+
+    transient = True
+    memory_size = 100.0
+    memory_unit = "rad"
+
+    phase: eqx.AbstractVar[Scalar]
+
+    @abc.abstractmethod
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
+        """Radians of the wave per radian of the motor's shaft k [-]."""
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.order(robot, signals.configuration) * signals.speed_motor
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        """0: a phase has no settled value. `wave` then returns its mean."""
+        return jnp.zeros_like(signals.speed_motor)
+
+    def wave(self, signals: Signals) -> Scalar:
+        """sin(ψ + φ), or 0 if no phase is followed [-]."""
+        if self.name not in signals.memory:
+            return jnp.zeros_like(signals.speed_motor)
+        return jnp.sin(signals.memory[self.name] + self.phase)
+
+    def step_longest(self, robot: Robot, conditions: Conditions) -> Scalar:
+        """A twelfth of the period at the no-load speed [s]."""
+        source = power.voltage_source(
+            robot.battery, conditions.voltage, conditions.battery, 0.0, conditions.discharge
+        )
+        rate = self.order(robot, conditions.configuration) * source / robot.motor.torque_constant
+        return 2 * jnp.pi / STEPS / jnp.maximum(jnp.abs(rate), 1.0)
+
+
+def breakaway_parameter() -> Scalar:
+    """The breakaway angle θ_s of a bristle, a field of every effect with one."""
+    return parameter(
+        0.02, "rad", "angle θ_s of the driven shaft until the contacts slide", (1e-4, 2.0),
+        "1 mm of belt, a degree of a geared shaft", relative_sd=0.5,
+    )  # fmt: skip
+
+
+class Bristle(Effect):
+    """A term in the bend z of a bristle at the driven shaft: θ_s z' = ω_k - |ω_k| z, z(0) = 0, settled z = sign ω_k.
+
+    Dahl, A solid friction model (1968), with exponent 1. The first order of Canudas de Wit, Olsson, Åström and
+    Lischinsky (1995) with a steady curve that does not depend on speed. The memory is z [-].
+    """
+
+    memory_size = 1.0
+    memory_unit = "-"
+
+    angle_breakaway: eqx.AbstractVar[Scalar]
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return signals.direction
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        speed = signals.speed_wheel
+        return speed * (1 - signals.direction * signals.memory[self.name]) / self.angle_breakaway
+
+
+#: Factors of a class: for the sd of its amplitude, its shape parameter, and the limits of its amplitude.
+Factors = tuple[float, float, float]
+
+
+def amplitude_of(effect: Effect) -> Parameter:
+    """The amplitude of an effect."""
+    return next(p for p in params.walk_parameters(effect) if p.spec.amplitude)
+
+
+def free_shape_parameter(effect: Effect) -> Parameter | None:
+    """The shape parameter that a fit frees: the first phase or scale after the amplitude, None without one."""
+    for p in params.walk_parameters(effect):
+        if not p.spec.amplitude and (p.name == "phase" or (p.spec.relative_sd and float(p.value) > 0)):
+            return p
+    return None
+
+
+@functools.lru_cache(maxsize=4096)
+def scaled_effect(kind: type[Effect], factors: Factors) -> type[Effect]:
+    """A class of the same effect with the amplitude's sd and limits and the shape multiplied by factors.
+
+    Equal factors return the same class.
+    """
+    sd, stretch, limits = factors
+    effect = kind()
+    fields = {amplitude_of(effect).name: _field(amplitude_of(effect), sd, limits)}
+    if (shape := free_shape_parameter(effect)) is not None and stretch != 1.0:
+        fields[shape.name] = _field(shape, stretch, stretch)
+    body: Mapping[str, object] = {
+        "__annotations__": {**dict.fromkeys(fields, "Scalar"), "factors": ClassVar[Factors]},
+        "__module__": kind.__module__,
+        "__doc__": kind.__doc__,
+        "__reduce__": _reduced,
+        "name": kind.name,
+        "plain": kind,
+        "factors": factors,
+        **fields,
+    }
+    return type(kind.__name__, (kind,), dict(body))
+
+
+def _field(parameter: Parameter, factor: float, limits: float) -> Any:
+    spec = parameter.spec
+    low, high = spec.bounds
+    return params.parameter(
+        factor * float(parameter.value), spec.unit, spec.meaning, (low * limits, high * limits), spec.source,
+        relative_sd=spec.relative_sd, sd=None if spec.sd is None else spec.sd * factor, amplitude=spec.amplitude,
+    )  # fmt: skip
+
+
+def _reduced(effect: Effect) -> tuple[Any, ...]:
+    values = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect) if f.init}
+    kind = type(effect)
+    return restore_effect, (kind.plain, kind.factors, values)
+
+
+def restore_effect(kind: type[Effect], factors: Factors, values: Mapping[str, Any]) -> Effect:
+    """Restores an effect from its pickled values, because its class cannot be found by name."""
+    return scaled_effect(kind, factors)(**values)

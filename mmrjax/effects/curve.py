@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.effects.base import THE_SIDE, Effect, amplitude, name_class
-from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.effects.base import THE_SIDE, Effect, Periodic, amplitude, name_class, phase_parameter
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
 from mmrjax.model.quantities import DEG, MM, RPM, TRAVEL, TURN

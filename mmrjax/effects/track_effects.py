@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from mmrjax.effects.base import Effect, amplitude
-from mmrjax.effects.bristle import Bristle, breakaway_parameter
-from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.effects.base import Bristle, Effect, Periodic, amplitude, breakaway_parameter, phase_parameter
 from mmrjax.model.params import Index, Scalar, parameter
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.one_sided import magnitude
+from mmrjax.numerics.elementary import magnitude
 
 
 class TrackEffect(Effect):

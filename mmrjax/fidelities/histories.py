@@ -44,8 +44,8 @@ from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.rig import interpolate
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
+from mmrjax.numerics.batch_flow import compute_if_needed
 from mmrjax.numerics.linear_equations import invert, solve
-from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import Unknowns
 
 T = TypeVar("T")

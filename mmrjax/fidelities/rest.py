@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax.fidelities.result import movers_slip, travel_status
+from mmrjax.fidelities.base import movers_slip, travel_status
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.driver import STEEPNESS
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
-from mmrjax.numerics import one_sided
-from mmrjax.numerics.rarely import compute_if_needed
+from mmrjax.numerics import elementary
+from mmrjax.numerics.batch_flow import compute_if_needed
 
 #: Torque at the driving wheel equivalent to the whole weight of a side [N·m].
 TORQUE = 1.0
@@ -58,7 +58,7 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))
     if not conditions.voltage_follows:
         most = robot.driver.current_limit * (1 + jnp.abs(balances.bridge_duty(robot, conditions)) * (1 / STEEPNESS))
-        stall = one_sided.clip(stall, -most, most)
+        stall = elementary.clip(stall, -most, most)
     stall = robot.motor.torque_electromagnetic(stall)
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
     weight = weight if conditions.load_torque is None else weight + conditions.load_torque
@@ -143,12 +143,14 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     traction = ahead.gravity
     if robot.has_ground:
         least_, most = ((inputs[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
-        traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
+        traction = elementary.clip(
+            elementary.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit
+        )
     carried = chassis.radius * traction
     loads = [carried + lost for lost in track_losses]
     if conditions.held is not None:
         loads = [jnp.where(conditions.held > 0.5, *both) for both in zip(inputs, loads, strict=True)]
-    torque = one_sided.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
+    torque = elementary.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
     none = jnp.zeros_like(carried)
     return dataclasses.replace(
         ahead,

@@ -14,7 +14,15 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Fidelity, ImplicitSolution, Progress, RunBatch
+from mmrjax.fidelities.base import (
+    Fidelity,
+    ImplicitSolution,
+    Progress,
+    RunBatch,
+    result_of_signals,
+    travel_status,
+    withhold_numbers,
+)
 from mmrjax.fidelities.rest import (
     admitted_current,
     is_at_rest,
@@ -24,8 +32,7 @@ from mmrjax.fidelities.rest import (
     voltage_at_rest,
     without_diode,
 )
-from mmrjax.fidelities.result import result_of_signals, travel_status, withhold_numbers
-from mmrjax.model import balances, channels, ground, params
+from mmrjax.model import balances, channels, contact, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
@@ -42,10 +49,10 @@ from mmrjax.model.signals import (
     Signals,
     State,
 )
+from mmrjax.numerics.batch_flow import compute_if_needed
+from mmrjax.numerics.elementary import clip
 from mmrjax.numerics.linear_equations import Vector
 from mmrjax.numerics.newton import root, root_alone
-from mmrjax.numerics.one_sided import clip
-from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import Unknowns
 from mmrjax.turning import circling
 
@@ -209,7 +216,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     point = dataclasses.replace(
         point,
         reading=reading,
-        slip=jnp.where(parked, ground.slip_ratio(speed, point.theoretical_speed), point.slip),
+        slip=jnp.where(parked, contact.slip_ratio(speed, point.theoretical_speed), point.slip),
         adhesion_used=jnp.where(exceeds_adhesion, 1.0, point.adhesion_used),
         traction=point.traction / jnp.where(exceeds_adhesion, point.adhesion_used, 1.0),
         power_ground=jnp.where(parked, 0.0, point.power_ground),

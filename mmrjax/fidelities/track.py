@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch
-from mmrjax.fidelities.result import flag_mask, withhold_numbers
+from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch, flag_mask, withhold_numbers
 from mmrjax.model import balances, contact, masses
 from mmrjax.model.balances import signals_of
 from mmrjax.model.conditions import Conditions
@@ -33,8 +32,8 @@ from mmrjax.model.signals import (
 )
 from mmrjax.undercarriage import both_sides, half_robot
 from mmrjax.undercarriage.half_robot import Changes, HalfRobotState, HalfRobotSystem, SteadyAverages, build_system
+from mmrjax.undercarriage.modes import check_track_step, largest_step
 from mmrjax.undercarriage.side_contacts import GearReactions
-from mmrjax.undercarriage.stability import check_track_step, largest_step
 
 STEP = fidelities.fidelity_facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]

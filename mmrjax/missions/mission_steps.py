@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mmrjax.fidelities.base import flag_mask
 from mmrjax.fidelities.rest import smallest_of
-from mmrjax.fidelities.result import flag_mask
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.rarely import compute_if_needed
+from mmrjax.numerics.batch_flow import compute_if_needed
 from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages, step_longest
 
 #: The first step of a segment [s], and the shortest.

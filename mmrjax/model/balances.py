@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax.climbing import resting_posture
-from mmrjax.model import channels, contact, ground, masses, power
+from mmrjax.model import channels, contact, masses, power
 from mmrjax.model import chassis as chassis_room
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
@@ -25,8 +25,7 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
-from mmrjax.numerics.one_sided import at_least, clip, value_and_slope
-from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.numerics.elementary import at_least, clip, cosine, sine, value_and_slope
 from mmrjax.turning.two_sides import SIDES, GroundForces, Stance, ground_forces, sum_of_sides
 
 #: Each balance with its unit and its equation.
@@ -292,7 +291,7 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
         return _fill_unset(signals, resistance=zero, gravity=demand, demand=demand, adhesion_limit=zero + jnp.inf)
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
     resistance = resistance + effects_sum(robot, signals, "ground")
-    gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
+    gravity = contact.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
     return _fill_unset(
         signals,
         resistance=resistance,

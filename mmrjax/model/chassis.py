@@ -6,11 +6,10 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from mmrjax.model.ground import Ground, force_gravity
+from mmrjax.model.contact import Ground, Track, force_gravity
 from mmrjax.model.params import Scalar, as_float, parameter
 from mmrjax.model.signals import GRAVITY
-from mmrjax.model.track_friction import Track
-from mmrjax.numerics.trigonometry import cosine
+from mmrjax.numerics.elementary import cosine
 from mmrjax.turning.two_sides import Turning
 
 

@@ -1,4 +1,6 @@
-"""Contact laws: the friction law of Fig. 7 with its inverse, the contact force (27)-(29), the step of Fig. 9a."""
+"""Contact with ground and guides: friction law of Fig. 7 and its inverse, contact force (27)-(29), step of Fig. 9a,
+loss (24) and guide friction (26) of tracks, motion resistance (5), adhesion (6), (7), slip (32), (33).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.numerics.trigonometry import sine_third
+from mmrjax.model.signals import safe_quotient
+from mmrjax.numerics.elementary import sine, sine_third
 
 _SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with the adhesion of Table 5"
 _PACKAGE = "10 V_s, as in the multibody package of ref. [48]. The paper prints none"
@@ -132,3 +135,75 @@ def force_contact(
 def damping_contact(force: Scalar, gap: Scalar, gap_free: Scalar, damping: Scalar, depth: Scalar) -> Scalar:
     """Damping of a `force` from `force_contact`: its decrease with the gap's rate [N·s/m], same arguments."""
     return jnp.where(force > 0, damping * cubic_step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)
+
+
+class Track(eqx.Module):
+    """M_t = M_t0 sign ω_k + K_ft ω_k at the pulley, and F' = μ_t R_g on the lower guide."""
+
+    loss_coulomb: Scalar = parameter(
+        None, "N·m", "static loss torque of a side's tracks M_t0, eq. (24)", (0.0, 1e3),
+        "Table 3: 350 mN·m for three tracks, 70 for one", relative_sd=0.15,
+    )  # fmt: skip
+    loss_viscous: Scalar = parameter(
+        None, "N·m·s", "pseudo-viscous loss of a side's tracks K_ft, eq. (24)", (0.0, 100.0),
+        "Table 3: 16 mN·m·s for three tracks, 3 for one", relative_sd=0.15,
+    )  # fmt: skip
+    guide_friction: Scalar = parameter(
+        0.20, "-", "track-guide friction coefficient μ_t, eq. (26)", (0.0, 2.0), "Table 4", relative_sd=0.2
+    )
+    guide_share: Scalar = parameter(
+        None, "-", "share of the weight that the guides carry (the pulleys carry the rest)", (0.0, 1.0),
+        "Table A1 simulated lies between 0 and 1 of the weight; wheels carry all of it in 4W2T", sd=0.2,
+    )  # fmt: skip
+
+    def torque_loss(self, speed_wheel: Scalar, direction: Scalar) -> Scalar:
+        """Internal loss torque M_t [N·m], eq. (24), at pulley speed [rad/s]."""
+        return self.loss_coulomb * direction + self.loss_viscous * speed_wheel
+
+    def force_guide(self, normal: Scalar, direction: Scalar) -> Scalar:
+        """Friction of the teeth on the lower guide F'_t = μ_t R_g [N], eq. (26)."""
+        return self.guide_friction * self.guide_share * normal * direction
+
+
+#: Least normal load that divides a demand, beyond the traction it can hold [N].
+NO_LOAD = 1e-9
+
+
+class Ground(eqx.Module):
+    """Resistance and adhesion of the surface for one mover."""
+
+    friction: Friction
+    rolling_resistance: Scalar = parameter(
+        None, "-", "rolling resistance coefficient f, eq. (5)", (0.0, 1.0), "Table 4", relative_sd=0.15
+    )
+
+    def force_resistance(self, normal: Scalar, direction: Scalar) -> Scalar:
+        """Motion resistance F_f = f N [N], eq. (5), against `direction` (-1..1)."""
+        return self.rolling_resistance * normal * direction
+
+    def force_adhesion(self, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Largest traction φ R_z [N], eqs. (6), (7). `adhesion` is the surface's ratio [-]."""
+        return self.friction.static * adhesion * normal
+
+    def traction(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Traction [N] of a contact that slides at `speed_sliding` [m/s], eq. (25) with Fig. 7."""
+        return self.friction.coefficient(speed_sliding) * adhesion * normal
+
+    def traction_rise(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Derivative of `traction` with respect to `speed_sliding` [N·s/m]."""
+        return self.friction.rise(speed_sliding) * adhesion * normal
+
+    def speed_creep(self, demand: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Sliding speed [m/s] for a traction equal to `demand` [N]."""
+        # A vertical ground carries no normal load: 0 / 0 would make the derivatives of the whole batch NaN.
+        return self.friction.speed_creep(demand / jnp.maximum(adhesion * normal, NO_LOAD))
+
+
+def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
+    """Downhill force m g sin α [N], eq. (1)."""
+    return mass * gravity * sine(slope)
+
+
+def slip_ratio(speed: Scalar, speed_theoretical: Scalar) -> Scalar:
+    """s = 1 - V / V_theoretical [-], eq. (33), 0 at rest."""
+    return safe_quotient(speed_theoretical - speed, speed_theoretical)

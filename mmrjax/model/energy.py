@@ -13,7 +13,7 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.quantities import SINKS as SINKS
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals
-from mmrjax.numerics.trigonometry import sine
+from mmrjax.numerics.elementary import sine
 
 
 def source_power(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:

@@ -7,10 +7,8 @@ from collections.abc import Callable
 
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
-from mmrjax.model.contact import Friction
-from mmrjax.model.gearbox import Gearbox
-from mmrjax.model.ground import Ground
-from mmrjax.model.motor import UNLIMITED, Motor
+from mmrjax.model.contact import Friction, Ground, Track
+from mmrjax.model.gearmotor import UNLIMITED, Gearbox, Motor
 from mmrjax.model.paper_tables import (
     BENCH,
     PAYLOADS_KG,
@@ -25,7 +23,6 @@ from mmrjax.model.paper_tables import (
 from mmrjax.model.power import Battery
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations, Robot
-from mmrjax.model.track_friction import Track
 from mmrjax.turning.two_sides import Turning
 
 __all__ = [

@@ -14,10 +14,8 @@ import numpy as np
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.chassis import Chassis
-from mmrjax.model.controller import Controller
-from mmrjax.model.driver import Driver
-from mmrjax.model.gearbox import Gearbox
-from mmrjax.model.motor import Motor
+from mmrjax.model.driver import Controller, Driver
+from mmrjax.model.gearmotor import Gearbox, Motor
 from mmrjax.model.paper_tables import RADIUS_PULLEY
 from mmrjax.model.params import Index, Scalar, as_float
 from mmrjax.model.power import Battery

@@ -21,10 +21,10 @@ import optimistix as optx
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from mmrjax.numerics import lanes
+from mmrjax.numerics import batch_flow
+from mmrjax.numerics.batch_flow import compute_if_needed
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
-from mmrjax.numerics.one_sided import value_and_slope
-from mmrjax.numerics.rarely import compute_if_needed
 
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
@@ -254,7 +254,7 @@ def root_alone(residual: Residual, start: Vector, shared: Any, own: Any, toleran
     In a batch each member ends on its own. One without a root takes every turn, but does not delay the others.
     """
     method, function = FewUnknowns(atol=tolerance), _function(residual)
-    found: tuple[Vector, Array] = lanes.loop_until(
+    found: tuple[Vector, Array] = batch_flow.loop_until(
         lambda given: method.init(function, given[0], given[1:], {}, None, None, frozenset()),
         lambda given, state: method.step(function, state.y, given[1:], {}, state, frozenset())[1],
         lambda state: state.solved | (state.turns >= MAX_STEPS),

@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import rest
+from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, withhold_numbers
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
-from mmrjax.fidelities.result import mask_unknown, power_ratio, result_of_signals, withhold_numbers
-from mmrjax.model import balances, ground
+from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Pair, Scalar
@@ -37,7 +37,7 @@ from mmrjax.model.signals import (
     Signals,
     State,
 )
-from mmrjax.numerics import lanes
+from mmrjax.numerics import batch_flow
 from mmrjax.numerics.linear_equations import inverse
 from mmrjax.numerics.rosenbrock import Unknowns, error_norm_of_sides
 from mmrjax.turning.two_sides import SIDES
@@ -331,11 +331,11 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
     each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
     """
     inputs = robot, conditions
-    first = lanes.loop_until(
+    first = batch_flow.loop_until(
         _begin_broyden, _broyden_step, lambda s: (s.looks >= SOON) | s.solved, inputs, lambda s: (s.y, s.solved)
     )
-    solution = lanes.loop_until(_no_linearisation, _linearise_balance, lambda s: s[2], (*inputs, *first))
-    end = lanes.loop_until(
+    solution = batch_flow.loop_until(_no_linearisation, _linearise_balance, lambda s: s[2], (*inputs, *first))
+    end = batch_flow.loop_until(
         _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*inputs, first[0], solution), most=FEW
     )
     is_solved = end.solved & jnp.all(jnp.isfinite(end.jacobian))
@@ -497,7 +497,7 @@ def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Resu
     result = dataclasses.replace(
         mean,
         reading=balances.readings_of_sides(robot, signals),
-        slip=ground.slip_ratio(mean.speed, mean.theoretical_speed),
+        slip=contact.slip_ratio(mean.speed, mean.theoretical_speed),
         adhesion_used=jnp.max(jnp.hypot(travel.grip.ahead, travel.grip.aside) / limit),
         efficiency_motor=power_ratio(mean.power_motor, mean.power_supply),
         efficiency_gear=power_ratio(mean.power_gear, mean.power_motor),

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model.contact import Friction
 from mmrjax.model.params import Pair, Scalar, parameter
-from mmrjax.numerics.rarely import compute_if_needed
+from mmrjax.numerics.batch_flow import compute_if_needed
 
 #: Position of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])

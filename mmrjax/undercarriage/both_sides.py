@@ -26,14 +26,14 @@ from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Signals
+from mmrjax.numerics.elementary import cosine, sine
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
-from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES, ContactLaw, GroundForces
 from mmrjax.undercarriage import half_robot, side_contacts
-from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.half_robot import Average, HalfRobotState, HalfRobotSystem, SteadyAverages
 from mmrjax.undercarriage.mjcf import mjx
+from mmrjax.undercarriage.running_gear import BeltPath
 from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions
 
 #: Coordinates of the robot, or their velocities or forces.

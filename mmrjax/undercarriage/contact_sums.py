@@ -19,9 +19,8 @@ from jaxtyping import Array, Float
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.one_sided import value_and_slope
-from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import BeltPath, belt_runs, tips_on_path
+from mmrjax.numerics.elementary import cosine, sine, value_and_slope
+from mmrjax.undercarriage.running_gear import BeltPath, belt_runs, tips_on_path
 from mmrjax.undercarriage.side_contacts import (
     WHEEL,
     ContactState,

@@ -21,7 +21,7 @@ from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
-from mmrjax.numerics.trigonometry import cosine, sine
+from mmrjax.numerics.elementary import cosine, sine
 from mmrjax.turning.two_sides import SIDES
 from mmrjax.undercarriage.side_contacts import lever_tips
 

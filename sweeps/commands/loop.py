@@ -16,9 +16,8 @@ import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
 from calibration.data.runs import Runs
 from calibration.described import describe
-from calibration.discovery import findings
+from calibration.discovery import REFIT_FILE, OutOfTime, findings
 from calibration.discovery.discover import discover
-from calibration.discovery.kept import REFIT_FILE, OutOfTime
 from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors

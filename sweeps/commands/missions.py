@@ -17,7 +17,7 @@ from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import PAIRS
-from mmrjax.model import balances, channels, ground, quantities
+from mmrjax.model import balances, channels, contact, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import lateral_ratio
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -334,7 +334,7 @@ def _course_rows(
         "time_s": course.time + delay,
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / quantities.MM,
-        "slip": np.asarray(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
+        "slip": np.asarray(contact.slip_ratio(signals.speed, signals.speed_theoretical)),
         "distance_m": course.path,
         "displacement_m": course.distance,
         "voltage_V": signals.voltage,

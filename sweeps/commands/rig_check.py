@@ -29,7 +29,7 @@ from mmrjax.errors import count_noun
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.driver import FAST
-from mmrjax.model.motor import UNLIMITED
+from mmrjax.model.gearmotor import UNLIMITED
 from mmrjax.model.quantities import GOALS, HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft

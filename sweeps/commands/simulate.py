@@ -18,10 +18,9 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.derived.start_figures import curve_peak, stages_of_histories
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import History, RunBatch
-from mmrjax.fidelities.result import result_of_signals
-from mmrjax.model import channels, ground, quantities
-from mmrjax.model.motor import Motor
+from mmrjax.fidelities.base import History, RunBatch, result_of_signals
+from mmrjax.model import channels, contact, quantities
+from mmrjax.model.gearmotor import Motor
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
@@ -260,7 +259,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown_channels},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / quantities.MM,
-        "slip": np.ravel(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
+        "slip": np.ravel(contact.slip_ratio(signals.speed, signals.speed_theoretical)),
         "displacement_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),

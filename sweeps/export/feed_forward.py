@@ -15,7 +15,7 @@ from calibration.data import Columns, Json, Names
 from calibration.data.writing import table_text
 from mmrjax import __version__
 from mmrjax.errors import printable
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 from sweeps.export import jax_actuator, mujoco
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, ComparisonRuns, EffectFate
 from sweeps.export.joint import DriveJoint

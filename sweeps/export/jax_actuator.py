@@ -15,7 +15,7 @@ import numpy as np
 
 from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 from sweeps.export.comparison import DROPPED, HELD, ComparisonRuns, EffectFate
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source

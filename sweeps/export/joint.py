@@ -15,10 +15,10 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.effects import Effect
 from mmrjax.model import balances, contact, params
 from mmrjax.model.channels import EVERY
-from mmrjax.model.controller import Controller
+from mmrjax.model.driver import Controller
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.one_sided import value_and_slope
+from mmrjax.numerics.elementary import value_and_slope
 from sweeps.export.expressions import ZERO, Symbol, names_in, trace_function
 
 #: Balances of a joint. Terms in other balances belong to the load or to an instrument.

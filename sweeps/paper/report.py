@@ -51,7 +51,7 @@ def simulate_gear_runs(robot: Robot) -> Any:
     import jax
 
     from mmrjax.fidelities import track
-    from mmrjax.undercarriage.stability import largest_step
+    from mmrjax.undercarriage.modes import largest_step
 
     conditions = data.batch_conditions(robot, data.shown_configurations(robot), voltage=33.0)
     step = min(track.STEP, float(largest_step(robot, conditions).min()))

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data import Columns, Names
 from calibration.data.runs import Runs
@@ -90,6 +90,14 @@ class Observer(eqx.Module):
     def axes_of(cls, runs: Runs) -> Names:
         """Columns of a table with which its readings vary."""
         return (*runs.axes, *([cls.axis] if cls.axis else []))
+
+    @classmethod
+    def padded_rows(cls, rows: int) -> tuple[Int[np.ndarray, " padded"], Bool[np.ndarray, " padded"]]:
+        """Row indices, padded by repeating the first row, see `sizes_padded`. Also True for each without padding."""
+        sizes = cls.sizes_padded
+        size = next((s for s in sizes if s >= rows), rows + (-rows % sizes[-1] if sizes else 0))
+        index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
+        return index, np.arange(size) < rows
 
     @classmethod
     @abc.abstractmethod

@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.data import Columns, Names
-from calibration.data.columns import SUPPLY
-from calibration.data.courses import (
+from calibration.data.clock import (
     ConstantInterval,
     applied_drive,
     changing_columns,
@@ -32,6 +31,7 @@ from calibration.data.courses import (
     divide_run,
     intervals_by_run,
 )
+from calibration.data.columns import SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -68,8 +68,7 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from calibration.inference.weak_form import fit_weak_form
 from mmrjax import fidelities
-from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, Threads, compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import drive_rates, moving, state_of_unknowns
@@ -99,8 +98,8 @@ from mmrjax.model.quantities import GOALS
 from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.linear_equations import solve
-from mmrjax.numerics.one_sided import value_and_slope
 
 #: Most knots of a run's defect in time, and largest product of knots and steps of all runs (2 GB of working memory).
 KNOTS, KNOT_STEPS = 256, 1e7

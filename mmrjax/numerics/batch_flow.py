@@ -1,5 +1,6 @@
-"""A loop for batches whose members need very different numbers of turns: finished members are replaced by waiting
-ones.
+"""Branches and loops of batches whose members need different computations.
+
+A batch skips a branch that no member needs. A loop replaces finished members by waiting ones.
 """
 
 from __future__ import annotations
@@ -14,6 +15,28 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
 T = TypeVar("T")
+
+
+def compute_if_needed(needed: Bool[Array, ""], function: Callable[..., T], arguments: tuple, otherwise: T) -> T:
+    """Result of `function(*arguments)` if `needed`, otherwise `otherwise`.
+
+    Similar to `jax.lax.cond`, but `jax.vmap` turns that into computing both branches for every member of a batch.
+    This is a loop of at most one turn: a batch runs it if one member needs it.
+
+    Args:
+        function: pure function.
+        arguments: trees of arrays.
+        otherwise: alternative, with the shapes and types of the function's result.
+    """
+
+    def turn(state: tuple[Array, T]) -> tuple[Array, T]:
+        # Tied to the loop's state; otherwise the compiler would move the computation out of the loop.
+        _, ordered_arguments = jax.lax.optimization_barrier((state[0], arguments))
+        like = jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), function(*ordered_arguments), otherwise)
+        return jnp.zeros_like(state[0]), like
+
+    return jax.lax.while_loop(lambda state: state[0], turn, (needed, otherwise))[1]
+
 
 #: Number of members that are computed at a time: enough to fill vectors and caches, few enough that most are still
 #: running at the end.

@@ -1,0 +1,277 @@
+"""Stages of logs: the loop on their windows and on their linear readings, each confirmed by one simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace, candidate_space
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.log_simulation import refine_by_simulation, simulate_models
+from calibration.discovery.loop_input import LoopInput
+from calibration.discovery.loop_notes import MissedChannel
+from calibration.discovery.mechanism import excess_misfit, find_mechanism
+from calibration.discovery.outliers import Screening
+from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
+from calibration.discovery.settings import Settings, settings_for
+from calibration.discovery.verdict import LoopStages, VerdictNoise, missed_channels, unused_inputs
+from calibration.inference import observers, priors
+from calibration.inference.fit_notes import progress_remark
+from calibration.inference.noise import Noise
+from calibration.inference.observers.linear_rows import problem_of_readings
+from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.weak_form import fit_weak_form
+
+#: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
+LONG = 4000
+
+
+#: Difference of a delay from whole rows up to which a simulation begins at these [rows].
+NEAREST = 0.25
+
+
+#: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
+CHANCE = 3.0
+
+
+#: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
+RIVALS = 3
+
+
+def windows_of_log(given: LoopInput) -> LoopInput | None:
+    """The same input with the windows of a log as its table. None if the log does not show its states, or if its
+    longest run has fewer than `LONG` steps.
+
+    Windows use every row of a log, except for an angle alone. Simulations use fewer.
+    """
+    space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
+    observe: Any = space.bare.observe
+    if not observe.long or observe.times.shape[1] < LONG:
+        return None
+    bare = space.bare
+    motions = [c.settled for c in bare.channels if c.zero_at_rest]
+    # With every row of an angle alone, the class of EMPS is tentative, and a pendulum leaves twice its noise.
+    if given.runs.log is not None and (any(motions) or not motions):
+        sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
+        bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
+        observe = bare.observe
+    fit = fit_weak_form(bare, space.library.scored)
+    if fit is None:
+        return None
+
+    def columns(rows: np.ndarray) -> dict[str, np.ndarray]:
+        table = {name: x[rows] for name, x in runs.columns.items() if x.dtype.kind == "f"}
+        return {**table, "configuration": np.asarray(observe.of_rows.configuration)[rows]}
+
+    settings = given.settings
+    posed, rows = problem_of_windows(bare, fit, space.library.scored, columns, settings.width)
+    table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    noise = dataclasses.replace(given.noise, sd=sd[rows])
+    shares = settings_for(type(posed.observe), settings.replicates).shares
+    return dataclasses.replace(
+        given, runs=runs.where(rows), numbers=numbers[rows], noise=noise, equations=table, known=None,
+        settings=dataclasses.replace(settings, shares=shares),
+    )  # fmt: skip
+
+
+def readings_of_log(given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: bool) -> LoopInput:
+    """The same input with the readings of a log as linear equations about the simulated fit of its base.
+
+    Args:
+        screened, sds: simulated fit of the base, and its noise.
+        ranked: True if the effects have been ranked.
+    """
+    space, settings, measured = screened.base.space, given.settings, given.runs.measured()
+    weight = space.weight.copy()
+    weight[list(screened.outliers)] = np.isfinite(measured[list(screened.outliers)])
+    problem = space.with_noise(None, weight).bare
+    z = screened.base.candidate.z[: space.free]
+    posed = problem_of_readings(problem, z, space.library.scored, settings.width)
+    equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    apart = given.kept_apart("readings")
+
+    def keep(name: str, make: Callable[[], Any]) -> Any:
+        """Stores a stage apart, except a second ranking."""
+        return None if ranked and name == "ranking" else apart(name, make)
+
+    confirm = functools.partial(smallest_confirmed, space, settings)
+    return dataclasses.replace(
+        given, equations=equations, noise=sds.noise, known=None, keep=keep, confirm=confirm
+    )  # fmt: skip
+
+
+def confirm_readings(
+    given: LoopInput, readings: LoopInput, screened: Screening, sds: VerdictNoise, traced: LoopStages
+) -> LoopStages:
+    """Stages of a log's linear readings after the simulation of the model that they choose.
+
+    Args:
+        readings: input of these stages, see `readings_of_log`.
+        screened, sds: simulated fit of the base, and its noise.
+        traced: results of these stages.
+    """
+    settings = given.settings
+    if not traced.sds.factors:
+        traced = dataclasses.replace(
+            traced, sds=dataclasses.replace(traced.sds, factors=sds.factors, remarks=sds.remarks)
+        )
+    linear = traced.screened.base
+    space = screened.base.space.with_noise(traced.sds.noise.sd, linear.space.weight)
+    given.progress(progress_remark("confirm"))
+    best = _chosen_fit(traced)
+    space = space if traced.searched is None else space.with_room(traced.searched.room)
+    run = simulate_models(space, linear.candidate, best, settings, screened.base.candidate)
+    traced = dataclasses.replace(traced, run=run)
+    if traced.searched is None:
+        return traced
+    confirmed = traced.left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    if not confirmed.rejected and traced.screened.cluster is None:
+        left = dataclasses.replace(traced.left, test=confirmed)
+        none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
+        return LoopStages("none", traced.screened, left, traced.sds, run=none)
+    return _lower_if_contradicted(readings, traced)
+
+
+def smallest_confirmed(
+    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
+    noise: Noise,
+) -> SearchResult:  # fmt: skip
+    """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
+
+    The diagnosis is that of its simulation.
+
+    Readings are linear near the fit of the base only. A large effect therefore leaves residuals that another one
+    would explain.
+
+    Args:
+        space: space of the simulated log. If it has room for effects, only sets of these are simulated.
+        screened, left, searched: linear fit of the base, its diagnosis, and the search from it.
+        noise: noise of the readings.
+    """
+    best = searched.best
+    if best is None or searched.diagnosis is None:
+        return searched
+    if len(best.effects) == 1 and not searched.diagnosis.test.rejected_with_margin:
+        return searched
+    alone = sorted((c for c in searched.ladder if len(c.effects) == 1 and c.plausible), key=lambda c: c.cost)
+    sizes = [alone[:RIVALS], *([c] for c in best_of_each_size(searched) if len(c.effects) > 1)]
+    sizes = [[c for c in sets if _has_room(space, c)] for sets in sizes]
+    space = space.with_noise(noise.sd, screened.base.space.weight)
+    space = space.with_room([*space.room, *(name for sets in sizes for c in sets for name in c.effects)])
+    for sets in filter(None, sizes):
+        fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
+        k = min(range(len(fits)), key=lambda k: fits[k].cost)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings, left.linear)
+        searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
+        if not diagnosis.test.rejected_with_margin:
+            break
+    return searched
+
+
+def _has_room(space: CandidateSpace, fit: Candidate) -> bool:
+    """True if the program of a log's simulations has room for a set of effects, or has not been determined."""
+    return not space.room or {*fit.effects} <= {*space.room}
+
+
+def best_simulated_size(
+    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
+    noise: Noise,
+) -> SearchResult:  # fmt: skip
+    """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
+
+    Windows of many rows have the power for a second effect, whose simulation may leave more than that of the first.
+
+    Args: as for `smallest_confirmed`, of the windows. The noise of the simulated log is that of `space`.
+    """
+    sets = [c for c in best_of_each_size(searched) if _has_room(space, c)]
+    space = space.with_room([*space.room, *(name for c in sets for name in c.effects)])
+    searched = dataclasses.replace(searched, room=space.room)
+    if len(sets) < 2:
+        return searched
+    costs = [refine_by_simulation(space, c, [c.z], settings).cost for c in sets]
+    best = sets[int(np.argmin(costs))]
+    if best is searched.best:
+        return searched
+    diagnosis = diagnose_candidate(screened.base.space, best, screened.bases, left.test.null, settings)
+    return dataclasses.replace(searched, best=best, diagnosis=diagnosis)
+
+
+def _chosen_fit(traced: LoopStages) -> Candidate:
+    """Fit of the verdict: the proposal, or else the best set of its mechanism."""
+    base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
+    if searched is None or traced.best is not base:
+        return traced.best
+    named = frozenset(() if mechanism is None else mechanism.effects)
+    return min(searched.ladder, key=lambda c: (c.key != named, not c.plausible, c.cost))
+
+
+def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
+    """The fit of a log's windows with a delay of whole rows, if that is near.
+
+    A held quantity jumps at its rows. So a fast current jumps too as a function of the delay, and steps from one side
+    do not lead to the other.
+    """
+    coordinates, steps = given.space.coordinates.base, np.diff(given.runs.whole["time_s"])
+    if priors.DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
+        return fit
+    k, step = coordinates.names.index(priors.DELAY), float(np.median(steps[steps > 0]))
+    delay = float(coordinates.value(fit.z[: given.space.free])[k])
+    off = round(delay / step) * step - delay
+    if abs(off) > NEAREST * step:
+        return fit
+    return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
+
+
+def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
+    """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
+    run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
+    if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
+        return traced
+    if traced.verdict == "mechanism" and traced.mechanism is not None:  # a curve is not simulated
+        return dataclasses.replace(traced, verdict="place") if traced.mechanism.effects else traced
+    mechanism = find_mechanism(
+        screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
+        traced.predicted, windows.settings,
+    )  # fmt: skip
+    level = "place" if mechanism is None or mechanism.fails else "mechanism"
+    return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
+
+
+def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
+    """Stages of a log's windows after the simulation of the base model and of the chosen one.
+
+    None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
+    gain no more than chance there. If they gain less than half of what the windows promised, the claim falls by one
+    level. No effect is named if the simulation misses a channel.
+    """
+    screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
+
+    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
+        return LoopStages("undescribed", screened, left, traced.sds, searched, beside=beside, run=traced.run,
+                          predicted=traced.predicted, missed=missed, unused=unused_inputs(given.runs))  # fmt: skip
+
+    if given.known is not None:  # only the noise differs
+        if given.known.verdict == "undescribed":
+            return undescribed(given.known.missed)
+        refuted = given.known.run is not None and given.known.run.contradicts
+        return dataclasses.replace(traced, verdict="place") if refuted and traced.verdict != "none" else traced
+    if searched is None or beside is None:
+        return None
+    given.progress(progress_remark("confirm"))
+    chosen, base = _chosen_fit(traced), delayed_by_rows(given, screened.base.candidate)
+    best = base if chosen is screened.base.candidate else delayed_by_rows(given, chosen)
+    run = simulate_models(given.space.with_room(searched.room), base, best, given.settings, disturbed=True)
+    confirmed = left.test.confirmed(max(0.0, 2 * (run.base.cost - run.best.cost)))
+    noise = CHANCE * math.sqrt(2 * float(np.sum(run.space.weight > 0)))
+    if not confirmed.rejected or (not run.disturbed and excess_misfit(run.space, run.base) < noise):
+        return None
+    traced = dataclasses.replace(traced, run=run)
+    linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
+    refit, fit = (missed_channels(run.space, given.runs, given.noise, x) for x in linear)
+    return undescribed(refit) if fit else _lower_if_contradicted(windows, traced)

@@ -1,0 +1,273 @@
+"""Input of the loop: runs without copies, robot, noise, priors and settings, and the candidate space of runs."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from calibration.data import Names, Priors, inferred_facts
+from calibration.data.columns import ROWS, SIDES, WHEN
+from calibration.data.effect_file import Library
+from calibration.data.input_errors import BadData
+from calibration.data.runs import Runs
+from calibration.described import describe
+from calibration.discovery import menu, scales
+from calibration.discovery.active_set import CandidateSpace, candidate_space
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import BaseFit
+from calibration.discovery.outliers import Screening
+from calibration.discovery.result import EffectRanking
+from calibration.discovery.search import SearchResult
+from calibration.discovery.settings import FIT, Settings, settings_for
+from calibration.discovery.verdict import LoopStages
+from calibration.inference import observers, preparation, priors
+from calibration.inference.fit_notes import Notes, Remark, remarks_with_codes
+from calibration.inference.noise import Noise
+from calibration.inference.population import StoreStage, compute_without_storing
+from calibration.inference.shown_states import MissingStates, state_plan_or_reason
+from mmrjax import effects, fidelities
+from mmrjax.effects import Effect
+from mmrjax.errors import count_noun
+from mmrjax.model import channels
+from mmrjax.model.robot import Robot
+
+#: Callback for progress notes.
+Tell = Callable[[Remark | str], None]
+
+
+#: Share of the largest speed or voltage above which a value is not noise about rest [-].
+EITHER_WAY = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopInput:
+    """Input of the stages of the loop: runs, robot, settings and callbacks.
+
+    Attributes:
+        runs: runs without exact copies.
+        numbers: row numbers as used in messages.
+        robot: robot from `preparation.prepare_input`.
+        noise: noise of the readings.
+        stated: priors (mean, sd) that replace those of the fields [SI].
+        settings: statistical settings.
+        library: effects to test.
+        notes: remarks on the input.
+        at_first: remarks to report before the first fit.
+        progress: callback for progress messages.
+        keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
+        known: results for the same table with other sds.
+        settled: function that returns the input of settled runs that replace a log, None if these are too few.
+        equations: candidate space of the windows or the linear readings of a log, whose rows are equations.
+        confirm: function that chooses from the sets of a search in such equations by their simulation.
+        others: open while later programs are compiled on other cores. None if there is nothing to compile.
+        later: functions that begin to compile these programs from the fit of the base.
+        ranked: not empty once the library is ranked.
+    """
+
+    runs: Runs
+    numbers: np.ndarray
+    robot: Robot
+    noise: Noise
+    stated: Priors
+    settings: Settings
+    library: Library
+    notes: Notes = ()
+    at_first: Notes = ()
+    progress: Tell = lambda note: None
+    keep: StoreStage = compute_without_storing
+    known: LoopStages | None = None
+    others: contextlib.ExitStack | None = None
+    equations: CandidateSpace | None = None
+    confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
+    settled: Callable[[], LoopInput | None] = lambda: None
+    later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
+    ranked: list[EffectRanking] = dataclasses.field(default_factory=list)
+
+    def kept_apart(self, word: str) -> StoreStage:
+        """Storage of stages apart from those of the log over time. Only the ranking has the same name."""
+        return lambda name, make: self.keep(name if name == "ranking" else f"{word} {name}", make)
+
+    @property
+    def known_room(self) -> Names:
+        """Effects in the simulation program of the known results. Another program takes half a minute to compile."""
+        return () if self.known is None or self.known.searched is None else self.known.searched.room
+
+    @functools.cached_property
+    def space(self) -> CandidateSpace:
+        """Candidate space of the runs."""
+        return build_candidate_space(self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library)
+
+    @property
+    def shows_unmodelled_backlash(self) -> bool:
+        """True if the log shows backlash but the robot has none."""
+        return bool(remarks_with_codes(self.at_first, "lost_motion"))
+
+
+def prepare_loop(
+    runs: Runs,
+    robot: Robot,
+    *,
+    noise: str | None = None,
+    stated: Priors | None = None,
+    library: Library = effects.BY_NAME,
+    replicates: int = 500,
+    seed: int = 0,
+    prefer: str = FIT,
+    forbidden: Sequence[str] = (),
+    rows: int = ROWS,
+    settled: Notes = (),
+) -> LoopInput:
+    """Prepares the input of the stages from the arguments of `discover`, and raises its errors.
+
+    A campaign that needs only verdicts continues with `discover.trace_verdict`, as the command does.
+    `settled`: remark on settled runs that replace a log.
+    """
+    menu.check_forbidden(forbidden, robot)
+    runs, of_sides = preparation.rows_to_fit(runs, robot, rows)
+    distinct, numbers, notes = remove_copies(runs)
+    kind = observers.observer_kind(distinct)
+    if len(distinct) < kind.fewest:
+        raise BadData(
+            f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
+            f"{kind.fewest} are needed"
+        )
+    ready = preparation.prepare_input(distinct, robot, noise, stated, settled=(*settled, *of_sides))
+    for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
+        if note.code == "nothing_varies" or not note.tied:
+            raise BadData(describe(note))
+    unshown = missing_states_remarks(distinct, ready.robot)
+    at_first = (*ready.foreign, *ready.doubted, *unshown, *remarks_with_codes(ready.checked, "lost_motion"))
+    notes_so_far: Notes = (
+        *notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted, *unshown
+    )  # fmt: skip
+    output_turn = scales.output_rotation(distinct, ready.robot)
+    channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
+    library = {**library, **kind.library, **channel_effects}
+    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, output_turn)
+    settings = dataclasses.replace(
+        settings_for(kind, replicates, seed, prefer),
+        forbidden=tuple(forbidden),
+        silent=tuple(c.name for c in ready.noise.silent),
+    )
+    return LoopInput(
+        distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, notes_so_far, at_first
+    )
+
+
+def settled_input(given: LoopInput, prepare: Callable[..., LoopInput]) -> LoopInput | None:
+    """Input of the settled runs of a log that no fit describes. None if these are too few.
+
+    Args:
+        prepare: `prepare_loop` with the options of the loop.
+    """
+    try:
+        runs, remarks = preparation.settled_rows(given.runs.whole, given.robot, "unfitted")
+    except BadData:
+        return None
+    return prepare(runs, settled=remarks)
+
+
+def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
+    """Remark on a log that does not show the states of its equations."""
+    read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
+    plan = state_plan_or_reason(robot, read) if read else None
+    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
+
+
+def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
+    """Runs without exact copies, their row numbers, and remarks on the copies.
+
+    Equal rows may be repeated measurements, for instance from a coarse display. They count as copies only if the
+    whole table consists of the same sequence of rows, repeated.
+    """
+    columns = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
+    seen_columns: set[Names] = set()
+    keep: list[int] = []
+    copies: list[int] = []
+    if runs.sampled or {"run_id", *WHEN} & set(runs.headings):
+        for k in range(len(runs)):
+            row = tuple(str(column[k]) for column in columns)
+            (copies if row in seen_columns else keep).append(k)
+            seen_columns.add(row)
+    else:
+        rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
+        # rows after which the table repeats itself exactly, or all of its rows
+        first_rows = next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
+        keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
+    if not copies:
+        return runs, np.arange(1, len(runs) + 1), []
+    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
+
+
+def build_candidate_space(
+    runs: Runs,
+    robot: Robot,
+    sd: np.ndarray,
+    settings: Settings,
+    stated: Priors | None = None,
+    library: Library = effects.BY_NAME,
+) -> CandidateSpace:
+    """Base problem of a table, with slots for the effects that its data can reveal.
+
+    Tables are padded with rows of weight 0 to one of a few sizes, so that tables of similar size share compiled
+    programs. A mass in the table replaces the robot's mass. Ground friction without a stated prior gets a wide one
+    for any surface, because the prior of a wrong surface would bias parameters that depend on slip.
+    """
+    robot = inferred_facts.with_table_mass(robot, runs)
+    kind = observers.observer_kind(runs)
+    index, real = kind.padded_rows(len(runs))
+    idle = (
+        *(() if kind.axis else priors.OVER_TIME),
+        *(f"{n}.mass" for n in inferred_facts.stated_masses(robot, runs)),
+    )
+    names = priors.loop_parameter_names(robot, runs.configurations_named(robot), *kind.free(), idle)
+    unread = fidelities.unread_parameters("drive" if kind.axis else "steady", names, runs.turns)
+    names = tuple(n for n in names if n not in unread)
+    coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
+    bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
+    visible = visible_effects(library, robot, kind, goes_both_ways(runs), has_partial_duty(runs))
+    space = candidate_space(bare, visible, library, settings.slots, settings.width)
+    return space.without(~real)
+
+
+def visible_effects(
+    library: Library,
+    robot: Robot,
+    kind: type[observers.Observer],
+    either_way: bool = True,
+    at_duties: bool = False,
+) -> tuple[Effect, ...]:
+    """Effects of a library that this kind of data can reveal and that the robot does not have yet.
+
+    Args:
+        either_way: True if there are forward and backward runs, see `goes_both_ways`.
+        at_duties: True if some runs have a duty below 1, see `has_partial_duty`.
+    """
+    have = {e.name for e in robot.effects}
+    return tuple(
+        effect()
+        for name, effect in library.items()
+        if name not in have
+        and kind.shows(effect)
+        and scales.effect_applies(effect, robot)
+        and (either_way or not effect.needs_reverse)
+        and (at_duties or not effect.needs_duty)
+    )
+
+
+def has_partial_duty(runs: Runs) -> bool:
+    """True if some runs have a duty below 1, so that the supply is pulsed."""
+    duties = [runs[name] for name in ("duty", *SIDES) if runs.has(name)]
+    return any((np.abs(x) < 1).any() for x in duties)
+
+
+def goes_both_ways(runs: Runs) -> bool:
+    """True if there are forward and backward runs, according to a measured speed or the command."""
+    motion_columns = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
+    columns = [runs[name] for name in (*motion_columns, runs.layout.imposed_column, "duty") if runs.has(name)]
+    finite_columns = [x[np.isfinite(x)] for x in columns]
+    return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in finite_columns if x.size)

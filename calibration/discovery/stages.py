@@ -1,0 +1,270 @@
+"""Stages of the loop: from the fit of the base to the claim, see `discover.STAGES`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from calibration.discovery import classes, findings, outliers, preference, search, verdict
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.assembly import residuals_by_channel
+from calibration.discovery.candidates import BaseFit, Candidate, fit_base
+from calibration.discovery.classes import Classes
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
+from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
+from calibration.discovery.loop_input import LoopInput
+from calibration.discovery.loop_notes import Mechanism, MissedChannel, NameSupport
+from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
+from calibration.discovery.outliers import Screening
+from calibration.discovery.prediction import HeldOutAlternative, Predicted
+from calibration.discovery.search import SearchResult, screen_by_weak_form
+from calibration.discovery.settings import HELD_OUT
+from calibration.discovery.verdict import LoopStages, VerdictNoise
+from calibration.inference.fit_notes import progress_remark
+from calibration.inference.noise import Noise
+from calibration.inference.noise_factor import common_factors, noise_remarks
+
+#: Number of times that rows are screened for isolated outliers, with the effects found.
+SCREENINGS = 4
+
+
+#: Root of a score from which an effect is probably missing, before the bootstrap's result [σ].
+LIKELY = 4.0
+
+
+def fit_base_and_noise(given: LoopInput, begin: Candidate | None) -> tuple[Screening, VerdictNoise]:
+    """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
+    known_stages, noise = given.known, given.noise
+    screened = _fit_base(given, noise, None if known_stages is None else known_stages.screened.base, begin)
+    base, free = screened.base, screened.base.space.free
+    residuals = residuals_by_channel(
+        base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free]
+    )
+    skip = screened.cluster is not None or not base.space.bare.observe.reads
+    factors = {} if skip else common_factors(residuals)
+    sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
+    if factors:
+        given.progress(progress_remark("sds"))
+        sds = dataclasses.replace(sds, noise=noise.scaled(factors))
+        screened = _fit_base(given, sds.noise, screened.base, begin)
+    return screened, sds
+
+
+def _fit_base(given: LoopInput, noise: Noise, before: BaseFit | None, begin: Candidate | None) -> Screening:
+    """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
+
+    For logs, the equations in weak form give the start of the fit, and rank the library unless effects would only
+    stand in for a backlash.
+    """
+    settings, same = given.settings, noise is given.noise
+    space = given.equations or (given if same else dataclasses.replace(given, noise=noise)).space
+    near = None if before is None else before.candidate
+    if before is None:
+        if begin is not None:  # as near as a simulated fit, and its effects are ranked
+            near = dataclasses.replace(begin, simulated=True)
+        elif (ranking := screen_by_weak_form(space, settings)) is not None:
+            make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, settings)
+            if not given.shows_unmodelled_backlash:
+                given.ranked.append(given.keep("ranking", make))
+            near = None if ranking.slides else ranking.base
+        if given.others is not None:
+            given.later.append(given.others.enter_context(outliers.compile_ahead(space, given.runs, settings)))
+    if given.equations is None or not space.bare.observe.reads:  # linear readings have a fit
+        given.progress(progress_remark("base"))
+    return outliers.screen_outliers(fit_base(space, settings, given.runs.source, near), given.runs, settings)
+
+
+def search_until_clean(
+    given: LoopInput, screened: Screening, sds: VerdictNoise
+) -> tuple[Screening, Diagnosis, SearchResult | None]:
+    """Searches for effects, again whenever new outliers appear. No search if the base fits, or if the log shows
+    backlash that the robot lacks.
+    """
+    settings, keep, progress = given.settings, given.keep, given.progress
+    for k in range(SCREENINGS):
+        progress(progress_remark("bootstrap", settings.replicates))
+        screened, diagnosis = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
+        if k == 0 and not given.ranked and not given.shows_unmodelled_backlash:
+            keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis, settings))
+        if given.shows_unmodelled_backlash or (not diagnosis.test.rejected and screened.cluster is None):
+            return screened, diagnosis, None  # effects of the library would only stand in for a backlash
+        progress(progress_remark("effects"))
+        screened, diagnosis, searched = keep(
+            f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
+        )
+        after = searched.diagnosis
+        if after is None or not after.test.rejected_with_margin:
+            break
+        more = outliers.screen_with_effects(screened, after.scores, given.runs, settings)
+        if more is None:
+            break
+        progress(progress_remark("alone"))
+        screened = more
+    return screened, diagnosis, searched
+
+
+def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tuple[Screening, Diagnosis]:
+    """Tests the base fit by bootstrap."""
+    known_stages, weight = given.known, screened.base.space.weight
+    null = (
+        None
+        if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
+        else known_stages.left.test.null
+    )
+    if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
+        for begin in given.later:
+            begin(screened.base)
+    return screened, outliers.diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
+
+
+def _search_effects(
+    given: LoopInput, screened: Screening, left: Diagnosis
+) -> tuple[Screening, Diagnosis, SearchResult]:
+    """Searches for effects that explain the residuals of the base fit."""
+    base = screened.base
+    searched = search.search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
+    return screened, left, searched
+
+
+def end_without_search(
+    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult | None
+) -> LoopStages | None:
+    """Verdict on a base without a search for effects: nothing is missing, or the model does not describe the runs."""
+    if searched is not None:
+        return None
+    missed = verdict.missed_channels(screened.base.space, given.runs, sds.noise, left.linear)
+    # A rigid base that leaves only noise refutes a backlash.
+    loose = given.shows_unmodelled_backlash and left.test.rejected
+    word = "undescribed" if missed or loose else "none"
+    return LoopStages(word, screened, left, sds, missed=missed, unused=verdict.unused_inputs(given.runs))
+
+
+def confirm_search(
+    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult
+) -> SearchResult:
+    """The search with the set of effects that a simulation confirms, for equations of a log."""
+    return searched if given.confirm is None else given.confirm(screened, left, searched, sds.noise)
+
+
+def choose_effects(
+    given: LoopInput, screened: Screening, left: Diagnosis, searched: SearchResult
+) -> tuple[BaseCurve, Predicted, tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
+    """Curve of the base's discrepancy, and the effects to add, see `preference.choose_effects`."""
+    beside, predicted = BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases), Predicted()
+    chosen = preference.choose_effects(
+        given.runs, screened, left, searched, given.settings, given.progress, beside, predicted
+    )
+    return beside, predicted, *chosen
+
+
+def check_described(
+    given: LoopInput,
+    screened: Screening,
+    left: Diagnosis,
+    sds: VerdictNoise,
+    searched: SearchResult,
+    chosen: tuple[Candidate, Diagnosis] | None,
+    beside: BaseCurve,
+    predicted: Predicted,
+) -> tuple[MissedChannel, ...] | LoopStages:
+    """Channels that the refit misses but effects describe. Ends the loop if no set of effects describes the runs."""
+    runs, space = given.runs, screened.base.space
+    missed = verdict.missed_channels(space, runs, sds.noise, left.linear)
+    if not missed:
+        return ()
+    given.progress(progress_remark("held out"))
+    refit = cached_hold_out_score(space, runs, screened.base.candidate, predicted)
+    sets = (chosen[0] if chosen else None, searched.best, *search.best_of_each_size(searched))
+    for fit in {c.key: c for c in sets if c}.values():
+        with_effects = cached_hold_out_score(space, runs, fit, predicted)
+        if leaves := verdict.remaining_errors(space, runs, missed, refit, with_effects):
+            return leaves
+    unused = verdict.unused_inputs(runs)
+    return LoopStages(
+        "undescribed", screened, left, sds, searched, beside=beside, predicted=predicted, missed=missed, unused=unused
+    )
+
+
+def trace_mechanism(
+    given: LoopInput,
+    screened: Screening,
+    left: Diagnosis,
+    searched: SearchResult,
+    chosen: tuple[Candidate, Diagnosis] | None,
+    standing: NameSupport,
+    beside: BaseCurve,
+    predicted: Predicted,
+) -> Mechanism | None:
+    """Equation and driving variable of the discrepancy, with ammeter errors that explain the data as well. None if
+    the name of an effect is established.
+    """
+    if chosen is not None and any(map(standing.established, chosen[0].effects)):
+        return None
+    given.progress(progress_remark("mechanism"))
+    space, linear, settings = screened.base.space, left.linear, given.settings
+    ladder = [*searched.ladder, *([] if chosen is None else chosen[:1])]
+    found = find_mechanism(
+        space, given.runs, screened.base.candidate, left, ladder, screened.bases, beside, predicted, settings
+    )
+    if found is None:
+        return None
+    columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
+    columns = columns if found.effects else location_columns(linear, screened.bases, _location(given, beside))
+    fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    also = classes.ammeter_families(space, *fit, columns, found.families[0], settings)
+    families = tuple(dict.fromkeys((*found.families, *also)))
+    return dataclasses.replace(found, families=families, ammeter=classes.errors_of_ammeters(space, families))
+
+
+def _location(given: LoopInput, beside: BaseCurve) -> DiscrepancyLocation:
+    return dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))
+
+
+def find_alternatives(
+    given: LoopInput,
+    screened: Screening,
+    left: Diagnosis,
+    searched: SearchResult,
+    chosen: tuple[Candidate, Diagnosis] | None,
+) -> tuple[SearchResult, Classes | None]:
+    """The search with the chosen effects, and the alternatives to each of them. None without effects."""
+    if chosen is None:
+        return searched, None
+    searched, base = dataclasses.replace(searched, best=chosen[0], diagnosis=chosen[1]), screened.base
+    given.progress(progress_remark("alike", chosen[0].effects))
+    alike = classes.find_classes(
+        base.space, base.candidate, chosen[0], searched.ladder, left, chosen[1], given.settings
+    )
+    return searched, alike
+
+
+def reach_verdict(
+    given: LoopInput,
+    screened: Screening,
+    searched: SearchResult,
+    alike: Classes | None,
+    standing: NameSupport,
+    beside: BaseCurve,
+    mechanism: Mechanism | None,
+) -> tuple[
+    str, SearchResult, Classes | None, NameSupport, DiscrepancyLocation | None, tuple[HeldOutAlternative, ...]
+]:
+    """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects."""
+    best, after, space, settings = searched.best, searched.diagnosis, screened.base.space, given.settings
+    named = [] if alike is None or best is None else [standing.established(e) for e in best.effects]
+    if alike is None or best is None or after is None or not any(named):
+        level = "place" if mechanism is None or mechanism.fails else "mechanism"
+        return level, searched, alike, standing, _location(given, beside), ()
+    compared: tuple[HeldOutAlternative, ...] = ()
+    if settings.prefer == HELD_OUT:
+        given.progress(progress_remark("held out"))
+        searched, alike, compared = preference.prefer_by_held_out(
+            space, given.runs, searched, alike, screened.bases, settings
+        )
+        after = searched.diagnosis or after
+        standing = standing.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
+    alone = all(one for one, name in zip(alike.alone, named, strict=True) if name)
+    remains = locate_discrepancy(after, screened.bases, space.included) if after.test.rejected_with_margin else None
+    return "named" if alone else "class", searched, alike, standing, remains, compared

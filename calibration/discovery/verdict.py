@@ -1,0 +1,351 @@
+"""Results of the loop up to the verdict, and what this verdict claims."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from calibration.data import Names
+from calibration.data.runs import Runs
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.classes import Classes
+from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.log_simulation import LogSimulation
+from calibration.discovery.loop_notes import (
+    AlternativeValue,
+    Headline,
+    Mechanism,
+    MissedChannel,
+    MissingEffect,
+    NameSupport,
+    VerdictSummary,
+)
+from calibration.discovery.outliers import Screening
+from calibration.discovery.prediction import HeldOutAlternative, HeldOutScore, Predicted
+from calibration.discovery.search import SearchResult
+from calibration.discovery.settings import WITHOUT_NAME
+from calibration.inference import checks as unused_room
+from calibration.inference.fit_notes import Remark
+from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
+from calibration.inference.linearization import Linearization
+from calibration.inference.noise import UNSTATED, Noise
+
+#: Share of excluded rows above which the summary begins with it.
+MANY = 0.03
+
+
+#: Distance from the prior above which a note reports a base parameter [prior sd].
+FAR = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class VerdictNoise:
+    """Noise behind a verdict.
+
+    Attributes:
+        noise: noise of the readings.
+        factors: factors on the given sds by channel, empty if they are unchanged.
+        remarks: notes on the noise.
+    """
+
+    noise: Noise
+    factors: dict[str, float] = dataclasses.field(default_factory=dict)
+    remarks: tuple[Remark, ...] = ()
+
+
+#: Result of a stage that has not run yet.
+PENDING: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopStages:
+    """Results of the stages of the loop, in the order of `discover.STAGES`.
+
+    Attributes:
+        verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`. Empty before the last stage.
+        screened: base fit without outliers.
+        left: diagnosis of the base fit.
+        sds: noise behind the verdict.
+        searched: result of the search for effects.
+        alike: alternatives to the effects found, if effects are named.
+        where: location of the discrepancy, or of the rest that the effects leave.
+        standing: tests of the effects' names.
+        held_out: alternatives ordered by hold-out error, if these errors chose the leading effect.
+        beside: smooth curve of the discrepancy of the base, if there is one.
+        predicted: hold-out predictions of fits, as from `prediction.smallest_predictive_set`.
+        mechanism: equation and driving variable, if no effect is established. They need not be established either.
+        missed: channels that the refit does not describe. For other verdicts than `undescribed`, with the error that
+            remains after adding effects.
+        unused: numeric columns that vary and have no role.
+        run: simulation of a log, whose verdict comes from its equations.
+        settled: True if settled runs replace a log.
+        begin: start of a log's simulated fit: the fit of the base to its windows.
+        chosen: fit of the effects to add and its diagnosis, None for no effects.
+    """
+
+    verdict: str = ""
+    screened: Screening = PENDING
+    left: Diagnosis = PENDING
+    sds: VerdictNoise = PENDING
+    searched: SearchResult | None = None
+    alike: Classes | None = None
+    where: DiscrepancyLocation | None = None
+    standing: NameSupport | None = None
+    held_out: tuple[HeldOutAlternative, ...] = ()
+    beside: BaseCurve | None = None
+    predicted: Predicted = dataclasses.field(default_factory=dict)
+    mechanism: Mechanism | None = None
+    missed: tuple[MissedChannel, ...] = ()
+    unused: Names = ()
+    run: LogSimulation | None = None
+    settled: bool = False
+    begin: Candidate | None = None
+    chosen: tuple[Candidate, Diagnosis] | None = None
+
+    @property
+    def members(self) -> tuple[Names, ...]:
+        """For each established effect, the effect and those that the data cannot separate from it."""
+        return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
+
+    @property
+    def _classes(self) -> tuple[Names, ...]:
+        return () if self.alike is None else self.alike.members
+
+    @property
+    def _named(self) -> list[bool]:
+        return [self.standing is None or self.standing.established(m[0]) for m in self._classes]
+
+    @property
+    def families(self) -> Names:
+        """Families of the members of each established class, or of the location of a discrepancy without a name."""
+        if self.alike is not None and self.verdict not in WITHOUT_NAME:
+            return tuple(
+                f for members, name in zip(self.alike.families, self._named, strict=True) if name for f in members
+            )
+        if self.verdict == "mechanism" and self.mechanism is not None:
+            return self.mechanism.families
+        return () if self.where is None else (self.where.family,)
+
+    @property
+    def best(self) -> Candidate:
+        """Proposed candidate: the base fit if no effect is named."""
+        if self.alike is None or self.searched is None or self.searched.best is None:
+            return self.screened.base.candidate
+        return self.searched.best
+
+    @property
+    def ends(self) -> Diagnosis:
+        """Diagnosis of the proposed candidate."""
+        if self.alike is None or self.searched is None or self.searched.diagnosis is None:
+            return self.left
+        return self.searched.diagnosis
+
+
+def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
+    """Data of the statement of a verdict. `numbers`: row numbers as used in messages."""
+    space, alike = traced.screened.base.space, traced.alike
+    support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
+    best = None if traced.searched is None else traced.searched.best
+    base = traced.screened.base.candidate
+    aside, counting = len(traced.screened.outliers), int(space.included.sum())
+    many = aside > MANY * (aside + counting)
+    return VerdictSummary(
+        traced.verdict,
+        traced.left.test.p_value,
+        traced.where,
+        missing=() if alike is None else missing_effects(space, alike, support),
+        nearest=best.effects if traced.verdict in WITHOUT_NAME and best is not None else (),
+        support=support,
+        aside=aside if many else 0,
+        of=aside + counting,
+        noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
+        cluster=traced.screened.cluster,
+        mechanism=traced.mechanism,
+        missed=traced.missed,
+        unused=traced.unused,
+        far=tuple(n for n, z in zip(space.coordinates.base.names, base.z[: space.free], strict=True) if abs(z) > FAR),
+    )
+
+
+def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[MissingEffect, ...]:
+    """Effects that the search added to the model, each with its alternatives and whether it is established."""
+    c, p = space.coordinates.base, space.free
+    return tuple(
+        MissingEffect(
+            names,
+            tuple(
+                AlternativeValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index])
+                for s in shifts
+            ),
+            families,
+            support is None or support.established(names[0]),
+            None if support is None else support.test_of(names[0]),
+        )
+        for names, shifts, families in zip(alike.members, alike.stated, alike.families, strict=True)
+    )
+
+
+def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
+    """The most detailed claims that the verdicts at all noise levels share.
+
+    Args:
+        others: factor on the noise, and verdict, of each other noise level.
+    """
+    sentences = [said, *(summary for _, summary in others)]
+    factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
+    if len({_verdict_without_claim(s) for s in sentences}) > 1:
+        return Headline("open", (), factors)
+    if _verdict_without_claim(said):
+        return Headline(said.verdict, (), factors)
+    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in sentences])
+    if laws:
+        alone = all(len(names) == 1 for names in laws) and not any(
+            m.values or len(m.families) > len(m.names) for s in sentences for m in s.missing
+        )
+        effects_of_laws = [
+            next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
+        ]
+        families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
+        return Headline("named" if alone else "class", laws, factors, (), families, values)
+    mechanisms, shared = _shared_claims([_claimed_families(s) for s in sentences])
+    if mechanisms:
+        return Headline("mechanism", mechanisms, factors, shared)
+    places, shared = _shared_claims([_claimed_equations(s) for s in sentences])
+    return Headline("place", places, factors, shared)
+
+
+def _verdict_without_claim(said: VerdictSummary) -> str:
+    """Verdict if it claims no missing effect (`none` or `undescribed`), otherwise empty."""
+    return said.verdict if said.verdict in ("none", "undescribed") else ""
+
+
+def _claimed_families(said: VerdictSummary) -> list[Names]:
+    """Families of each established law or mechanism."""
+    families = [m.families for m in said.missing if m.established]
+    return (
+        [*families, said.mechanism.families]
+        if said.verdict == "mechanism" and said.mechanism is not None
+        else families
+    )
+
+
+def _claimed_equations(said: VerdictSummary) -> list[Names]:
+    """Equations with a discrepancy, in words, without their variable."""
+    families = _claimed_families(said)
+    if said.verdict in WITHOUT_NAME and said.where is not None:
+        families.append((said.where.family,))
+    return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
+
+
+def _shared_claims(
+    claims: Sequence[Sequence[Names]],
+) -> tuple[tuple[Names, ...], tuple[int, ...]]:
+    """Claims of the first verdict that every other verdict shares at least in part.
+
+    Members that all verdicts share come first, then those that some noise levels cannot separate from them. A claim
+    that is part of another is omitted. The second result is the number of agreed members of each claim.
+    """
+    counts: dict[Names, int] = {}
+    for claim in claims[0]:
+        alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
+        if all(alike):
+            effect_names = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
+            shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
+            ordered_names = (*shared, *(n for n in effect_names if n not in shared))
+            if not any(set(ordered_names) <= set(other) for other in counts):
+                counts[ordered_names] = len(shared)
+    largest_claims = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
+    return tuple(largest_claims), tuple(largest_claims.values())
+
+
+#: Least share of the refit's error on unseen runs that effects have to remove where the refit misses a channel.
+REMOVED = 0.5
+
+
+def missed_channels(
+    space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization
+) -> tuple[MissedChannel, ...]:
+    """Channels with a refit error above `UNDESCRIBED` of their measured rms, or with an estimated noise above it.
+
+    If the stated noise of a channel is that large, residuals up to `EXPLAINED` times the noise are accepted.
+
+    Args:
+        refit: linearization of the fit without effects.
+    """
+    if not space.bare.observe.reads:
+        return ()
+    has_stated_sd = np.array([source not in UNSTATED for source in noise.source])
+    share, sigma = _error_shares(space, runs, noise, refit)
+    large = (share > UNDESCRIBED) & ~(has_stated_sd & (sigma <= EXPLAINED))
+    counts = space.weight[: len(runs)] > 0
+    measured_values = np.where(counts, runs.measured(), np.nan)
+    with np.errstate(invalid="ignore"):
+        noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured_values**2, 0))
+    noisy = np.where(has_stated_sd, 0.0, noisy)
+    return tuple(
+        MissedChannel(c.name, float(share[k]), float(noisy[k]))
+        for k, c in enumerate(runs.channels)
+        if large[k] or noisy[k] > UNDESCRIBED
+    )
+
+
+def remaining_errors(
+    space: CandidateSpace, runs: Runs, missed: Sequence[MissedChannel], refit: HeldOutScore, found: HeldOutScore
+) -> tuple[MissedChannel, ...]:
+    """Hold-out errors of the missed channels after effects were added.
+
+    None if the effects do not describe the runs either. This is so if more than `UNDESCRIBED` of a channel's rms
+    remains, less than `REMOVED` of the refit's error has gone, or the noise itself is estimated to be that large.
+
+    Args:
+        missed: channels from `missed_channels`.
+        refit, found: hold-out predictions without and with the effects.
+    """
+    before, after = _hold_out_error_shares(space, runs, refit, found)
+    index = {c.name: k for k, c in enumerate(runs.channels)}
+    remaining = [m._replace(error=float(after[index[m.channel]])) for m in missed]
+    described = all(
+        m.noise <= UNDESCRIBED and m.error <= min(UNDESCRIBED, (1 - REMOVED) * before[index[m.channel]])
+        for m in remaining
+    )
+    return tuple(remaining) if described else ()
+
+
+def _hold_out_error_shares(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
+    """Hold-out rms error of each fit, divided by the measured rms of the channel [-]. Only readings that all fits
+    predict count. NaN if there is none. Shape (fits, channels).
+    """
+    measured_values = runs.measured()
+    counts = space.weight[: len(runs)] > 0
+    off = [[np.where(counts, reading - measured_values, np.nan) for reading in s.reading.values()] for s in scores]
+    errors: np.ndarray = np.array(off).reshape(len(scores), -1, measured_values.shape[1])
+    errors = np.where(np.isfinite(errors).all(0), errors, np.nan)
+    with np.errstate(invalid="ignore"):
+        size = np.nansum(np.where(counts, measured_values, np.nan) ** 2, 0) / counts.sum(0)
+        return np.sqrt(np.nansum(errors**2, 1) / np.isfinite(errors).sum(1) / size)
+
+
+def _error_shares(
+    space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization
+) -> tuple[np.ndarray, np.ndarray]:
+    """rms error and noise of each channel, both divided by its measured rms [-]. Only included readings count. 0 if
+    there is none.
+    """
+    rows = len(runs)
+    counts = space.weight[:rows] > 0
+    off = np.where(counts, np.asarray(fit.by_row())[:rows], 0.0)
+    size = np.sqrt(np.sum(np.where(counts, runs.measured(), 0.0) ** 2, 0))
+    error = np.sqrt(np.sum((off * np.where(counts, noise.sd, 0.0)) ** 2, 0))
+    return error / np.maximum(size, 1e-300), np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
+
+
+def unused_inputs(runs: Runs) -> Names:
+    """Numeric columns that vary but have no role, and an output torque that may be imposed by a brake."""
+    torques = (f"{note.theirs} as a condition" for note in unused_room.unexplained_torque_notes(runs))
+    return (*unused_room.unused_columns(runs), *torques)
