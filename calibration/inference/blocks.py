@@ -90,6 +90,12 @@ def parts_over_time(runs: Runs) -> Columns:
     return {f"{k + 1} of {PARTS}": part == k for k in np.unique(part)}
 
 
+def parts_of_runs(runs: Runs) -> Columns:
+    """Label → mask of its rows, for each part of each run over time."""
+    names, parts = runs.run_names, parts_over_time(runs)
+    return {f"{run} {label}": (names == run) & part for run in np.unique(names) for label, part in parts.items()}
+
+
 def blocks_of_kind(runs: Runs, by: str) -> Columns:
     """Label → mask of its rows, for each block of the kind `by`. Empty if the data do not vary in that quantity.
 
