@@ -8,24 +8,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calibration.data import Names
-from calibration.data.posterior_file import Posterior, join_posteriors
+from calibration.data import Names, posterior_file
 from calibration.data.runs import Runs
-from calibration.discovery import findings, prediction, preference
-from calibration.discovery.active_set import (
-    CandidateSpace,
-    clipped_parameters,
-    coordinate_groups,
-    posterior_of_fit,
+from calibration.discovery import (
+    active_set,
+    discrepancy,
+    experiments,
+    findings,
+    hidden,
+    loop_input,
+    prediction,
+    preference,
+    result_remarks,
+    verdict,
 )
-from calibration.discovery.discrepancy import CurveCoordinates, Discrepancy
-from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
-from calibration.discovery.loop_input import LoopInput, goes_both_ways
 from calibration.discovery.result import DiscoveryResult, Errors, FoundEffect, ReadingsOfRows
-from calibration.discovery.result_remarks import loop_remarks, noise_remarks_before_verdict, worse_than_stated
 from calibration.discovery.settings import WITHOUT_NAME, Settings
-from calibration.discovery.verdict import LoopStages, verdict_summary
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import observers
@@ -38,7 +36,7 @@ from calibration.inference.simulation_errors import channel_errors
 from mmrjax.model import channels, params
 
 
-def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
+def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
     screened, diagnosis, noise = traced.screened, traced.left, traced.sds.noise
@@ -81,7 +79,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     else:
         fit, of_fit = (best, ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
-        posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
+        posterior = active_set.posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
     remaining = residuals_by_channel(space, runs, ends.linear, row_readings.after, z)
 
@@ -93,15 +91,17 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
-    concealed: tuple[HiddenEffect, ...] = ()
+    concealed: tuple[hidden.HiddenEffect, ...] = ()
     if traced.alike is not None:
         named, base_there = dataclasses.replace(best, cost=decided[1].cost), screened.base.candidate
         found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
         if not nameless and run is None:
             ask = observe.menu and not observe.long
-            concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
+            concealed = hidden.find_hidden_effects(
+                space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask
+            )
     scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
-    summary, kind = verdict_summary(traced, numbers), type(observe)
+    summary, kind = verdict.verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
         verdict=traced.verdict,
         summary=summary,
@@ -125,7 +125,9 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         cannot_see=findings.invisible_effects(decided[0], diagnosis.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
-            sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
+            sorted(
+                name for name, e in given.library.items() if e.needs_reverse and not loop_input.goes_both_ways(runs)
+            )
         ),
         alternatives=near,
         implausible=too_large,
@@ -155,11 +157,20 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     )
     # A temporary change is not uniform.
     is_event = traced.where is not None and bases_room.window_from_name(traced.where.variable) is not None
-    of_noise = () if is_event and not traced.sds.factors else noise_remarks_before_verdict(traced.sds, remaining)
+    of_noise = (
+        ()
+        if is_event and not traced.sds.factors
+        else result_remarks.noise_remarks_before_verdict(traced.sds, remaining)
+    )
     if run is not None and run.contradicts:
         of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(
-        result, remarks=(*of_noise, *worse_than_stated(row_readings, noise, included), *loop_remarks(result))
+        result,
+        remarks=(
+            *of_noise,
+            *result_remarks.worse_than_stated(row_readings, noise, included),
+            *result_remarks.loop_remarks(result),
+        ),
     )
 
 
@@ -172,7 +183,7 @@ def errors_on_common_rows(
 
 
 def _hold_out_gains(
-    space: CandidateSpace, runs: Runs, traced: LoopStages, seen: ReadingsOfRows
+    space: active_set.CandidateSpace, runs: Runs, traced: verdict.LoopStages, seen: ReadingsOfRows
 ) -> tuple[tuple[Names, prediction.Gain], ...]:
     """Hold-out gain of each set of effects over the refit, ordered by the number of effects. The proposal is last.
 
@@ -192,7 +203,7 @@ def _hold_out_gains(
 
 
 def residuals_by_channel(
-    space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
+    space: active_set.CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
 ) -> Residuals:
     """Residuals of a fit, with their statistics, by channel.
 
@@ -209,15 +220,19 @@ def residuals_by_channel(
     )
 
 
-def _next_experiment(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
+def _next_experiment(
+    space: active_set.CandidateSpace, traced: verdict.LoopStages, settings: Settings
+) -> experiments.Proposal | None:
     """Next experiment. None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
     if not space.bare.observe.menu or space.bare.base.rig.follows_goal:
-        return propose_nothing(space) if traced.verdict != "none" else None
+        return experiments.propose_nothing(space) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
-        return propose_denser_runs(space, traced.where, settings)
-    return None if traced.alike is None else propose_separating(space, traced.best, traced.alike, settings)
+        return experiments.propose_denser_runs(space, traced.where, settings)
+    return (
+        None if traced.alike is None else experiments.propose_separating(space, traced.best, traced.alike, settings)
+    )
 
 
 def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
@@ -231,19 +246,21 @@ def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) 
     }
 
 
-def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
+def posterior_of_curve(
+    space: active_set.CandidateSpace, active: Names, curve: discrepancy.Discrepancy
+) -> posterior_file.Posterior:
     """Posterior distribution of a fit with a smooth curve. The ordinates are linear in their coordinates and come
     last.
     """
-    shaped: CurveCoordinates = curve.problem.coordinates
+    shaped: discrepancy.CurveCoordinates = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
-    base, kept_places = coordinate_groups(shaped.base, space, active, curve.z[:inner])
+    base, kept_places = active_set.coordinate_groups(shaped.base, space, active, curve.z[:inner])
     spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
-    ordinates = clipped_parameters(
+    ordinates = active_set.clipped_parameters(
         shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
     )
     places = [*kept_places, *range(inner, len(shaped))]
     covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
-    return join_posteriors([*base, ordinates], covariance)
+    return posterior_file.join_posteriors([*base, ordinates], covariance)

@@ -15,8 +15,7 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
-from calibration.discovery import menu, scales
-from calibration.discovery.active_set import CandidateSpace, candidate_space
+from calibration.discovery import active_set, menu, scales
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import BaseFit
 from calibration.discovery.outliers import Screening
@@ -24,11 +23,10 @@ from calibration.discovery.result import EffectRanking
 from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import FIT, Settings, settings_for
 from calibration.discovery.verdict import LoopStages
-from calibration.inference import observers, preparation, priors
+from calibration.inference import observers, preparation, priors, shown_states
 from calibration.inference.fit_notes import Notes, Remark, remarks_with_codes
 from calibration.inference.noise import Noise
 from calibration.inference.population import StoreStage, compute_without_storing
-from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
 from mmrjax.errors import count_noun
@@ -81,7 +79,7 @@ class LoopInput:
     keep: StoreStage = compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
-    equations: CandidateSpace | None = None
+    equations: active_set.CandidateSpace | None = None
     confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
     settled: Callable[[], LoopInput | None] = lambda: None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
@@ -97,7 +95,7 @@ class LoopInput:
         return () if self.known is None or self.known.searched is None else self.known.searched.room
 
     @functools.cached_property
-    def space(self) -> CandidateSpace:
+    def space(self) -> active_set.CandidateSpace:
         """Candidate space of the runs."""
         return build_candidate_space(self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library)
 
@@ -174,8 +172,12 @@ def settled_input(given: LoopInput, prepare: Callable[..., LoopInput]) -> LoopIn
 def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
     """Remark on a log that does not show the states of its equations."""
     read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
-    plan = state_plan_or_reason(robot, read) if read else None
-    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
+    plan = shown_states.state_plan_or_reason(robot, read) if read else None
+    return (
+        [Remark("unshown", source=runs.source, why=plan.value)]
+        if isinstance(plan, shown_states.MissingStates)
+        else []
+    )
 
 
 def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
@@ -210,7 +212,7 @@ def build_candidate_space(
     settings: Settings,
     stated: Priors | None = None,
     library: Library = effects.BY_NAME,
-) -> CandidateSpace:
+) -> active_set.CandidateSpace:
     """Base problem of a table, with slots for the effects that its data can reveal.
 
     Tables are padded with rows of weight 0 to one of a few sizes, so that tables of similar size share compiled
@@ -227,7 +229,7 @@ def build_candidate_space(
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
     visible = visible_effects(library, robot, kind, goes_both_ways(runs), has_partial_duty(runs))
-    space = candidate_space(bare, visible, library, settings.slots, settings.width)
+    space = active_set.candidate_space(bare, visible, library, settings.slots, settings.width)
     return space.without(~real)
 
 

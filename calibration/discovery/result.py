@@ -7,18 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, Json, Names, robot_file
+from calibration.data import Columns, Json, Names, robot_file, writing
 from calibration.data import posterior_file as posterior
 from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
-from calibration.data.writing import entries_of, json_value, write_json, write_table
 from calibration.described import describe, sentences
-from calibration.discovery import REFIT_FILE, formula
+from calibration.discovery import REFIT_FILE, formula, loop_notes
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Headline, NameSupport, RuledOut, VerdictSummary
 from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.prediction import Gain, HeldOutAlternative
 from calibration.discovery.settings import Settings
@@ -163,7 +161,7 @@ class RejectedCandidate:
     prior_sds: dict[str, float]
     sizes: dict[str, float]
     rise_chi2: float
-    reasons: tuple[RuledOut, ...] = ()
+    reasons: tuple[loop_notes.RuledOut, ...] = ()
 
     @property
     def why(self) -> str:
@@ -365,7 +363,7 @@ class DiscoveryResult:
     """
 
     verdict: str
-    summary: VerdictSummary
+    summary: loop_notes.VerdictSummary
     robot: Robot
     refit: Robot
     gains: tuple[tuple[Names, Gain], ...]
@@ -387,7 +385,7 @@ class DiscoveryResult:
     alternatives: tuple[RejectedCandidate, ...]
     implausible: tuple[RejectedCandidate, ...]
     hidden: tuple[HiddenEffect, ...]
-    support: NameSupport | None
+    support: loop_notes.NameSupport | None
     cluster: OutlierCluster | None
     residual_clusters: tuple[ResidualCluster, ...]
     before: Evidence
@@ -424,7 +422,7 @@ class DiscoveryResult:
         return describe(self.summary)
 
     @property
-    def headline(self) -> Headline:
+    def headline(self) -> loop_notes.Headline:
         """The claims that hold at every noise level tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
@@ -507,32 +505,36 @@ class DiscoveryResult:
     def to_json(self) -> Json:
         """The whole result as JSON data, as described in docs/schemas/loop.schema.json."""
         mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
-        return json_value(
+        return writing.json_value(
             {
                 "schema": SCHEMA,
-                **entries_of(self, "statement", "verdict"),
+                **writing.entries_of(self, "statement", "verdict"),
                 "mechanism": None
                 if mechanism is None
                 else {
-                    **entries_of(mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"),
+                    **writing.entries_of(
+                        mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"
+                    ),
                     "established": not mechanism.fails,
                     "course": "" if self.unnamed is None else describe(self.unnamed),
                 },
                 "missed": [m._asdict() for m in self.summary.missed],
                 "headline": {
-                    **entries_of(self.headline, "level", "claims", "factors", "shared"),
+                    **writing.entries_of(self.headline, "level", "claims", "factors", "shared"),
                     "statement": self.statement,
                 },
                 "verdict_statement": self.verdict_statement,
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
-                **entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
+                **writing.entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
                 "effects": [_effect_json(e, self.support) for e in self.effects]
                 + ([] if self.unnamed is None else [_unnamed_json(self.unnamed)]),
-                **entries_of(self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"),
+                **writing.entries_of(
+                    self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"
+                ),
                 "needs_reverse": self.needs_reverse,
                 **self.detail.to_json(),
-                **entries_of(self, "alternatives", "implausible", "hidden", "standing", "cluster"),
+                **writing.entries_of(self, "alternatives", "implausible", "hidden", "standing", "cluster"),
                 "residual_clusters": self.residual_clusters,
                 "errors": {
                     # nothing is fitted as stated, so both are the same
@@ -544,14 +546,18 @@ class DiscoveryResult:
                     kind: {"before": before, "after": after, "blocks": self.readings_of_rows.blocks[kind]}
                     for kind, (before, after) in self.errors_held_out.items()
                 },
-                **entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
+                **writing.entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
                 "prediction": {
-                    **({"gain": None, "se": None} if self.gain is None else entries_of(self.gain, "gain=mean", "se")),
+                    **(
+                        {"gain": None, "se": None}
+                        if self.gain is None
+                        else writing.entries_of(self.gain, "gain=mean", "se")
+                    ),
                     "sets": [{"effects": names, "gain": g.mean, "se": g.se} for names, g in self.gains],
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },
-                "adequate": entries_of(self, "before=before.adequate", "after=after.adequate"),
+                "adequate": writing.entries_of(self, "before=before.adequate", "after=after.adequate"),
                 "evidence": {"before": _evidence_json(self.before), "after": _evidence_json(self.after)},
                 "chi2": {
                     "before": self.chi2[0],
@@ -559,12 +565,12 @@ class DiscoveryResult:
                     "readings": self.readings,
                     "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
                 },
-                **entries_of(self, "base_shift", "together", "scores"),
+                **writing.entries_of(self, "base_shift", "together", "scores"),
                 "bootstrap": {
                     "replicates": self.replicates,
-                    **entries_of(self.settings, "asked=replicates", "seed", "family_wise_error", "shares"),
+                    **writing.entries_of(self.settings, "asked=replicates", "seed", "family_wise_error", "shares"),
                 },
-                **entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes"),
+                **writing.entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes"),
             }
         )
 
@@ -608,8 +614,8 @@ class DiscoveryResult:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "result.json", self.to_json())
-        write_table(folder / "rows.csv", self.rows_table(), tables)
+        writing.write_json(folder / "result.json", self.to_json())
+        writing.write_table(folder / "rows.csv", self.rows_table(), tables)
         held_sentence = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([describe(self, "header", robot_name), *held_sentence])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
@@ -627,7 +633,7 @@ class NoiseVerdict:
 
     factor: float
     verdict: str
-    summary: VerdictSummary
+    summary: loop_notes.VerdictSummary
     classes: tuple[Names, ...]
     adequate_after: bool
 
@@ -638,10 +644,10 @@ class NoiseVerdict:
 
     def to_json(self) -> Json:
         """Entry of result.json."""
-        return entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
+        return writing.entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
 
 
-def _effect_json(e: FoundEffect, support: NameSupport | None) -> Json:
+def _effect_json(e: FoundEffect, support: loop_notes.NameSupport | None) -> Json:
     test = None if support is None else support.test_of(e.name)
     return {
         "name": e.name,
@@ -651,13 +657,13 @@ def _effect_json(e: FoundEffect, support: NameSupport | None) -> Json:
         "rests_on_row": None if test is None else test.rests_on,
         "root": None if test is None else test.root,
         "root_needed": None if test is None else test.needed,
-        **entries_of(
+        **writing.entries_of(
             e, "families", "balance", "unit", "equation", "source", "parameters", "p_value", "score", "share"
         ),
         "accuracy_of_form": None
         if test is None or not test.shows_form
         else {"over": test.over, "share": test.spread},
-        **entries_of(e, "members", "stated_values=stated"),
+        **writing.entries_of(e, "members", "stated_values=stated"),
     }
 
 
@@ -665,12 +671,14 @@ def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
     return {
         "name": "unnamed",
         "class": [],
-        **entries_of(d, "families", "balance", "channel", "balances_alike", "variable", "variables_alike", "window"),
+        **writing.entries_of(
+            d, "families", "balance", "channel", "balances_alike", "variable", "variables_alike", "window"
+        ),
         "unit": d.unit,
         "equation": None,
         "parameters": {},
-        **entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
-        "curve": entries_of(d, "at", "value", "sd", "unit"),
+        **writing.entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
+        "curve": writing.entries_of(d, "at", "value", "sd", "unit"),
         "course": describe(d),
         "proposal": d.proposal,
     }

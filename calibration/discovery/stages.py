@@ -7,15 +7,22 @@ import functools
 
 import numpy as np
 
-from calibration.discovery import classes, findings, outliers, preference, search, verdict
+from calibration.discovery import (
+    candidates,
+    classes,
+    discrepancy,
+    findings,
+    loop_notes,
+    outliers,
+    preference,
+    search,
+    verdict,
+)
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.assembly import residuals_by_channel
-from calibration.discovery.candidates import BaseFit, Candidate, fit_base
 from calibration.discovery.classes import Classes
-from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_input import LoopInput
-from calibration.discovery.loop_notes import Mechanism, MissedChannel, NameSupport
 from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, Predicted
@@ -34,7 +41,7 @@ SCREENINGS = 4
 LIKELY = 4.0
 
 
-def fit_base_and_noise(given: LoopInput, begin: Candidate | None) -> tuple[Screening, VerdictNoise]:
+def fit_base_and_noise(given: LoopInput, begin: candidates.Candidate | None) -> tuple[Screening, VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
     known_stages, noise = given.known, given.noise
     screened = _fit_base(given, noise, None if known_stages is None else known_stages.screened.base, begin)
@@ -52,7 +59,9 @@ def fit_base_and_noise(given: LoopInput, begin: Candidate | None) -> tuple[Scree
     return screened, sds
 
 
-def _fit_base(given: LoopInput, noise: Noise, before: BaseFit | None, begin: Candidate | None) -> Screening:
+def _fit_base(
+    given: LoopInput, noise: Noise, before: candidates.BaseFit | None, begin: candidates.Candidate | None
+) -> Screening:
     """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
     For logs, the equations in weak form give the start of the fit, and rank the library unless effects would only
@@ -73,7 +82,9 @@ def _fit_base(given: LoopInput, noise: Noise, before: BaseFit | None, begin: Can
             given.later.append(given.others.enter_context(outliers.compile_ahead(space, given.runs, settings)))
     if given.equations is None or not space.bare.observe.reads:  # linear readings have a fit
         given.progress(progress_remark("base"))
-    return outliers.screen_outliers(fit_base(space, settings, given.runs.source, near), given.runs, settings)
+    return outliers.screen_outliers(
+        candidates.fit_base(space, settings, given.runs.source, near), given.runs, settings
+    )
 
 
 def search_until_clean(
@@ -150,9 +161,18 @@ def confirm_search(
 
 def choose_effects(
     given: LoopInput, screened: Screening, left: Diagnosis, searched: SearchResult
-) -> tuple[BaseCurve, Predicted, tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
+) -> tuple[
+    discrepancy.BaseCurve,
+    Predicted,
+    tuple[candidates.Candidate, Diagnosis] | None,
+    SearchResult,
+    loop_notes.NameSupport,
+]:
     """Curve of the base's discrepancy, and the effects to add, see `preference.choose_effects`."""
-    beside, predicted = BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases), Predicted()
+    beside, predicted = (
+        discrepancy.BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases),
+        Predicted(),
+    )
     chosen = preference.choose_effects(
         given.runs, screened, left, searched, given.settings, given.progress, beside, predicted
     )
@@ -165,10 +185,10 @@ def check_described(
     left: Diagnosis,
     sds: VerdictNoise,
     searched: SearchResult,
-    chosen: tuple[Candidate, Diagnosis] | None,
-    beside: BaseCurve,
+    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    beside: discrepancy.BaseCurve,
     predicted: Predicted,
-) -> tuple[MissedChannel, ...] | LoopStages:
+) -> tuple[loop_notes.MissedChannel, ...] | LoopStages:
     """Channels that the refit misses but effects describe. Ends the loop if no set of effects describes the runs."""
     runs, space = given.runs, screened.base.space
     missed = verdict.missed_channels(space, runs, sds.noise, left.linear)
@@ -192,11 +212,11 @@ def trace_mechanism(
     screened: Screening,
     left: Diagnosis,
     searched: SearchResult,
-    chosen: tuple[Candidate, Diagnosis] | None,
-    standing: NameSupport,
-    beside: BaseCurve,
+    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    standing: loop_notes.NameSupport,
+    beside: discrepancy.BaseCurve,
     predicted: Predicted,
-) -> Mechanism | None:
+) -> loop_notes.Mechanism | None:
     """Equation and driving variable of the discrepancy, with ammeter errors that explain the data as well. None if
     the name of an effect is established.
     """
@@ -211,14 +231,16 @@ def trace_mechanism(
     if found is None:
         return None
     columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
-    columns = columns if found.effects else location_columns(linear, screened.bases, _location(given, beside))
+    columns = (
+        columns if found.effects else discrepancy.location_columns(linear, screened.bases, _location(given, beside))
+    )
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
     also = classes.ammeter_families(space, *fit, columns, found.families[0], settings)
     families = tuple(dict.fromkeys((*found.families, *also)))
     return dataclasses.replace(found, families=families, ammeter=classes.errors_of_ammeters(space, families))
 
 
-def _location(given: LoopInput, beside: BaseCurve) -> DiscrepancyLocation:
+def _location(given: LoopInput, beside: discrepancy.BaseCurve) -> DiscrepancyLocation:
     return dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))
 
 
@@ -227,7 +249,7 @@ def find_alternatives(
     screened: Screening,
     left: Diagnosis,
     searched: SearchResult,
-    chosen: tuple[Candidate, Diagnosis] | None,
+    chosen: tuple[candidates.Candidate, Diagnosis] | None,
 ) -> tuple[SearchResult, Classes | None]:
     """The search with the chosen effects, and the alternatives to each of them. None without effects."""
     if chosen is None:
@@ -245,11 +267,16 @@ def reach_verdict(
     screened: Screening,
     searched: SearchResult,
     alike: Classes | None,
-    standing: NameSupport,
-    beside: BaseCurve,
-    mechanism: Mechanism | None,
+    standing: loop_notes.NameSupport,
+    beside: discrepancy.BaseCurve,
+    mechanism: loop_notes.Mechanism | None,
 ) -> tuple[
-    str, SearchResult, Classes | None, NameSupport, DiscrepancyLocation | None, tuple[HeldOutAlternative, ...]
+    str,
+    SearchResult,
+    Classes | None,
+    loop_notes.NameSupport,
+    DiscrepancyLocation | None,
+    tuple[HeldOutAlternative, ...],
 ]:
     """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects."""
     best, after, space, settings = searched.best, searched.diagnosis, screened.base.space, given.settings
@@ -266,5 +293,9 @@ def reach_verdict(
         after = searched.diagnosis or after
         standing = standing.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
     alone = all(one for one, name in zip(alike.alone, named, strict=True) if name)
-    remains = locate_discrepancy(after, screened.bases, space.included) if after.test.rejected_with_margin else None
+    remains = (
+        discrepancy.locate_discrepancy(after, screened.bases, space.included)
+        if after.test.rejected_with_margin
+        else None
+    )
     return "named" if alone else "class", searched, alike, standing, remains, compared
