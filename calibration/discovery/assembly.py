@@ -19,24 +19,22 @@ from calibration.discovery import (
     loop_input,
     prediction,
     preference,
+    result,
     result_remarks,
     verdict,
 )
-from calibration.discovery.result import DiscoveryResult, Errors, FoundEffect, ReadingsOfRows
+from calibration.discovery.candidates import residuals_by_channel
+from calibration.discovery.scales import goes_both_ways
 from calibration.discovery.settings import WITHOUT_NAME, Settings
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
-from calibration.inference import observers
-from calibration.inference.fit_notes import Remark, progress_remark
-from calibration.inference.lack_of_fit import Residuals
-from calibration.inference.linearization import Linearization
-from calibration.inference.noise import Noise
+from calibration.inference import fit_notes
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax.model import channels, params
 
 
-def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> DiscoveryResult:
+def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> result.DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
     screened, diagnosis, noise = traced.screened, traced.left, traced.sds.noise
@@ -52,19 +50,19 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     # The fit of the result: with the named effects, or with the curve if no name is given.
     beside = traced.beside if nameless and run is None else None
     if beside is not None:
-        progress(progress_remark("shape"))
-    before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
+        progress(fit_notes.progress_remark("shape"))
+    before, curve = prediction.FittedProblem(*space.fit_of(base.active, base.z)), None
     after, z, sd, cost = None, best.z, best.sd, best.cost
     if beside is not None and best is base:
         curve, ends = beside.curve, beside.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
-        after = findings.FittedProblem(curve.problem, z, None)
+        after = prediction.FittedProblem(curve.problem, z, None)
     elif best is not base:
-        after = findings.FittedProblem(*space.fit_of(best.active, z))
-    progress(progress_remark("errors"))
+        after = prediction.FittedProblem(*space.fit_of(best.active, z))
+    progress(fit_notes.progress_remark("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    row_readings = findings.readings_of_rows(
+    row_readings = prediction.readings_of_rows(
         runs, noise.sd, kinds, before, after, predictions[0], None if best is base else predictions[1]
     )
     compared = traced.held_out
@@ -80,17 +78,17 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         fit, of_fit = (best, ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = active_set.posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
-    progress(progress_remark("next"))
+    progress(fit_notes.progress_remark("next"))
     remaining = residuals_by_channel(space, runs, ends.linear, row_readings.after, z)
 
-    def error(simulated: np.ndarray) -> Errors:
+    def error(simulated: np.ndarray) -> result.Errors:
         simulated = np.where(included[:, None], simulated, np.nan)
         return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
     ladder = () if traced.searched is None else (traced.alike or traced.searched).ladder
     cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
-    found: tuple[FoundEffect, ...] = ()
+    found: tuple[result.FoundEffect, ...] = ()
     concealed: tuple[hidden.HiddenEffect, ...] = ()
     if traced.alike is not None:
         named, base_there = dataclasses.replace(best, cost=decided[1].cost), screened.base.candidate
@@ -102,7 +100,9 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
             )
     scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
     summary, kind = verdict.verdict_summary(traced, numbers), type(observe)
-    result = DiscoveryResult(
+    with np.errstate(invalid="ignore"):
+        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
+    assembled = result.DiscoveryResult(
         verdict=traced.verdict,
         summary=summary,
         robot=robot,
@@ -125,9 +125,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         cannot_see=findings.invisible_effects(decided[0], diagnosis.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
-            sorted(
-                name for name, e in given.library.items() if e.needs_reverse and not loop_input.goes_both_ways(runs)
-            )
+            sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
         ),
         alternatives=near,
         implausible=too_large,
@@ -151,7 +149,11 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
         held_out_worse=preference.worse_predictions(row_readings.held_out, error),
         alternatives_held_out=compared,
-        noise=_noise_by_channel(runs, noise, kind),
+        noise={
+            name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
+            for k, name in enumerate(channels.channel_names(noise.channels))
+            if noise.source[k] != "no readings"
+        },
         settings=settings,
         replicates=len(diagnosis.test.null.single),
     )
@@ -163,27 +165,27 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         else result_remarks.noise_remarks_before_verdict(traced.sds, remaining)
     )
     if run is not None and run.contradicts:
-        of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
+        of_noise = (fit_notes.Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(
-        result,
+        assembled,
         remarks=(
             *of_noise,
             *result_remarks.worse_than_stated(row_readings, noise, included),
-            *result_remarks.loop_remarks(result),
+            *result_remarks.loop_remarks(assembled),
         ),
     )
 
 
 def errors_on_common_rows(
-    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
-) -> tuple[Errors, Errors]:
+    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], result.Errors]
+) -> tuple[result.Errors, result.Errors]:
     """Errors of two sets of readings, over the readings that both fits predict."""
     in_both = np.isfinite(before) & np.isfinite(after)
     return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
 
 
 def _hold_out_gains(
-    space: active_set.CandidateSpace, runs: Runs, traced: verdict.LoopStages, seen: ReadingsOfRows
+    space: active_set.CandidateSpace, runs: Runs, traced: verdict.LoopStages, seen: prediction.ReadingsOfRows
 ) -> tuple[tuple[Names, prediction.Gain], ...]:
     """Hold-out gain of each set of effects over the refit, ordered by the number of effects. The proposal is last.
 
@@ -202,24 +204,6 @@ def _hold_out_gains(
     return tuple((names, score(reading).gain(score(refit))) for names, reading in scored)
 
 
-def residuals_by_channel(
-    space: active_set.CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
-) -> Residuals:
-    """Residuals of a fit, with their statistics, by channel.
-
-    Args:
-        linear: linearization of the fit at z.
-        reading: simulated reading of each row [SI], shape (rows or more, channels).
-    """
-    rows, count = len(runs), len(runs.channels)
-    counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
-    jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
-    whitened = np.where(counts, np.asarray(linear.by_row())[:rows], 0.0)
-    return Residuals(
-        type(space.bare.observe), runs, reading[:rows], whitened, counts, jacobian, z[: jacobian.shape[1]]
-    )
-
-
 def _next_experiment(
     space: active_set.CandidateSpace, traced: verdict.LoopStages, settings: Settings
 ) -> experiments.Proposal | None:
@@ -233,17 +217,6 @@ def _next_experiment(
     return (
         None if traced.alike is None else experiments.propose_separating(space, traced.best, traced.alike, settings)
     )
-
-
-def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
-    """Source and median relative size [%] of the sd of each channel."""
-    with np.errstate(invalid="ignore"):
-        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
-    return {
-        name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
-        for k, name in enumerate(channels.channel_names(noise.channels))
-        if noise.source[k] != "no readings"
-    }
 
 
 def posterior_of_curve(

@@ -9,22 +9,18 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from calibration.data import Names, Priors
+from calibration.data import Priors
 from calibration.data.columns import ROWS
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
-from calibration.discovery import log_stages, loop_input, result, stages, verdict
+from calibration.discovery import log_stages, loop_input, outliers, preference, result, stages, verdict
 from calibration.discovery.assembly import assemble_result
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.outliers import (
-    Screening,
-)
 from calibration.discovery.settings import FIT
+from calibration.inference import fit_notes, population
 from calibration.inference import noise as noise_room
-from calibration.inference import population
-from calibration.inference.fit_notes import Notes, Remark, progress_remark, remarks_with_codes
 from calibration.inference.observers.windows import Windows
 from calibration.inference.optimizers import CORES
 from mmrjax import effects
@@ -81,8 +77,8 @@ def discover(
         raise BadConfiguration(f"discover: {precision.SINGLE}")
     tell = report_in_words(progress)
     prepare = functools.partial(
-        loop_input.prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed,
-        prefer=prefer, forbidden=forbidden, rows=rows,
+        loop_input.prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates,
+        seed=seed, prefer=prefer, forbidden=forbidden, rows=rows,
     )  # fmt: skip
     ready = prepare(runs)
     given = dataclasses.replace(
@@ -94,8 +90,8 @@ def discover(
     if traced.settled and (table := given.settled()) is not None:
         ready, given = table, dataclasses.replace(table, progress=tell, keep=keep)
     known = ready.noise
-    refuted = remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
-    notes: Notes = tuple(n for n in ready.notes if n not in refuted)
+    refuted = fit_notes.remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
+    notes: fit_notes.Notes = tuple(n for n in ready.notes if n not in refuted)
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
@@ -103,7 +99,7 @@ def discover(
     sensitivity, outstanding = list[result.NoiseVerdict](), list[float]()
     try:
         if factors:
-            tell(progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
+            tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
 
         def trace_with_noise(factor: float) -> verdict.LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
@@ -113,7 +109,7 @@ def discover(
         verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
         found = keep("result", lambda: assemble_result(given, traced))
         if not all(one.done() for one in verdicts.values()):
-            tell(progress_remark("others"))
+            tell(fit_notes.progress_remark("others"))
         for f, pending in verdicts.items():
             try:
                 other = pending.result(left())
@@ -127,17 +123,17 @@ def discover(
     finally:  # an interruption or the time limit waits for none of them
         threads.shutdown(wait=False, cancel_futures=True)
     if outstanding:
-        notes = (Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
+        notes = (fit_notes.Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
     if assumed:
         notes = (
             *notes,
-            Remark(
+            fit_notes.Remark(
                 "assumed_noise", channels=channels.channel_names(assumed), usual=noise_room.default_noise(assumed)
             ),
         )
     if known.along_series:
-        notes = (*notes, Remark("noise_from_series", noise=known.along_series))
+        notes = (*notes, fit_notes.Remark("noise_from_series", noise=known.along_series))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
 
 
@@ -157,9 +153,9 @@ class Stage(NamedTuple):
     """
 
     name: str
-    inputs: Names
+    inputs: tuple[str, ...]
     function: Callable[..., Any]
-    results: Names = ()
+    results: tuple[str, ...] = ()
     stored: bool = False
 
 
@@ -218,7 +214,7 @@ def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate
 
 
 def trace_settled_runs(
-    given: loop_input.LoopInput, begin: Candidate | None, screened: Screening
+    given: loop_input.LoopInput, begin: Candidate | None, screened: outliers.Screening
 ) -> verdict.LoopStages | None:
     """Stages of the settled runs of a log that no fit describes. None for others, and if these are too few."""
     base = screened.base
@@ -233,7 +229,7 @@ def trace_settled_runs(
 
 
 def trace_readings(
-    given: loop_input.LoopInput, begin: Candidate | None, screened: Screening, sds: verdict.VerdictNoise
+    given: loop_input.LoopInput, begin: Candidate | None, screened: outliers.Screening, sds: verdict.VerdictNoise
 ) -> verdict.LoopStages | None:
     """Stages of the linear readings of a log about its simulated fit, and the simulation of the model that they
     choose. None for other tables, and for a log with backlash that the robot lacks.
@@ -254,8 +250,9 @@ STAGES = (
     Stage("search", ("screened", "sds"), stages.search_until_clean, ("screened", "left", "searched")),
     Stage("no search", ("screened", "left", "sds", "searched"), stages.end_without_search),
     Stage("confirm", ("screened", "left", "sds", "searched"), stages.confirm_search, ("searched",)),
-    Stage("effects", ("screened", "left", "searched"), stages.choose_effects,
-          ("beside", "predicted", "chosen", "searched", "standing")),
+    Stage("curve", ("screened", "left"), stages.curve_of_base, ("beside",)),
+    Stage("effects", ("screened", "left", "searched", "beside", "predicted"),
+          preference.choose_effects, ("chosen", "searched", "standing")),
     Stage("described", ("screened", "left", "sds", "searched", "chosen", "beside", "predicted"),
           stages.check_described, ("missed",)),
     Stage("mechanism", ("screened", "left", "searched", "chosen", "standing", "beside", "predicted"),

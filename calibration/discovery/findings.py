@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns, Names
-from calibration.data.runs import Runs
+from calibration.data import Names
 from calibration.discovery import adequacy, classes, mechanism, projection, result, search
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
@@ -22,9 +21,7 @@ from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, linearization
 from calibration.inference.estimates import SIDE_OF_BOUND
-from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
-from calibration.inference.problem import Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model import params
 from mmrjax.model.balances import BALANCES
@@ -325,62 +322,3 @@ def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Setti
 
 
 # --- readings and errors --------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class FittedProblem:
-    """A problem with the coordinates of its fit and the active effects (None without slots)."""
-
-    problem: Problem
-    z: np.ndarray
-    active: tuple[int, ...] | None
-
-    def observation(self) -> Observation:
-        """Simulated observation at the fit."""
-        return self.problem.observe.observation_at(self.problem, self.z, self.active)
-
-
-#: Kind of block → hold-out predictions of each row, shape (rows, channels).
-HeldOutReadings = Columns
-
-
-def readings_of_rows(
-    runs: Runs,
-    sd: np.ndarray,
-    kinds: Mapping[str, Columns],
-    before: FittedProblem,
-    after: FittedProblem | None,
-    known_before: HeldOutReadings | None = None,
-    known_after: HeldOutReadings | None = None,
-) -> result.ReadingsOfRows:
-    """Simulated readings of both fits for all rows, fitted and held out for each kind of block. `after` = None: both
-    are equal.
-
-    Args:
-        kinds: blocks from `blocks.predictable_blocks`.
-        known_before, known_after: hold-out readings, if they are already known.
-    """
-    rows = len(runs)
-
-    def fitted_reading(fitted: FittedProblem) -> np.ndarray:
-        observation = fitted.observation()
-        unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
-        return np.where(unreachable, np.nan, np.asarray(observation.reading)[:rows])
-
-    def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
-        return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
-
-    values, labels = {}, {}
-    for kind, blocks_by_name in kinds.items():
-        masks = list(blocks_by_name.values())
-        first = held_out_reading(before, masks) if known_before is None else known_before[kind]
-        later = first
-        if after is not None:
-            later = held_out_reading(after, masks) if known_after is None else known_after[kind]
-        values[kind], labels[kind] = (first, later), tuple(blocks_by_name)
-    stated_readings, fitted = (
-        fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))),
-        fitted_reading(before),
-    )
-    later = fitted if after is None else fitted_reading(after)
-    return result.ReadingsOfRows(runs.measured(), sd[:rows], stated_readings, fitted, later, values, labels)

@@ -140,8 +140,8 @@ def confirm_readings(
 
 
 def smallest_confirmed(
-    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
-    noise: Noise,
+    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis,
+    searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
 
@@ -181,8 +181,8 @@ def _has_room(space: active_set.CandidateSpace, fit: Candidate) -> bool:
 
 
 def best_simulated_size(
-    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
-    noise: Noise,
+    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis,
+    searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
 
@@ -254,8 +254,10 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: verdict.LoopSt
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
 
     def undescribed(missed: tuple[MissedChannel, ...]) -> verdict.LoopStages:
-        return verdict.LoopStages("undescribed", screened, left, traced.sds, searched, beside=beside, run=traced.run,
-                          predicted=traced.predicted, missed=missed, unused=verdict.unused_inputs(given.runs))  # fmt: skip
+        return dataclasses.replace(
+            verdict.LoopStages("undescribed", screened, left, traced.sds, searched), beside=beside, run=traced.run,
+            predicted=traced.predicted, missed=missed, unused=verdict.unused_inputs(given.runs),
+        )  # fmt: skip
 
     if given.known is not None:  # only the noise differs
         if given.known.verdict == "undescribed":

@@ -17,7 +17,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.discrepancy import BaseCurve
-from calibration.discovery.loop_input import Tell
+from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import NameSupport
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, Predicted
@@ -180,12 +180,10 @@ def _classes_with_leader(
 
 
 def choose_effects(
-    runs: Runs,
+    given: LoopInput,
     screened: Screening,
     left: Diagnosis,
     searched: search.SearchResult,
-    settings: Settings,
-    progress: Tell,
     beside: BaseCurve,
     predicted: Predicted,
 ) -> tuple[tuple[candidates.Candidate, Diagnosis] | None, search.SearchResult, NameSupport]:
@@ -201,11 +199,11 @@ def choose_effects(
         predicted: cache of hold-out predictions of fits. This function adds to it.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    best, after = searched.best, searched.diagnosis
+    best, after, settings = searched.best, searched.diagnosis, given.settings
     if best is None or after is None:
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
-    kinds = blocks_room.predictable_blocks(runs, space.bare)
+    kinds = blocks_room.predictable_blocks(given.runs, space.bare)
     blocks = [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
@@ -213,8 +211,8 @@ def choose_effects(
     stood = support_of() if adequate else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
-    progress(progress_remark("held out"))
-    few = prediction.smallest_predictive_set(space, runs, base, search.best_of_each_size(searched), predicted)
+    given.progress(progress_remark("held out"))
+    few = prediction.smallest_predictive_set(space, given.runs, base, search.best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
         proposed = (
@@ -238,11 +236,6 @@ def choose_effects(
         fits_of_names = candidates.fit_candidates(space, [(active, begins)], settings)
         searched = dataclasses.replace(searched, ladder=(*searched.ladder, *fits_of_names))
     diagnosis = next((d for c, d in (proposed, (best, after)) if c is fits_of_names[0]), None)
-    return (
-        (
-            fits_of_names[0],
-            diagnosis or search.diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings),
-        ),
-        searched,
-        stood,
-    )
+    if diagnosis is None:
+        diagnosis = search.diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)
+    return (fits_of_names[0], diagnosis), searched, stood

@@ -7,22 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, Json, Names, robot_file, writing
-from calibration.data import posterior_file as posterior
-from calibration.data.columns import DRIVING
-from calibration.data.posterior_file import Posterior
-from calibration.data.runs import WHEN, Runs
-from calibration.described import describe, sentences
-from calibration.discovery import REFIT_FILE, formula, loop_notes
+from calibration import described
+from calibration.data import Json, Names, columns, posterior_file, robot_file, writing
+from calibration.data.runs import Runs
+from calibration.discovery import REFIT_FILE, formula, loop_notes, prediction
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.outliers import OutlierCluster
-from calibration.discovery.prediction import Gain, HeldOutAlternative
 from calibration.discovery.settings import Settings
 from calibration.discovery.verdict import headline
+from calibration.inference import fit_notes
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import DependentPair, Notes, Remark, remarks_with_codes
 from calibration.inference.identifiability import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -166,7 +162,7 @@ class RejectedCandidate:
     @property
     def why(self) -> str:
         """Reasons why they are implausible, as a sentence."""
-        return describe(self)
+        return described.describe(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,27 +266,6 @@ class Evidence:
     adequate: bool
 
 
-@dataclasses.dataclass(frozen=True)
-class ReadingsOfRows:
-    """Readings of all rows [SI], shape (rows, channels), NaN if missing.
-
-    Attributes:
-        measured, sd: measured readings and their standard deviations.
-        as_stated: simulated by the robot before any fit, at its prior means.
-        before, after: simulated by the base and by the proposed robot, fitted to all rows.
-        held_out: kind of block → readings (before, after), where each row is predicted by fits without its block.
-        blocks: kind of block → label of each row's block.
-    """
-
-    measured: np.ndarray
-    sd: np.ndarray
-    as_stated: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    held_out: dict[str, tuple[np.ndarray, np.ndarray]]
-    blocks: dict[str, Names]
-
-
 Errors = dict[str, dict[str, float | int]]
 
 
@@ -366,10 +341,10 @@ class DiscoveryResult:
     summary: loop_notes.VerdictSummary
     robot: Robot
     refit: Robot
-    gains: tuple[tuple[Names, Gain], ...]
+    gains: tuple[tuple[Names, prediction.Gain], ...]
     written: bool
     converged: bool
-    posterior: Posterior
+    posterior: posterior_file.Posterior
     runs: Runs
     numbers: np.ndarray
     included: np.ndarray
@@ -395,17 +370,17 @@ class DiscoveryResult:
     base_shift: dict[str, ParameterShift]
     scores: tuple[EffectScore, ...]
     detail: Detail
-    readings_of_rows: ReadingsOfRows
+    readings_of_rows: prediction.ReadingsOfRows
     errors_as_stated: Errors
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
     held_out_unpredictable: Names
     held_out_worse: tuple[WorseChannel, ...]
-    alternatives_held_out: tuple[HeldOutAlternative, ...]
+    alternatives_held_out: tuple[prediction.HeldOutAlternative, ...]
     noise: dict[str, Json]
     settings: Settings
     replicates: int
-    remarks: Notes = ()
+    remarks: fit_notes.Notes = ()
     sensitivity: tuple[NoiseVerdict, ...] = ()
 
     @property
@@ -413,13 +388,15 @@ class DiscoveryResult:
         """The answer in a sentence or two. It begins with backlash or compliance that no effect of the library
         explains.
         """
-        lost_motion_sentences = (f"{note}." for note in sentences(remarks_with_codes(self.remarks, "lost_motion")))
-        return " ".join((*lost_motion_sentences, describe(self.headline)))
+        lost_motion_sentences = (
+            f"{note}." for note in described.sentences(fit_notes.remarks_with_codes(self.remarks, "lost_motion"))
+        )
+        return " ".join((*lost_motion_sentences, described.describe(self.headline)))
 
     @property
     def verdict_statement(self) -> str:
         """The verdict at the noise of the fit, with its evidence."""
-        return describe(self.summary)
+        return described.describe(self.summary)
 
     @property
     def headline(self) -> loop_notes.Headline:
@@ -427,7 +404,7 @@ class DiscoveryResult:
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
     @property
-    def gain(self) -> Gain | None:
+    def gain(self) -> prediction.Gain | None:
         """Hold-out gain of the proposal over the refit, None if no block can be held out."""
         return self.gains[-1][1] if self.gains else None
 
@@ -439,12 +416,12 @@ class DiscoveryResult:
     @property
     def standing(self) -> str:
         """Reasons for or against the effects' names, as a sentence, "" for none."""
-        return describe(self, "standing")
+        return described.describe(self, "standing")
 
     @property
     def notes(self) -> Names:
         """Remarks as sentences."""
-        return sentences(self.remarks)
+        return described.sentences(self.remarks)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -496,7 +473,7 @@ class DiscoveryResult:
         return (*base, *(name for name, p in parameters if p.held_by_prior))
 
     @property
-    def together(self) -> tuple[DependentPair, ...]:
+    def together(self) -> tuple[fit_notes.DependentPair, ...]:
         """Pairs of parameters, of the base or of effects, that the data determine only in combination."""
         shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
@@ -516,7 +493,7 @@ class DiscoveryResult:
                         mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"
                     ),
                     "established": not mechanism.fails,
-                    "course": "" if self.unnamed is None else describe(self.unnamed),
+                    "course": "" if self.unnamed is None else described.describe(self.unnamed),
                 },
                 "missed": [m._asdict() for m in self.summary.missed],
                 "headline": {
@@ -574,12 +551,12 @@ class DiscoveryResult:
             }
         )
 
-    def rows_table(self) -> Columns:
+    def rows_table(self) -> dict[str, np.ndarray]:
         """Table with one line for each row: conditions, readings (measured, simulated without and with the proposal,
         held out), and errors of balances if known.
         """
         readings = self.readings_of_rows
-        known_columns = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
+        known_columns = ("run_id", *columns.WHEN, "configuration", *self.runs.axes, *columns.DRIVING)
         table = {"row": self.numbers, **{k: self.runs[k] for k in known_columns if self.runs.has(k)}}
         main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
@@ -616,11 +593,17 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows_table(), tables)
-        held_sentence = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([describe(self, "header", robot_name), *held_sentence])
+        held_sentence = (
+            [described.describe(fit_notes.Remark("held_by_prior", names=self.held_by_prior))]
+            if self.held_by_prior
+            else []
+        )
+        note = "\n".join([described.describe(self, "header", robot_name), *held_sentence])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
-        robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))
-        posterior.write_posterior(self.posterior, folder / posterior.FILE)
+        robot_file.write_robot(
+            self.refit, folder / REFIT_FILE, note=described.describe(self, "refit header", robot_name)
+        )
+        posterior_file.write_posterior(self.posterior, folder / posterior_file.FILE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -640,7 +623,7 @@ class NoiseVerdict:
     @property
     def statement(self) -> str:
         """The verdict as a sentence."""
-        return describe(self.summary)
+        return described.describe(self.summary)
 
     def to_json(self) -> Json:
         """Entry of result.json."""
@@ -679,7 +662,7 @@ def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
         "parameters": {},
         **writing.entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
         "curve": writing.entries_of(d, "at", "value", "sd", "unit"),
-        "course": describe(d),
+        "course": described.describe(d),
         "proposal": d.proposal,
     }
 
