@@ -61,7 +61,7 @@ def free_run(robot_file: Path, record: Path) -> float:
     from calibration.data import robot_file as files
     from calibration.data import runs as records
     from calibration.inference.preparation import prepare_input
-    from mmrjax.compile.precision import in_double
+    from mmrjax.compile.compiling import in_double
     from sweeps.points.run import simulate_histories
 
     @in_double

@@ -318,7 +318,7 @@ def actuator(robot: str) -> tuple[str, str]:
     import tempfile
 
     from calibration.data import robot_file
-    from mmrjax.compile.precision import in_double
+    from mmrjax.compile.compiling import in_double
     from sweeps.export.formats import export_format
     from sweeps.report import export_report
 

@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
 from worlds import paper  # noqa: E402
 
-from calibration.sensitivity import sobol  # noqa: E402
+from calibration.sensitivity import sampled_indices  # noqa: E402
 from calibration.sensitivity import uncertain_inputs as room  # noqa: E402
 from calibration.sensitivity.model import Model, chosen_outputs  # noqa: E402
 from mmrjax import nominal  # noqa: E402
@@ -122,31 +122,31 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     exact = ishigami_indices()
     held = np.zeros((2, 3))
     for seed in range(seeds):
-        design = sobol.sobol_design(3, size, seed, second=False)
-        found = sobol.sobol_terms(design, ishigami(design.points))
+        design = sampled_indices.sobol_design(3, size, seed, second=False)
+        found = sampled_indices.sobol_terms(design, ishigami(design.points))
         assert found is not None
-        indices = sobol.indices_of_terms(found)
+        indices = sampled_indices.indices_of_terms(found)
         for k, (true, e) in enumerate(zip(exact, (indices.first, indices.total), strict=True)):
             held[k] += (e.low <= true) & (true <= e.high)
     record["ishigami"] = {"first": (held[0] / seeds).tolist(), "total": (held[1] / seeds).tolist()}
     print("Ishigami, share of seeds whose interval holds the index:", record["ishigami"], flush=True)
 
     inputs, model, conditions = ours()
-    design = sobol.sobol_design(len(NAMES), reference_size, 2**31, second=False)
+    design = sampled_indices.sobol_design(len(NAMES), reference_size, 2**31, second=False)
     values = inputs.values(inputs.scores(design.points))
     began = time.perf_counter()
     by = by_scipy(values[:, : len(NAMES)])
     print(f"reference: {len(values)} roots by SciPy in {time.perf_counter() - began:.0f} s", flush=True)
-    known = [sobol.indices_of_terms(sobol.sobol_terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
+    known = [sampled_indices.indices_of_terms(sampled_indices.sobol_terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
     held = np.zeros((3, 2, len(NAMES)))
     for seed in range(seeds):
-        design = sobol.sobol_design(len(NAMES), size, seed, second=False)
+        design = sampled_indices.sobol_design(len(NAMES), size, seed, second=False)
         values = inputs.values(inputs.scores(design.points))
         answer = model(values, conditions)
         for j, name in enumerate(OUTPUTS):
-            found = sobol.sobol_terms(design, answer.values[name])
+            found = sampled_indices.sobol_terms(design, answer.values[name])
             assert found is not None
-            indices = sobol.indices_of_terms(found)
+            indices = sampled_indices.indices_of_terms(found)
             pairs = ((indices.first, known[j].first), (indices.total, known[j].total))
             for k, (e, true) in enumerate(pairs):
                 held[j, k] += (e.low <= true.value) & (true.value <= e.high)
@@ -172,7 +172,7 @@ def speed(points: int, repeats: int) -> dict[str, Any]:
     """Rate of model evaluations over the points of a Sobol design [1/s]: a loop of SciPy, NumPy, ours."""
     inputs, model, conditions = ours()
     blocks = 2 * len(NAMES) + 2
-    design = sobol.sobol_design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
+    design = sampled_indices.sobol_design(len(NAMES), 2 ** int(np.log2(points / 32 / blocks)), 0)
     values = inputs.values(inputs.scores(design.points))
     own = values[:, : len(NAMES)]
     some = own[:: max(len(own) // 2000, 1)]

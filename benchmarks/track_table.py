@@ -42,7 +42,7 @@ from jaxtyping import Array  # noqa: E402
 from measure import machine  # noqa: E402
 from scipy.optimize import least_squares  # noqa: E402
 
-from calibration.data import own_mass  # noqa: E402
+from calibration.data import inferred_facts  # noqa: E402
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
 from calibration.inference.held_out import fit_from_each_start  # noqa: E402
@@ -248,7 +248,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     table = read_runs("measured")
     if what == "slip":
         table = table.where(table["configuration"] == "6T2A")
-    robot = own_mass.with_table_mass(paper_robots.nominal(), read_runs("measured"))
+    robot = inferred_facts.with_table_mass(paper_robots.nominal(), read_runs("measured"))
     if what == "slip":
         robot = params.replace(robot, {"6T2A.track.guide_friction": 0.06})
         names, stated = FRICTION + GEAR, {}
@@ -439,7 +439,7 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
 def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     """Time of one generation of gears over all twenty rows, with wheeled ones also by the track model."""
     table = read_runs("measured")
-    robot = own_mass.with_table_mass(
+    robot = inferred_facts.with_table_mass(
         params.replace(paper_robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table
     )
     coordinates = priors.parameter_coordinates(robot, FRICTION + GEAR, any_surface=True)

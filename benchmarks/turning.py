@@ -21,7 +21,7 @@ from mmrjax.fidelities import drive, steady, track
 from mmrjax.model import params
 from mmrjax.model.paper_tables import SURFACES, adhesion_ratio, lateral_ratio
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
-from mmrjax.undercarriage.belt import BeltPath, tips_on_path
+from mmrjax.undercarriage.running_gear import BeltPath, tips_on_path
 
 jax.config.update("jax_enable_x64", True)
 

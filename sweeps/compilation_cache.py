@@ -3,7 +3,7 @@
 Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`. `MMRJAX_CACHE=off` switches it off.
 JAX keys an entry by program, compiler version, flags and device. A folder of its own for each version of jaxlib and
 each kind of processor keeps native code of one machine from another with the same home. Programs are native code: a
-folder that others could change is not used (`mmrjax.compile.private`). Importable without jax.
+folder that others could change is not used (`mmrjax.compile.programs`). Importable without jax.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import stat
 import warnings
 from pathlib import Path
 
-from mmrjax.compile.private import exposure_reason
+from mmrjax.compile.programs import exposure_reason
 
 VARIABLE = "MMRJAX_CACHE"
 #: The same of `mmrjax.compile.programs`, which finds programs that were kept whole there; empty to keep none so.

@@ -153,24 +153,6 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
     assert noise.noise_from_table(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (
-            "current=2%,total_current=3%",
-            "--noise total_current=3%: total_current is given twice; expected each channel once",
-        ),
-        ("amps=2%", "--noise amps=2%: no such channel; .*allowed: current, motor_speed, speed"),
-        ("current=2", "--noise current=2: expected a positive number with % or A or mA, e.g. current=2%"),
-        ("speed=-1%", "expected a positive number"),
-        ("speed=5rpm", "with % or mm/s"),
-    ],
-)
-def test_noise_refuses(text, says):
-    with pytest.raises(BadConfiguration, match=says):
-        noise.parse_noise(text, channels.usual_channels())
-
-
 def test_noise_is_in_any_unit_of_its_channel():
     shown = tuple(channels.find_channel(name) for name in ("total_current", "yaw_rate"))
     found = noise.parse_noise("current=40mA,yaw_rate=0.6deg/s", shown)
@@ -358,26 +340,6 @@ def test_too_few_readings_are_counted(gaps):
 
 
 # --- other robots, another channel ----------------------------------------------------------------------
-
-ROVER = """
-sides = 4
-configurations = ["rover"]
-[battery]
-cells = 4
-[rover]
-like = "4W2T"
-mass = 6.0
-[rover.ground.friction]
-static = 0.6
-"""
-
-
-def test_a_configuration_that_the_robot_lacks_lists_those_that_it_has(measured, tmp_path):
-    (tmp_path / "rover.toml").write_text(ROVER)
-    says = r"measured row 1?1?, configuration: got (4W2T|6T2A); expected one of these; .*allowed: rover"
-    with pytest.raises(BadData, match=says):
-        quick(measured, robot_file.read_robot(tmp_path / "rover.toml"))
-
 
 # --- from Python ------------------------------------------------------------------------------------------
 

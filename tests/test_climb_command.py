@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.data import terrains
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadData
 from mmrjax.climbing.climb_simulation import LOSSES
 from sweeps.commands import climb as room
 from sweeps.report.climb_report import footing_coordinates
@@ -86,12 +86,6 @@ def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
 def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, message, robot):
     with pytest.raises(BadData, match=message):
         terrains.read_sequence(text_file(tmp_path / "s.csv", text), robot, (0.0, 0.0))
-
-
-def test_stairs_are_read_and_refused_as_they_are_written():
-    assert terrains.parse_stairs("170x290x3") == (0.17, 0.29, 3)
-    with pytest.raises(BadConfiguration, match=r"count of 2\.5"):
-        terrains.parse_stairs("170x290x2.5")
 
 
 @pytest.mark.parametrize("limit", [87.3, 449.0, 5.0])

@@ -13,9 +13,9 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.undercarriage import contact_sums, half_robot, mjcf, side_contacts
-from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.half_robot import HalfRobotState, advance, build_system, generalized_forces, instant
 from mmrjax.undercarriage.mjcf import mjx
+from mmrjax.undercarriage.running_gear import BeltPath
 
 RUNS = {
     "tracked": dict(voltage=24.0, slope_deg=5.0, payload=3.0, battery=1.0),

@@ -103,17 +103,6 @@ def test_effect_outside_the_library_gets_no_name(outside):
     assert where.variable in bases.VARIABLES and found.families == (where.family,)
 
 
-@pytest.mark.slow
-def test_effect_outside_the_library_is_a_curve_in_the_result(outside):
-    found = SETTLED.result(outside.traced, outside.runs)
-    assert found.verdict in WITHOUT_NAME and found.effects == () and found.after.adequate
-    where = found.unnamed
-    assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.balances_alike)
-    assert where.variable in bases.VARIABLES and [e.name for e in found.robot.effects] == [where.effect]
-    assert where.score == found.chi2[0] - found.chi2[1] > 50
-    assert where.variable.replace("_", " ") in found.statement and where.variable in found.next_experiment.name
-
-
 def test_two_effects_are_both_found(looks):
     found = looks.analyst.trace(
         table(tables.narrow(["series_resistance", "mass_offset"], 12.0, seed=3, grid=looks.grid))

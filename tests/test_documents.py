@@ -14,12 +14,11 @@ from pages import Tables, as_text, drawn, outside, recorded
 
 from calibration.data import requirements_file, settling
 from calibration.data import runs as records
-from calibration.data.parts import packaged_cells
 from calibration.data.robot_file import RobotFile
 from calibration.inference.conduct import rows_after_steps
 from calibration.sizing import sheet
 from calibration.sizing.design_search import SizedDesign, SizingResult
-from calibration.sizing.part_options import drive_options
+from calibration.sizing.part_options import drive_options, packaged_cells
 from mmrjax.model import channels
 from mmrjax.model.paper_robots import nominal
 from sweeps import store

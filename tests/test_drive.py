@@ -11,8 +11,8 @@ from scipy.integrate import cumulative_simpson
 from worlds import paper
 
 from mmrjax.effects.voltage_effects import ThermalDrift
+from mmrjax.fidelities.base import movers_slip
 from mmrjax.fidelities.drive import _status_of_run, drive, drive_batch
-from mmrjax.fidelities.result import movers_slip
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
@@ -262,28 +262,6 @@ def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
 
 
 @pytest.mark.slow
-def test_drive_statuses(small):
-    _, go = small
-    runs = Conditions(
-        voltage=[24.0, 0.3, 24.0, 24.0, np.nan, 0.0, 24.0, 36.0, 15.0],
-        slope_deg=[0.0, 0.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.7],
-        configuration=[0.0, 0, 0, 0, 0, 0, 1, 1, 0],
-        payload=[0.0, 0, 0, 0, 0, 0, 0, 0, 70.0],
-        battery=[0.0, 0, 0, 1, 0, 0, 0, 0, 0],
-        discharge=[0.0, 0, 0, 7919, 0, 0, 0, 0, 0],
-    )
-    run = go(runs, 12.0)
-    expected = ["converged", "stalled", "slides", "battery_empty", "failed", "stalled", "converged", "converged"]
-    assert names(run.result)[:8] == expected
-    assert list(np.asarray(run.result.flags)[[0, 6, 7, 8]]) == [0b010, 0b010, 0b011, 0b100]
-    for field in (run.result.reading["speed"], run.result.reading["total_current"], run.result.power_ground):
-        assert np.isfinite(np.delete(np.asarray(field), [3, 4])).all()  # no NaN but where the status says why
-        assert np.isnan(np.asarray(field)[[3, 4]]).all()
-    short = go(runs, 0.05)
-    assert names(short.result)[0] == "not_settled"
-
-
-@pytest.mark.slow
 def test_a_robot_that_stands_ends_as_steady_says(small):
     """Parked, held on slopes either way, and stalled."""
     robot, go = small
@@ -305,25 +283,6 @@ def test_a_robot_that_stands_ends_as_steady_says(small):
 def test_drive_out_of_steps_has_failed(robot):
     run = drive_batch(robot, Conditions(voltage=[24.0]), jnp.linspace(0.0, 1.0, 3), 1e-6, 5)
     assert names(run.result) == ["failed"]
-
-
-@pytest.mark.slow
-def test_drive_discharges_a_full_battery_to_its_clear_end(small):
-    """Charge is what flowed. The voltage falls all the way. Past the capacity the run says so."""
-    robot, go = small
-    runs = Conditions(configuration=[0.0, 1.0, 0, 0, 0, 0, 0, 0, 0], battery=1.0, voltage=0.0)
-    run = go(runs, 1200.0)
-    assert names(run.result)[0] == "converged"
-    s = jax.tree.map(lambda x: np.asarray(x[0]), run.signals)
-    assert (np.diff(s.discharge) > 0).all() and (np.diff(s.voltage[1:]) < 0).all()
-    flow = s.total_current + 1.5  # from 60 s on it drifts slowly and smoothly
-    assert (np.diff(flow[1:]) < 0).all()
-    assert_allclose(np.trapezoid(flow[1:], run.time[0, 1:]), s.discharge[-1] - s.discharge[1], rtol=1e-4)
-    end = go(runs, 4000.0)
-    assert names(end.result) == ["battery_empty"] * 9
-    assert names(steady_batch(robot, Conditions(battery=[1.0], discharge=s.discharge[-1])))[0] == "converged"
-    point = steady_batch(robot, Conditions(battery=[1.0], discharge=s.discharge[-1]))
-    assert_allclose(run.result.reading["speed"][0], point.reading["speed"][0], rtol=1e-3)
 
 
 # --- batches ----------------------------------------------------------------------------------------

@@ -108,11 +108,6 @@ def test_user_effect_may_settle_to_another_of_the_users(tmp_path):
     assert library["seal_drag"].settles_to == "seal_wear"
 
 
-def test_robot_file_without_the_users_library_says_so(tmp_path):
-    with pytest.raises(BadConfiguration, match=r"effects\.seal_drag: no such effect"):
-        read_rig(tmp_path, "[effects.seal_drag]\namplitude = 0.05\n", "robot.toml")
-
-
 REFUSED = {
     "code fails": ("import nothing_of_this_name", r"mine\.py: its code fails \(ModuleNotFoundError"),
     "syntax": ("def (", r"mine\.py: its code fails \(SyntaxError"),
@@ -200,11 +195,6 @@ def test_bad_effect_files_are_refused_in_one_sentence(tmp_path, case):
     with pytest.raises(BadConfiguration, match=sentence) as refusal:
         effect_file.effect_library([written(tmp_path, text)])
     assert "\n" not in str(refusal.value)
-
-
-def test_missing_effect_file_is_refused(tmp_path):
-    with pytest.raises(BadConfiguration, match=r"--effects: got .*none\.py, no such file"):
-        effect_file.effect_library([tmp_path / "none.py"])
 
 
 def test_an_effect_may_read_the_torque_that_the_gearbox_transmits():

@@ -227,13 +227,3 @@ def test_unknown_fidelity_lists_those_there_are():
     for ask in (fidelities.get_fidelity, fidelities.fidelity_facts):
         with pytest.raises(KeyError, match="no fidelity fast; there are steady, drive, track"):
             ask("fast")
-
-
-@pytest.mark.slow
-def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
-    track = fidelities.get_fidelity("track")
-    stiff = params.replace(robot, {"running_gear.contact_stiffness": 3e9})
-    with pytest.raises(ValueError, match=r"the largest stable step is .* \(run \d of 2\)"):
-        track.check(stiff, RUNS, track.facts.resolved(step=1e-3))
-    with pytest.raises(ValueError, match=r"duration: got 0\.00055 s; expected a whole number of samples"):
-        track.check(robot, RUNS, track.facts.resolved(duration=5.5e-4))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
+from calibration.data import configuration_tables
 from calibration.data import runs as records
-from calibration.data import surfaces
 from calibration.inference import blocks, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import SettledTurns
@@ -41,7 +41,7 @@ def test_runs_are_what_is_held_out_first(runs):
 
 def test_loop_frees_the_friction_that_turns_show(robot, runs):
     """Of each surface. In straight travel nothing but a speed shows it."""
-    ours = surfaces.with_surface_configurations(robot, runs)
+    ours = configuration_tables.with_surface_configurations(robot, runs)
     present = runs.configurations_named(ours)
     freed = priors.loop_parameter_names(ours, present, *SettledTurns.free())
     of_ground = {f"{name}.ground.friction.{number}" for name in present for number in ("static", "speed_static")}

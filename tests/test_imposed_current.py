@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import rig_facts, robot_file, thinning
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data import rig_facts, robot_file, unused_readings
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import loop_input
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
@@ -89,7 +89,9 @@ def test_a_thinned_log_of_a_varying_current_turns_the_load_as_its_rows_do(tmp_pa
     current = np.round(2.0 * np.sin(2 * np.pi * (0.2 + 0.08 * time) * time), 3)
     angle = turned(current, every)
     rows = "".join(f"{t:.3f},{i},{np.degrees(x)}\n" for t, i, x in zip(time, current, angle, strict=True))
-    runs = thinning.thin_rows(read_table(tmp_path, "time_s,motor_current_A,output_angle_deg\n" + rows, robot), 1000)
+    runs = unused_readings.thin_rows(
+        read_table(tmp_path, "time_s,motor_current_A,output_angle_deg\n" + rows, robot), 1000
+    )
     observe = time_histories.Histories.of(runs, robot)
     assert len(runs) < 1100 and observe.times.size < len(time)
     simulated = np.asarray(jax.jit(lambda robot: observe(robot).reading)(robot))[:, 0]
@@ -311,8 +313,3 @@ def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
     }  # fmt: skip
     figure = comparison_figures.draw_errors_over_conditions(table, robot.channels)
     assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
-
-
-def test_a_table_without_its_current_is_refused(robot, tmp_path):
-    with pytest.raises(BadData, match="column motor_current_A is missing"):
-        read_table(tmp_path, "motor_speed_rpm\n100\n", robot, "runs.csv")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.climbing.lever_drives import lever_drive, step_levers
+from mmrjax.climbing.levers import lever_drive, step_levers
 from mmrjax.model import params
 from mmrjax.model.paper_robots import nominal
 

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
+from mmrjax.fidelities.base import exceeded_limits, travel_status
 from mmrjax.fidelities.rest import is_at_rest, travel_direction
-from mmrjax.fidelities.result import exceeded_limits, travel_status
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.power import Battery
 from mmrjax.model.signals import CONVERGED, REVERSES, ROLLS_BACK, STATUSES, Signals, is_done

@@ -190,29 +190,6 @@ def test_the_torque_of_a_row_is_read_in_its_unit(tmp_path, column, head, factor)
     assert "load_torque_Nm" in runs.axes
 
 
-@pytest.mark.parametrize(
-    ("cell", "said"),
-    [
-        ("", "runs.csv row 1, load_torque_Nm: got an empty cell; expected a number, -10000 to 10000"),
-        ("nan", "runs.csv row 1, load_torque_Nm: got nan; expected -10000 to 10000"),
-        ("inf", "runs.csv row 1, load_torque_Nm: got inf; expected -10000 to 10000"),
-        ("25000", "runs.csv row 1, load_torque_Nm: got 25000; is it in mNm? then name the column load_torque_mNm; "),
-        ("200 mNm", "write numbers without units, in Nm, or name the column load_torque_mNm"),
-    ],
-)
-def test_a_torque_that_is_none_is_refused(tmp_path, cell, said):
-    with pytest.raises(BadData) as error:
-        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", f"24,4000,{cell}"])
-    assert said in str(error.value)
-
-
-def test_columns_that_may_be_the_torque_are_asked_about(tmp_path):
-    with pytest.raises(BadData, match=r"unknown column load_torque; did you mean load_torque_Nm\?"):
-        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque", "24,4000,0"])
-    with pytest.raises(BadData, match="load_torque_Nm and load_torque_mNm have the same meaning"):
-        read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm,load_torque_mNm", "24,4000,0,0"])
-
-
 def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path, robot):
     head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,load_torque_mNm"
     with pytest.raises(BadData) as error:

@@ -8,7 +8,7 @@ import pytest
 from test_log_kinds import carriage, servo, written
 from test_weak_form import RIG, motor
 
-from calibration.data import invalid_readings, rig_facts, robot_file
+from calibration.data import rig_facts, robot_file, unused_readings
 from calibration.data import runs as records
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
@@ -106,9 +106,9 @@ def test_readings_that_are_held_at_the_last_value_are_left_out(robot, column, le
     columns = motor()
     columns["output_angle_deg"] = np.cumsum(columns[SPEED])
     runs = Runs("log.csv", columns, layout=dataclasses.replace(Layout.of(robot), channels=shown))
-    assert invalid_readings.without_held(runs).notes == ()
+    assert unused_readings.without_held(runs).notes == ()
     faulty = dataclasses.replace(runs, columns={**columns, column: held(columns[column])})
-    found = invalid_readings.without_held(faulty)
+    found = unused_readings.without_held(faulty)
     lost = {c.column: np.isnan(found[c.column]) for c in shown}
     assert {name: rows.sum() for name, rows in lost.items()} == dict.fromkeys(lost, 0) | {column: left_out}
     assert lost[column].reshape(4, 150)[:, 81:].all() == bool(left_out)

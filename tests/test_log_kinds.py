@@ -6,7 +6,7 @@ import pytest
 from calibration.data import robot_file, settling
 from calibration.data import runs as records
 from calibration.data.stated import EXAMPLE
-from calibration.data.thinning import thin_rows
+from calibration.data.unused_readings import thin_rows
 from calibration.inference import bases, observers
 from calibration.inference.preparation import prepare_input
 from sweeps.commands import rig_new

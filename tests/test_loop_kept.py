@@ -75,12 +75,6 @@ def test_a_budget_has_a_unit(text, seconds):
     assert config.LoopBeside(within=text).seconds == seconds
 
 
-def test_a_budget_of_no_time_is_refused():
-    assert config.LoopBeside().seconds == 600.0
-    with pytest.raises(BadConfiguration, match="within: got '5 weeks'"):
-        config.resolve_further_options(config.LoopBeside, {"within": "5 weeks"})
-
-
 @pytest.fixture
 def rig(tmp_path):
     """A folder with a bench's file and its table."""

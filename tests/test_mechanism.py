@@ -136,7 +136,8 @@ def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechan
     leads, stribeck = fitted("leads", explains=1500.0), fitted("stribeck", explains=1500.0)
     assert of_log(leads).families == (SPEED.family,) and of_log(leads).fails == ()
     assert of_log(leads, reads=False) is None  # no simulation confirms a curve of windows
-    assert of_log(stribeck).effects == of_log(stribeck, reads=False).effects == ("stribeck",)
+    assert of_log(stribeck, reads=False).effects == ("stribeck",)
+    assert of_log(stribeck).families == (SPEED.family,) and of_log(stribeck).effects == ()  # only the curve predicts
     # a constant that differs in one run explains more
     assert of_log(leads, run=(2, "motor.inertia", 44.0)).fails == ("run",)
     assert of_log(leads, run=(2, "motor.inertia", 43.0)).fails == ()
@@ -226,11 +227,20 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     columns, jacobian = rng.standard_normal((rows, 2)), rng.standard_normal((rows, free))
     jacobian = np.concatenate([jacobian, np.eye(free)])
     residual = np.append(2.0 * columns[:, 0] + 0.3 * rng.standard_normal(rows), np.zeros(free))
-    linear = SimpleNamespace(jacobian=jacobian, residual=residual, readings=rows)
+    points = lambda *_: (np.ones(rows), np.ones(rows))  # noqa: E731
+    linear = SimpleNamespace(jacobian=jacobian, residual=residual, readings=rows, curve_variable=points)
+    seen = []
+
+    def curve_of(linear, place, variable, included):
+        seen.append(included)
+        return SimpleNamespace(scale=2.0, root=np.eye(2), basis=lambda x: columns / 2)
+
+    monkeypatch.setattr(room, "fit_smooth_curve", curve_of)
+    monkeypatch.setattr(room, "place_signature", lambda linear, place, shapes: shapes)
     monkeypatch.setattr(room, "location_columns", lambda *_: columns)
     kinds = {"run": {name: np.arange(rows) // 10 == k for k, name in enumerate("abcd")}}
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: kinds)
-    monkeypatch.setattr(room.blocks_room, "parts_over_time", lambda _: {"half": np.arange(rows) % 4 < 2})
+    monkeypatch.setattr(room.blocks_room, "parts_of_runs", lambda _: {"half": np.arange(rows) % 4 < 2})
     data = SimpleNamespace(sd=np.full((rows, 1), 0.5))
     space = SimpleNamespace(weight=np.ones((rows, 1)), included=np.ones(rows, bool), bare=SimpleNamespace(data=data))
     beside = SimpleNamespace(left=SimpleNamespace(linear=linear), where=SPEED, bases=())
@@ -251,6 +261,7 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     counts = change >= room.CHANGED * np.sqrt(np.mean(change**2))
     assert 4 < counts.sum() < rows and got.mean == pytest.approx((density[0] - density[1])[counts].mean(), rel=1e-9)
     assert got.mean > 5 * got.se > 0
+    assert all(any((included == ~out).all() for included in seen) for out in kinds["run"].values())
     wave = SimpleNamespace(
         **vars(beside) | {"where": dataclasses.replace(SPEED, variable="order 2 of the driving shaft")}
     )

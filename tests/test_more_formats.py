@@ -140,14 +140,6 @@ def test_sheets_of_a_workbook_are_chosen_by_name(tmp_path):
         signals_of(file)["hot/n"].load()
 
 
-def test_damaged_workbook_is_refused(tmp_path):
-    write_xlsx(tmp_path / "bench.xlsx", Bench=ROWS)
-    content = (tmp_path / "bench.xlsx").read_bytes()
-    (tmp_path / "bench.xlsx").write_bytes(content[:400])
-    with pytest.raises(BadData, match="cannot be read as a workbook"):
-        signals_of(tmp_path / "bench.xlsx")
-
-
 # --- text ---------------------------------------------------------------------------------------------------------
 
 

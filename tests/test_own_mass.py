@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import SETTLED, STATED
 
-from calibration.data import own_mass, robot_file
+from calibration.data import inferred_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import findings, loop_input
@@ -140,7 +140,7 @@ def test_comparison_can_fail(tmp_path):
     conditions = runs.conditions(robot)
     before, _ = jax.device_get(_swept(params.without_weak_types(robot), conditions))
     assert np.abs(written(robot)[0] / before - 1).max() > 0.02
-    assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
+    assert_allclose(written(inferred_facts.with_table_mass(robot, runs))[0], before, rtol=1e-9)
 
 
 # --- what is said ---------------------------------------------------------------------------------------
@@ -148,60 +148,60 @@ def test_comparison_can_fail(tmp_path):
 
 def test_mass_of_the_table_is_taken_and_said(robot):
     runs = table({"6T2A": 13.1, "4W2T": 13.1})
-    assert own_mass.mass_notes(robot, runs) == [
+    assert inferred_facts.mass_notes(robot, runs) == [
         "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg. 13.1 kg is used, and written to robot.toml"
     ]
-    taken = own_mass.with_table_mass(robot, runs)
+    taken = inferred_facts.with_table_mass(robot, runs)
     assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1
     # Of a sum of floats the rounding is neither written nor said, and what is taken is not taken again.
-    assert own_mass.mass_notes(taken, runs) == []
+    assert inferred_facts.mass_notes(taken, runs) == []
 
 
 def test_a_table_without_masses_leaves_the_robots(robot):
     runs = unweighed(table())
-    assert own_mass.with_table_mass(robot, runs) is robot or own_mass.stated_masses(robot, runs) == {}
-    assert own_mass.mass_notes(robot, runs) == []
+    assert inferred_facts.with_table_mass(robot, runs) is robot or inferred_facts.stated_masses(robot, runs) == {}
+    assert inferred_facts.mass_notes(robot, runs) == []
 
 
 def test_a_mass_that_varies_is_said_and_its_median_written(robot):
     runs = table()
     runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
-    (said, _) = own_mass.mass_notes(robot, runs)
+    (said, _) = inferred_facts.mass_notes(robot, runs)
     assert said == (
         "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. robot.toml contains "
         "the median, 14.35 kg, so it does not reproduce the fit in other rows"
     )
-    assert float(own_mass.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
+    assert float(inferred_facts.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
 
 
 def test_a_total_without_its_payload_is_suspected(robot):
     runs = table()
     runs.columns["total_mass_kg"][:] = 13.1
-    said = own_mass.mass_notes(robot, runs)
+    said = inferred_facts.mass_notes(robot, runs)
     assert len(said) == 2 and all(s.endswith("; does total_mass_kg exclude the payload?") for s in said)
 
 
 def test_a_surface_other_than_the_robots_is_said(robot):
-    said = own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
+    said = inferred_facts.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
     assert said == [
         "the table has runs on asphalt: the written friction is for lacquered_wood. Simulate with "
         "--surface asphalt to use the fitted values"
     ]
-    assert own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
+    assert inferred_facts.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
 
 
 def test_a_mass_that_no_robot_has_is_refused(robot):
     runs = table({"6T2A": 0.003, "4W2T": 13.1})
     says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected 0\.01 to 10000 kg without"
     with pytest.raises(BadData, match=says):
-        own_mass.with_table_mass(robot, runs)
+        inferred_facts.with_table_mass(robot, runs)
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
     says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
     with pytest.raises(BadConfiguration, match=says):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
-    own_mass.check_priors(["4W2T.mass"], robot, unweighed(table()))
+    inferred_facts.check_priors(["4W2T.mass"], robot, unweighed(table()))
 
 
 # --- what calibration writes (what the loop writes: tests/test_prediction.py) ---------------------------

@@ -7,17 +7,17 @@ import tomllib
 
 import pytest
 
-from calibration.data import parts
 from calibration.data.input_errors import BadData
+from calibration.sizing import part_options
 from mmrjax.effects.voltage_effects import ThermalDrift
 from mmrjax.model.gearmotor import Gearbox, Motor
 from mmrjax.model.power import Battery
 from tests.commands import ROOT
 
 TABLES = {
-    "motors.csv": parts.packaged_motors,
-    "gearboxes.csv": parts.packaged_gearboxes,
-    "cells.csv": parts.packaged_cells,
+    "motors.csv": part_options.packaged_motors,
+    "gearboxes.csv": part_options.packaged_gearboxes,
+    "cells.csv": part_options.packaged_cells,
 }
 #: What a motor has to state to be sized with.
 NEEDED = (
@@ -71,15 +71,15 @@ def test_parts_have_sources_and_finite_positive_values(file):
 
 
 def test_parts_motors_are_enough_and_state_what_sizing_needs():
-    assert len(parts.packaged_motors()) >= 8
-    assert {m.maker for m in parts.packaged_motors()} >= {"maxon", "Faulhaber"}
-    for motor in parts.packaged_motors():
+    assert len(part_options.packaged_motors()) >= 8
+    assert {m.maker for m in part_options.packaged_motors()} >= {"maxon", "Faulhaber"}
+    for motor in part_options.packaged_motors():
         assert set(NEEDED) <= set(given(motor)), motor.name
         power = motor.torque_constant * (motor.current_nominal - motor.current_no_load) * motor.speed_no_load
         assert 10 < power < 200, motor.name
 
 
-@pytest.mark.parametrize("motor", parts.packaged_motors(), ids=lambda m: m.name)
+@pytest.mark.parametrize("motor", part_options.packaged_motors(), ids=lambda m: m.name)
 def test_parts_motor_sheet_is_consistent(motor):
     assert inconsistent(motor) == []
     assert motor.current_no_load < 0.2 * motor.current_nominal
@@ -89,7 +89,7 @@ def test_parts_motor_sheet_is_consistent(motor):
 
 def test_parts_winding_stays_cool_at_the_nominal_current():
     """In still air at 25 °C with hot copper, where the sheet states a limit. No sheet rates itself beyond it."""
-    for m in parts.packaged_motors():
+    for m in part_options.packaged_motors():
         if math.isnan(m.temperature_winding_max):
             continue
         hot = m.resistance * (1 + 0.00393 * (m.temperature_winding_max - 25))
@@ -98,7 +98,7 @@ def test_parts_winding_stays_cool_at_the_nominal_current():
 
 
 def test_parts_hold_the_robot_of_the_paper():
-    (motor,) = (m for m in parts.packaged_motors() if m.name == "RE 30 24 V")
+    (motor,) = (m for m in part_options.packaged_motors() if m.name == "RE 30 24 V")
     ours = Motor()
     assert motor.resistance == pytest.approx(float(ours.resistance), rel=1e-12)
     assert motor.inductance == pytest.approx(float(ours.inductance), rel=1e-12)
@@ -107,16 +107,16 @@ def test_parts_hold_the_robot_of_the_paper():
     thermal = motor.resistance_thermal_housing + motor.resistance_thermal_winding
     assert thermal == pytest.approx(float(ours.resistance_thermal), rel=1e-12)
     assert motor.time_constant_winding == pytest.approx(float(ThermalDrift().time_constant), rel=1e-12)
-    (gearbox,) = (g for g in parts.packaged_gearboxes() if g.order_number == "166936")
+    (gearbox,) = (g for g in part_options.packaged_gearboxes() if g.order_number == "166936")
     assert gearbox.ratio == pytest.approx(576 / 25) and gearbox.family in motor.gearboxes
     assert abs(gearbox.efficiency - float(Gearbox().efficiency_load)) < 0.02  # measured 0.74, catalogue 0.75
-    cell = parts.packaged_cells()[0]
+    cell = part_options.packaged_cells()[0]
     assert cell.capacity == pytest.approx(float(Battery().capacity))
     assert cell.resistance == pytest.approx(float(Battery().resistance))
 
 
 def test_parts_gearboxes_are_consistent():
-    for g in parts.packaged_gearboxes():
+    for g in part_options.packaged_gearboxes():
         assert g.torque_intermittent_max > g.torque_max and 0.5 < g.efficiency < 1, g.name
         assert 3 <= g.ratio ** (1 / g.stages) <= 9, g.name
         assert g.name.startswith(g.family) and float(g.name.split()[-1][:-2]) == pytest.approx(g.ratio, rel=0.04)
@@ -126,12 +126,12 @@ def test_parts_gearboxes_are_consistent():
             shaft = g.torque_max * g.speed_input_max / g.ratio
             assert math.isnan(g.power_max) == bool(g.note), g.name
             assert math.isnan(g.power_max) or g.power_max < 1.1 * shaft, g.name
-    families = {g.family for g in parts.packaged_gearboxes()}
-    assert all(set(m.gearboxes) <= families and m.gearboxes for m in parts.packaged_motors())
+    families = {g.family for g in part_options.packaged_gearboxes()}
+    assert all(set(m.gearboxes) <= families and m.gearboxes for m in part_options.packaged_motors())
 
 
 def test_parts_cells_weigh_what_cells_weigh():
-    weighed = [c for c in parts.packaged_cells() if not math.isnan(c.mass)]
+    weighed = [c for c in part_options.packaged_cells() if not math.isnan(c.mass)]
     assert len(weighed) >= 3
     for cell in weighed:
         grams_per_amp_hour = 1e3 * cell.mass / cell.cells / (cell.capacity / 3600)
@@ -141,7 +141,7 @@ def test_parts_cells_weigh_what_cells_weigh():
 def test_parts_columns_are_those_of_the_sheets(tmp_path, monkeypatch):
     folder = tmp_path / "data/parts"
     folder.mkdir(parents=True)
-    monkeypatch.setattr(parts.resources, "files", lambda package: tmp_path)
+    monkeypatch.setattr(part_options.resources, "files", lambda package: tmp_path)
     with (ROOT / "calibration/data/parts/cells.csv").open(encoding="utf-8", newline="") as lines:
         header, first, *_ = csv.reader(lines)
 
@@ -149,7 +149,7 @@ def test_parts_columns_are_those_of_the_sheets(tmp_path, monkeypatch):
         with (folder / "cells.csv").open("w", encoding="utf-8", newline="") as out:
             csv.writer(out).writerows(rows)
 
-    read = parts.packaged_cells.__wrapped__
+    read = part_options.packaged_cells.__wrapped__
     write(header, first)
     assert read()[0].name == "XP2200SL"
     write(header, [v if c != "capacity_mAh" else "2.2 Ah" for c, v in zip(header, first, strict=True)])

@@ -15,8 +15,6 @@ from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
 from calibration.data.runs import read_runs
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
-from mmrjax.fidelities.steady import steady_batch
-from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
 from sweeps import config
 from sweeps.points import run
@@ -80,28 +78,6 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
     guide = (values[:, 1] - 0.3) / 0.2
     assert np.corrcoef(z, guide)[0, 1] == pytest.approx(-0.06 / (0.3 * 0.32), abs=0.02)
     assert_array_equal(values, posterior.draw(20_000, 0))
-
-
-@pytest.mark.slow
-def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted):
-    runs = read_runs("measured").where(np.array([0, 1, 5, 6]))
-    found = run.simulate_draws(fitted, posterior, runs, config.Compare(), 500)
-    conditions = runs.conditions(fitted)
-
-    def readings(z):
-        return steady_batch(
-            Variation(fitted, posterior.names).at(posterior.at(z), conditions)[0], conditions
-        ).total_current
-
-    mean, step = np.asarray(posterior.mean), 1e-4
-    sides = [[np.asarray(readings(mean + sign * step * e)) for e in np.eye(len(mean))] for sign in (1, -1)]
-    slopes = (np.array(sides[0]) - np.array(sides[1])).T / (2 * step)
-    linear = np.sqrt(np.einsum("ij,jk,ik->i", slopes, posterior.covariance, slopes))
-    column = "total_current_A"
-    assert_allclose(found.sd(column), linear, rtol=0.1)
-    middle = np.asarray(readings(jnp.asarray(posterior.mean)))
-    assert_allclose(found.columns[column + "_upper"] - middle, 1.96 * linear, rtol=0.2)
-    assert np.all(found.columns[run.SHARE] == 1)
 
 
 @pytest.mark.slow
@@ -207,13 +183,6 @@ def _written(posterior, folder):
     assert len(room.read_posterior(folder / room.FILE)) == len(posterior)
     with xarray.open_dataset(folder / room.FILE, engine="scipy") as data:
         return data.load().copy(deep=True)
-
-
-def test_file_of_another_schema_is_refused(tmp_path):
-    xarray = pytest.importorskip("xarray")
-    xarray.Dataset({"x": 1.0}).to_netcdf(tmp_path / room.FILE, engine="scipy")
-    with pytest.raises(BadData, match=r"not a readable posterior \(ValueError: schema None"):
-        room.read_posterior(tmp_path / room.FILE)
 
 
 def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_public_api import python
 
 import mmrjax as mm
-from mmrjax.compile import precision
+from mmrjax.compile import compiling
 from mmrjax.model import params
 from mmrjax.model.params import walk_parameters
 
@@ -68,7 +68,7 @@ def test_threads_have_the_precision_of_who_hands_them_work(single):
         return jnp.asarray(0.1).dtype.name, threading.get_ident() != mine
 
     mine = threading.get_ident()
-    with precision.Threads(1) as threads:
+    with compiling.Threads(1) as threads:
         assert threads.submit(kind).result() == ("float32", True)
         with jax.enable_x64(True):
             assert [*threads.map(lambda _: kind(), range(2))] == [("float64", True)] * 2

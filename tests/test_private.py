@@ -7,7 +7,7 @@ import jax
 import pytest
 
 from mmrjax.compile import programs
-from mmrjax.compile.private import exposure_reason
+from mmrjax.compile.programs import exposure_reason
 from sweeps import compilation_cache
 
 

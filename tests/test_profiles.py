@@ -235,19 +235,3 @@ def test_a_mission_begins_as_its_profile_says(read, robot):
         table.start,
     )
     assert float(found.total.of["distance"]) > 0.01 and 59.0 < float(found.peaks["temperature"]) <= 60.0
-
-
-def test_unknown_name_lists_what_is_packaged():
-    with pytest.raises(BadData, match=r"patroll: no such file and no packaged profile; .*patrol"):
-        profiles.read_profile("patroll")
-
-
-def test_folder_is_no_profile(tmp_path):
-    with pytest.raises(BadData, match="is a folder; expected a file"):
-        profiles.read_profile(tmp_path)
-
-
-def test_bytes_that_are_no_text(tmp_path):
-    (tmp_path / "x.csv").write_bytes(b"time_s,duty\n\0\xff\xfe")
-    with pytest.raises(BadData, match=r"x.csv: cannot be read as a text file"):
-        profiles.read_profile(tmp_path / "x.csv")

@@ -22,6 +22,7 @@ from calibration.discovery import (
 )
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
+from calibration.inference.bases import family_names
 from calibration.inference.observers import Histories, windows
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
@@ -38,8 +39,9 @@ SETTINGS = settings_for(Histories, 333)
 
 
 def log(
-    seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0
-):
+    seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0,
+    cold=0.0,
+):  # fmt: skip
     """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
 
     Args:
@@ -48,6 +50,7 @@ def log(
         rough: friction of the third run alone is larger by this share.
         swings: the voltage swings, and is held from row to row.
         slow: sd of a torque that nobody knows and that changes every 0.4 s [N·m].
+        cold: friction is larger by it at the start of each run, and falls within 0.5 s.
     """
     rng = np.random.default_rng(seed)
     levels = np.where(np.arange(5) % 2, rng.uniform(1.2, 4.0, (4, 5)), rng.uniform(4.0, 24.0, (4, 5)))
@@ -65,6 +68,7 @@ def log(
             dry = (
                 0.02
                 * (1 + rough * (np.arange(4) == 2) + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60))
+                * (1 + cold * np.exp(-n * EVERY / 0.5))
                 * np.tanh(speed / 0.05)
             )
             torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed + unknown[:, n]
@@ -210,6 +214,16 @@ def test_a_torque_that_changes_slowly_does_not_look_like_an_effect(answered):
     posed = answered.windows_of(seed=5, slow=0.01)[2]
     scores = np.abs(np.asarray(score_tests.score_tests(posed.observe.linear, ()).single))
     assert 0 < scores.max() < 2.0
+
+
+def test_a_friction_that_falls_within_each_run_is_a_curve_over_time(answered, monkeypatch):
+    """Stairs of voltage tell most of the time, but not all of it."""
+    monkeypatch.setattr(log_stages, "LONG", 0)
+    given = log_stages.windows_of_log(answered.input_of(cold=1.0))
+    observe = given.equations.bare.observe
+    bases = observe.bases({}, np.ones(len(given.runs), bool), given.robot)
+    scores = np.asarray(score_tests.score_tests(observe.linear, bases).curve)
+    assert family_names(bases)[np.argmax(scores)] == ("track", "time")
 
 
 @pytest.mark.slow

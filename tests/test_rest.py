@@ -95,19 +95,6 @@ def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says
     assert min((held & spins).sum(), (held & ~spins).sum(), falls.sum()) > 100
 
 
-@pytest.mark.slow
-def test_a_robot_that_its_drive_and_the_ground_hold_stands(robot):
-    """6T2A on 17 degrees: gravity less rolling is 0.77 of the adhesion, travel would take 1.14 of it."""
-    voltage = np.array([0.0, 0.5, 0.9, -0.02, 3.0, 24.0])
-    found = steady_batch(robot, Conditions(np.zeros(6, int), voltage, np.full(6, 17.0)))
-    assert list(WORDS[np.asarray(found.status)]) == ["stalled"] * 4 + ["slides"] * 2
-    assert (np.asarray(found.speed)[:4] == 0).all() and (np.asarray(found.motor_speed)[:2] == 0).all()
-    used = np.asarray(found.adhesion_used)
-    assert (used[:4] <= 1).all() and (used[4:] > 1).all()  # the ground carries no more than it can
-    assert_allclose(found.total_current[1], 2 * 0.5 / 0.611, rtol=1e-9)
-    assert_allclose(found.traction[1], 13.1 * paper.G * np.sin(np.radians(17.0)), rtol=1e-9)
-
-
 #: Voltage, slope [deg] and payload [kg] of a 6T2A that stands: parked on level ground and on slopes either way, with
 #: rolling resistance in part, stalled, its motors too weak forward and backward.
 STANDING = [

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.data import stated
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import bases, observers
 from sweeps.commands import rig_check
@@ -72,11 +71,6 @@ def test_a_mistake_in_a_rigs_file_is_one_sentence(tmp_path, case):
     with pytest.raises(BadConfiguration, match=message) as refused:
         rig_of(tmp_path, text)
     assert "\n" not in str(refused.value)
-
-
-def test_a_number_that_is_none_is_not_blamed_on_its_sd():
-    with pytest.raises(BadConfiguration, match=r"^x: got 'inf ± 1'; expected a number, or one"):
-        stated.stated_number("inf ± 1", "x")
 
 
 def test_a_folder_is_no_rigs_file(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import instruments, rig_facts, robot_file, surfaces
+from calibration.data import configuration_tables, inferred_facts, rig_facts, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
@@ -24,8 +24,6 @@ from mmrjax.model.rig import Instrument, Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STALLED
-from sweeps import config as configuration
-from sweeps.points import run
 from tests.commands import csv_text, read_rig, read_table, text_file
 
 DRIVE = {
@@ -384,7 +382,7 @@ ON = "motor_speed_rpm,surface,total_current_A,speed_mm_s\n" + "".join(
 def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_path):
     robot = vehicle(priors=(("rig.ground.friction.static", 0.6, 0.1), ("rig.radius", 0.05, 0.001)))
     runs = read(tmp_path, ON, robot)
-    apart = surfaces.with_surface_configurations(robot, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
     assert apart.configurations.names == ("rig-felt", "rig-tiles")
     assert apart.rig.surfaces == (("rig-tiles", "rig-felt"),)
     assert runs.configurations(apart).tolist() == [0, 0, 0, 1, 1, 1]
@@ -392,8 +390,8 @@ def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_p
         "rig-felt.ground.friction.static", "rig-tiles.ground.friction.static", "rig-felt.radius",
     }  # fmt: skip
     assert (
-        surfaces.with_surface_configurations(apart, runs) == apart
-        or surfaces.with_surface_configurations(apart, runs).rig.surfaces == apart.rig.surfaces
+        configuration_tables.with_surface_configurations(apart, runs) == apart
+        or configuration_tables.with_surface_configurations(apart, runs).rig.surfaces == apart.rig.surfaces
     )
     assert runs.conditions(apart).adhesion == pytest.approx(1.0)
     again = read(tmp_path, ON, apart)  # without a column configuration
@@ -405,7 +403,7 @@ def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_p
 def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
-    apart = surfaces.with_surface_configurations(robot, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
     names = priors.loop_parameter_names(apart, runs.configurations_named(apart))
     assert "rig-felt.radius" in names and "rig-tiles.radius" not in names
     assert {"rig-felt.ground.rolling_resistance", "rig-tiles.ground.rolling_resistance"} <= set(names)
@@ -423,7 +421,9 @@ def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
 def test_one_surface_alone_and_a_robot_without_the_others_stay_as_they_are(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
-    assert surfaces.with_surface_configurations(robot, runs.where(np.arange(3))).configurations.names == ("rig",)
+    assert configuration_tables.with_surface_configurations(robot, runs.where(np.arange(3))).configurations.names == (
+        "rig",
+    )
     assert runs.configurations(robot).tolist() == [0] * 6  # simulated as it is
 
 
@@ -431,7 +431,7 @@ def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(ro
     runs = records.read_runs("measured").where(np.arange(4))
     columns = {**runs.columns, "surface": np.array(["linoleum", "linoleum", "sand", "sand"])}
     runs = dataclasses.replace(runs, columns=columns)
-    apart = surfaces.with_surface_configurations(robot, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
     assert apart.configurations.names == ("6T2A", "4W2T", "6T2A-sand") and apart.rig.surfaces == (
         ("6T2A-sand", "6T2A"),
     )
@@ -441,8 +441,10 @@ def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(ro
 def test_options_name_a_configuration_that_gave_way_to_its_surfaces(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
-    apart = surfaces.with_surface_configurations(robot, runs)
-    said = surfaces.names_of_surfaces(["rig.radius", "rig.ground.friction.static", "motor.resistance"], apart, runs)
+    apart = configuration_tables.with_surface_configurations(robot, runs)
+    said = configuration_tables.names_of_surfaces(
+        ["rig.radius", "rig.ground.friction.static", "motor.resistance"], apart, runs
+    )
     assert said == [
         "rig-felt.radius", "rig-felt.ground.friction.static", "rig-tiles.ground.friction.static", "motor.resistance",
     ]  # fmt: skip
@@ -500,16 +502,6 @@ def test_a_gear_ratio_upside_down_is_said(tmp_path):
 
 
 @pytest.mark.slow
-def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
-    robot = bench("voltage", ("motor_speed",))
-    columns = {"supply_voltage_V": np.array([6.0, 9, 12, 24])}
-    runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=columns["supply_voltage_V"]), columns)
-    off = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] * np.pi / 30})
-    with pytest.raises(BadData, match=r"motor_speed_rpm: about .* are they in rad/s"):
-        check_ranges(off, robot)
-
-
-@pytest.mark.slow
 def test_a_slow_speed_where_the_stated_friction_holds_the_robot_is_no_matter_of_units(tmp_path):
     # Between a robot that stands and one of a tenth of its friction any speed is possible, also a sixtieth of that
     # one's, which was refused: "are they in turns/s?".
@@ -533,15 +525,6 @@ def test_an_arm_has_no_steady_state(tmp_path):
     ) as refusal:
         calibrate(runs, robot, noise="motor_speed=1%")
     assert "\n" not in str(refusal.value)
-
-
-def test_an_arm_is_simulated_over_time_alone():
-    robot = bench("voltage", ("motor_speed",), load={"torque_gravity": 0.2})
-    config = configuration.Simulate(model="steady")
-    with pytest.raises(
-        BadConfiguration, match=r"--model steady: rig has a gravity torque .* --model drive, and tables with time_s"
-    ):
-        run.check_runs_bearable(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
 
 
 def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
@@ -580,13 +563,13 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
     ],
 )
 def test_step_of_readings_is_their_common_divisor(readings, step):
-    assert instruments.common_step(np.array(readings)) == pytest.approx(step, rel=1e-9)
+    assert inferred_facts.common_step(np.array(readings)) == pytest.approx(step, rel=1e-9)
 
 
 def test_step_of_an_encoder_is_found_in_a_log_that_is_printed_to_nine_digits():
     """648.632813 for 648.6328125: the step was not found, and its rounding was not in the noise."""
     angle = np.round(360 / 1024 * np.cumsum(np.random.default_rng(0).integers(1, 9, 400)), 6)
-    assert angle.max() > 500 and instruments.common_step(angle) == pytest.approx(360 / 1024, rel=1e-4)
+    assert angle.max() > 500 and inferred_facts.common_step(angle) == pytest.approx(360 / 1024, rel=1e-4)
 
 
 def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
@@ -601,8 +584,8 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     runs = records.read_runs(path, robot=free)
     (found,) = runs.layout.instruments
     assert found.signed is False and found.quantum == pytest.approx(0.03, rel=1e-9)
-    assert instruments.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
-    assert instruments.with_inferred_instruments(stated, runs) is stated
+    assert inferred_facts.with_inferred_instruments(free, runs).rig.instruments == runs.layout.instruments
+    assert inferred_facts.with_inferred_instruments(stated, runs) is stated
     size = np.ones((8, 1))
     sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
     assert_allclose(sds[0], sds[1], rtol=1e-9)

@@ -102,13 +102,6 @@ def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
     assert float(crawler.track.guide_friction) == 0.20 and float(crawler.ground.friction.speed_static) == 0.02
 
 
-def test_set_on_a_configuration_that_is_not_there_lists_those_that_are(robot):
-    with pytest.raises(
-        BadConfiguration, match=r"--set, rover\.mass: no such parameter; .*the robot has .*, 6T2A, 4W2T"
-    ):
-        robot_file.change_robot(robot, {"rover.mass": 3.0}, where="--set")
-
-
 REFUSED = {
     "misspelt table": (
         "[motr]\nresistance = 1",
@@ -196,13 +189,6 @@ def test_bad_robots_are_refused_in_one_sentence(tmp_path, case):
     with pytest.raises(BadConfiguration, match=sentence) as refusal:
         read_rig(tmp_path, text, "mine.toml")
     assert refusal.value.exit_code == 2
-
-
-def test_unknown_name_lists_the_robots():
-    with pytest.raises(
-        BadConfiguration, match=r"--robot: got nominel, no such file and no known robot; did you mean nominal"
-    ):
-        robot_file.load_robot("nominel")
 
 
 def test_ratings_are_stated_written_and_checked(tmp_path):

@@ -262,11 +262,6 @@ def test_bad_tables_are_refused_in_one_sentence(tmp_path, case):
     assert refusal.value.exit_code == 4
 
 
-def test_missing_files_are_refused(tmp_path):
-    with pytest.raises(BadData, match=r"no such file and no packaged table; packaged: measured, simulated_by_paper"):
-        records.read_runs(tmp_path / "none.csv")
-
-
 # --- as spreadsheets and people write them -----------------------------------------------------------
 
 

@@ -1,6 +1,5 @@
 """The command `sensitivity` and its study: against finite differences and the model itself, and what is refused."""
 
-import re
 from types import SimpleNamespace
 
 import jax
@@ -10,17 +9,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data import posterior_file as posteriors
-from calibration.data import robot_file
 from calibration.inference import priors
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
-from calibration.sensitivity.local import inert_inputs, local_derivatives
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import OperatingPoints
-from calibration.sensitivity.study import Study
+from calibration.sensitivity.study import Study, inert_inputs, local_derivatives
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
@@ -164,45 +160,6 @@ def test_an_output_that_nothing_changes_has_no_figures(monkeypatch):
     found = SimpleNamespace(outputs=outputs, comparison={}, names=("a", "b"))
     blocks = [block for section in sensitivity_report._sections(found) for block in section.blocks]
     assert [b.name for b in blocks if isinstance(b, Figure)] == ["tornado_speed"]
-
-
-@pytest.mark.slow
-def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmrjax, tmp_path, robot):
-    coordinates = priors.parameter_coordinates(robot, NAMES[:2])
-    found = posterior_of_coordinates(coordinates, np.zeros(2), 0.01 * np.eye(2))
-    values = np.asarray(found.at(np.zeros(2)))
-    fitted = params.replace(robot, {n: jnp.asarray(v) for n, v in zip(found.names, values, strict=True)})
-    robot_file.write_robot(fitted, tmp_path / "robot.toml", note="of a test")
-    posteriors.write_posterior(found, tmp_path / posteriors.FILE)
-    code, out, _ = mmrjax(
-        "sensitivity --robot robot.toml --posterior --voltages 24 --payloads 3 --slopes 0 --configurations 6T2A --outputs speed --evaluations 6000 --no-report --out p",
-    )  # fmt: skip
-    document = read_json(tmp_path / "p/result.json")
-    jsonschema.validate(document, SCHEMA)
-    assert code == 0 and document["method"] == "local" and document["correlated"]
-
-    _, out, _ = ends(
-        mmrjax("simulate --robot robot.toml --posterior 60 --voltage 24 --no-report --out u"),
-        code=0,
-    )
-    assert re.search(r"total current \[A\] +\d\.\d+ ± 0\.\d+", out)
-    (row,) = table(tmp_path / "u/runs.csv")
-    low, high = float(row["speed_mm_s_lower"]), float(row["speed_mm_s_upper"])
-    assert low < float(row["speed_mm_s"]) < high
-    assert float(row["speed_mm_s_sd"]) == pytest.approx((high - low) / 3.92, rel=0.3)
-    ends(
-        mmrjax(
-            "sweep --robot robot.toml --posterior 20 --slopes 0 --voltages 24 --configurations 6T2A --no-report --out w",
-        ),
-        " ± ",
-        code=0,
-    )
-    assert "speed_mm_s_sd" in table(tmp_path / "w/runs.csv")[0]
-    ends(
-        mmrjax("simulate --robot robot.toml --set", f"{NAMES[0]}=0.03", "--posterior", "20"),
-        f"{NAMES[0]} is 0.03 in the robot; expected",
-        code=4,
-    )
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.sensitivity import morris, sobol
-from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
+from calibration.sensitivity import sampled_indices
+from calibration.sensitivity.sampled_indices import REPLICATES, ratio_estimate
 
 A, B = 7.0, 0.1
 
@@ -29,12 +29,12 @@ def within(estimate, truth, widths=1.5):
 
 @pytest.fixture(scope="module")
 def design():
-    return sobol.sobol_design(3, 64, 1)
+    return sampled_indices.sobol_design(3, 64, 1)
 
 
 @pytest.fixture(scope="module")
 def found(design):
-    return sobol.indices_of_terms(sobol.sobol_terms(design, ishigami(design.points)))
+    return sampled_indices.indices_of_terms(sampled_indices.sobol_terms(design, ishigami(design.points)))
 
 
 def test_sobol_indices_are_those_of_ishigami(found):
@@ -54,47 +54,47 @@ def test_sobol_interval_of_another_function_does_not_hold(found):
 def test_sobol_replicates_are_unlike_one_another(design):
     first = design.points.reshape(REPLICATES, -1, 3)[:, 0]
     assert len(np.unique(first, axis=0)) == REPLICATES
-    again = sobol.sobol_design(3, 64, 1)
+    again = sampled_indices.sobol_design(3, 64, 1)
     assert_array_equal(again.points, design.points)
-    assert not np.array_equal(sobol.sobol_design(3, 64, 2).points, design.points)
+    assert not np.array_equal(sampled_indices.sobol_design(3, 64, 2).points, design.points)
 
 
 def test_sobol_leaves_out_rows_without_numbers_exactly_where_one_input_decides_them(design):
     # y = x0 + x1 with no number below x0 = 0.25: x0 is then uniform above it.
     y = np.where(design.points[:, 0] < 0.25, np.nan, design.points[:, 0] + design.points[:, 1])
-    terms = sobol.sobol_terms(design, y)
+    terms = sampled_indices.sobol_terms(design, y)
     share = 0.75**2 / (0.75**2 + 1)
-    found = sobol.indices_of_terms(terms)
+    found = sampled_indices.indices_of_terms(terms)
     assert within(found.first, [share, 1 - share, 0]) and within(found.total, [share, 1 - share, 0])
     assert terms.lost / (terms.lost + terms.rows) == pytest.approx(1 - 0.75**2, abs=0.01)
 
 
 def test_sobol_of_nothing_but_missing_numbers_is_none(design):
-    assert sobol.sobol_terms(design, np.full(len(design.points), np.nan)) is None
+    assert sampled_indices.sobol_terms(design, np.full(len(design.points), np.nan)) is None
 
 
 def test_sobol_of_several_outputs_together_weighs_them_by_their_variance(design):
     a, b = design.points[:, 0], 3 * design.points[:, 1]
-    both = sobol.sobol_terms(design, a) + sobol.sobol_terms(design, b)
-    assert within(sobol.indices_of_terms(both).total, [0.1, 0.9, 0.0])
+    both = sampled_indices.sobol_terms(design, a) + sampled_indices.sobol_terms(design, b)
+    assert within(sampled_indices.indices_of_terms(both).total, [0.1, 0.9, 0.0])
 
 
 def test_sobol_inputs_that_do_not_act_add_nothing_to_pairs():
-    design = sobol.sobol_design(2, 64, 3)
-    narrow = sobol.sobol_terms(design, design.points[:, 0] * design.points[:, 1])
-    wide = sobol.indices_of_terms(narrow.widened((1, 3), 4))
+    design = sampled_indices.sobol_design(2, 64, 3)
+    narrow = sampled_indices.sobol_terms(design, design.points[:, 0] * design.points[:, 1])
+    wide = sampled_indices.indices_of_terms(narrow.widened((1, 3), 4))
     assert wide.second.value[0, 1] == 0 and wide.second.value[0, 2] == 0
-    assert wide.second.value[1, 3] == sobol.indices_of_terms(narrow).second.value[0, 1] != 0
+    assert wide.second.value[1, 3] == sampled_indices.indices_of_terms(narrow).second.value[0, 1] != 0
 
 
 def test_constant_output_has_no_indices(design):
-    found = sobol.indices_of_terms(sobol.sobol_terms(design, np.ones(len(design.points))))
+    found = sampled_indices.indices_of_terms(sampled_indices.sobol_terms(design, np.ones(len(design.points))))
     assert np.isnan(found.first.value).all()
 
 
 def test_size_covers_the_evaluations_that_are_asked_for():
     for evaluations in (1_000, 100_000, 123_456):
-        size = sobol.base_point_count(evaluations, 5)
+        size = sampled_indices.base_point_count(evaluations, 5)
         assert size * REPLICATES * 12 >= evaluations and size & (size - 1) == 0
 
 
@@ -103,8 +103,8 @@ def test_size_covers_the_evaluations_that_are_asked_for():
 def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
     held = np.zeros((2, 3))
     for seed in range(200):
-        design = sobol.sobol_design(3, size, seed, second=False)
-        found = sobol.indices_of_terms(sobol.sobol_terms(design, ishigami(design.points)))
+        design = sampled_indices.sobol_design(3, size, seed, second=False)
+        found = sampled_indices.indices_of_terms(sampled_indices.sobol_terms(design, ishigami(design.points)))
         for k, (e, truth) in enumerate(((found.first, FIRST), (found.total, TOTAL))):
             held[k] += (e.low <= truth) & (truth <= e.high)
     assert np.all((held / 200 >= 0.9) & (held / 200 <= 0.98)), held / 200
@@ -117,8 +117,8 @@ def test_sobol_intervals_cover_in_ninety_to_ninety_eight_of_a_hundred(size):
 
 
 def test_elementary_effects_of_a_linear_model_are_its_slopes():
-    u = morris.morris_design(3, 40, 0)
-    found = morris.elementary_effects(u, u @ np.array([1.0, -2.0, 0.0]))
+    u = sampled_indices.morris_design(3, 40, 0)
+    found = sampled_indices.elementary_effects(u, u @ np.array([1.0, -2.0, 0.0]))
     assert_allclose(found.mean, [1, -2, 0], atol=1e-12)
     assert_allclose(found.size.value, [1, 2, 0], atol=1e-12)
     assert_allclose(found.spread, 0, atol=1e-12)
@@ -126,9 +126,9 @@ def test_elementary_effects_of_a_linear_model_are_its_slopes():
 
 
 def test_elementary_effects_tell_what_is_not_linear_and_leave_out_whole_trajectories():
-    u = morris.morris_design(2, 200, 0)
+    u = sampled_indices.morris_design(2, 200, 0)
     y = np.where(u[:, 1] > 0.9, np.nan, u[:, 0] ** 2 + u[:, 1])
-    found = morris.elementary_effects(u, y)
+    found = sampled_indices.elementary_effects(u, y)
     assert found.lost > 0 and found.trajectories + found.lost == 200
     assert found.spread[0] > 0.05 and found.spread[1] == pytest.approx(0, abs=1e-12)
 
@@ -136,9 +136,9 @@ def test_elementary_effects_tell_what_is_not_linear_and_leave_out_whole_trajecto
 def test_morris_design_is_repeatable_and_leaves_the_global_generator_alone():
     np.random.seed(3)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    first = morris.morris_design(3, 10, 5)
+    first = sampled_indices.morris_design(3, 10, 5)
     assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-    assert_array_equal(first, morris.morris_design(3, 10, 5))
+    assert_array_equal(first, sampled_indices.morris_design(3, 10, 5))
 
 
 def test_ratio_interval_is_that_of_students_t_for_a_constant_denominator():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data.instruments import display_step
+from calibration.data.inferred_facts import display_step
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
-from calibration.data.thinning import thin_rows
+from calibration.data.unused_readings import thin_rows
 from calibration.discovery.score_tests import UNSURE, _noise_factors
 from calibration.inference import noise, series_noise
 from calibration.inference.observers import SettledRuns

@@ -17,7 +17,7 @@ from calibration.data.input_errors import BadData
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
 from calibration.inference.foresight import InformationForecast
-from calibration.words import settle_words as words
+from calibration.words import table_words as words
 from sweeps.commands import rig_check
 from tests.commands import ROOT, csv_text, ends, read_json, read_rig, text_file
 
@@ -371,16 +371,6 @@ def test_signs_and_units_that_are_right_are_not_doubted(tmp_path):
     bench(tmp_path, both_ways(total_current_A=np.abs), '"total_current", "motor_speed", "output_angle"')
     robot = read_rig(tmp_path, text)
     assert len(settled(tmp_path, robot).kept) == 4
-
-
-def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
-    columns = stairs()
-    robot = bench(tmp_path, columns | {"duty": np.where(np.arange(600) == 7, 1.2, 1.0)})
-    with pytest.raises(BadData, match=r"row 8, duty: got 1\.2; expected -1 to 1"):
-        settled(tmp_path, robot)
-    robot = bench(tmp_path, columns | {"duty": np.full(600, 255)})
-    with pytest.raises(BadData, match=r"row 1, duty: got 255; is the command scaled\? divide .*; expected -1 to 1"):
-        settled(tmp_path, robot)
 
 
 def test_missing_samples_divide_a_level_and_are_said(tmp_path):

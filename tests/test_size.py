@@ -11,10 +11,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.parts import packaged_gearboxes, packaged_motors
 from calibration.sizing import design_search, sheet
 from calibration.sizing.design import build_robot, build_sizing_task, evaluate_design
-from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
+from calibration.sizing.part_options import (
+    BELT_STAGE,
+    MOTOR,
+    drive_options,
+    options_for_robot,
+    packaged_gearboxes,
+    packaged_motors,
+)
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
 from sweeps.report.check_report import design_verdict

@@ -75,11 +75,6 @@ def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
     assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)
 
 
-def test_size_is_an_obstacles_alone():
-    with pytest.raises(BadConfiguration, match="obstacle_mm: neither a parameter of the robot nor a condition"):
-        axes.plan_design(Campaign(axes={"obstacle_mm": [50]}), ROBOT, "map.toml")
-
-
 def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
     asked = {}
 

@@ -19,9 +19,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_cli import MMRJAX
 
 from calibration.data.input_errors import BadConfiguration, BadData
-from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
-from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import STATUSES
 from sweeps import cli
 from sweeps.commands import sweep as command
@@ -157,17 +155,6 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     same_table(tmp_path / "small/runs.csv", tmp_path / "large/runs.csv")
     robots_ = [(tmp_path / name / "robot.toml").read_text().splitlines()[1:] for name in ("small", "large")]
     assert robots_[0] == robots_[1]
-
-
-@pytest.mark.slow
-def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path, robot):
-    grid = ["sweep", "--slopes", "0,5", "--payloads", "0", "--voltages", "24", "--no-report"]
-    assert mmrjax(*grid, "--outputs", "slip, flags", "--out", "s")[0] == 0
-    found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
-    assert set(found.data_vars) == {"slip", "flags", "status"}
-    alone = steady(robot, Conditions(0, 24.0, 5.0, 0.0))
-    assert_allclose(found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12)
-    ends(mmrjax(*grid, "--outputs", "slipp", "--out", "t"), "outputs: got slipp; did you mean slip")
 
 
 def test_exports_hold_the_store_row_by_row(sweep, tmp_path, whole):

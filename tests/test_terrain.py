@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.climbing import belt_loop, terrain
+from mmrjax.climbing import levers, terrain
 from mmrjax.model.paper_robots import nominal
-from mmrjax.undercarriage import belt
+from mmrjax.undercarriage import running_gear
 
 NAMED = {
     "flat": (terrain.flat_ground(8), [(-100, 0), (100, 0)]),
@@ -98,7 +98,7 @@ def test_polylines_that_are_none_are_refused(x, z, message):
 def lever():
     gear = nominal().running_gear
     roller = gear.levers.roller - gear.grouser_height
-    return belt_loop.BeltLoop(
+    return levers.BeltLoop(
         nominal().radius_pulley, roller, gear.lever_length, gear.grouser_height, gear.grouser_length, 16
     )
 
@@ -111,13 +111,13 @@ def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
 @pytest.mark.slow
 def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model(robot):
     gear = robot.running_gear
-    main = belt_loop.BeltLoop(
+    main = levers.BeltLoop(
         robot.radius_pulley, robot.radius_pulley, gear.wheelbase, gear.grouser_height, gear.grouser_length, 24
     )
-    path = belt.BeltPath(robot.radius_pulley, gear)
+    path = running_gear.BeltPath(robot.radius_pulley, gear)
     place = np.concatenate([np.linspace(0, 0.23, 60), np.linspace(0.61, 0.83, 60)])  # all but the upper run's ends
-    mine, rate = belt_loop.grouser_tips(main, jnp.asarray(place))
-    theirs = belt.tips_on_path(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))
+    mine, rate = levers.grouser_tips(main, jnp.asarray(place))
+    theirs = running_gear.tips_on_path(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))
     assert np.asarray(mine[:, 0]) - float(gear.wheelbase) / 2 == pytest.approx(np.asarray(theirs.forward), abs=1e-12)
     assert np.asarray(mine[:, 1]) == pytest.approx(np.asarray(theirs.up), abs=1e-12)
     assert np.asarray(rate) == pytest.approx(
@@ -134,6 +134,6 @@ def test_points_project_on_the_belt_where_they_came_from_and_tips_move_as_they_s
     off = np.abs(np.asarray(back - place))
     assert np.minimum(off, float(belt_.length) - off) == pytest.approx(0, abs=1e-10)
     moved = (
-        belt_loop.grouser_tips(belt_, place[5:-5] + 1e-7)[0] - belt_loop.grouser_tips(belt_, place[5:-5] - 1e-7)[0]
+        levers.grouser_tips(belt_, place[5:-5] + 1e-7)[0] - levers.grouser_tips(belt_, place[5:-5] - 1e-7)[0]
     ) / 2e-7
-    assert np.asarray(belt_loop.grouser_tips(belt_, place[5:-5])[1]) == pytest.approx(np.asarray(moved), abs=1e-5)
+    assert np.asarray(levers.grouser_tips(belt_, place[5:-5])[1]) == pytest.approx(np.asarray(moved), abs=1e-5)

@@ -11,7 +11,7 @@ from worlds import rigs
 from calibration.data import columns, input_files
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
-from calibration.data.thinning import FIRST, thin_rows
+from calibration.data.unused_readings import FIRST, thin_rows
 from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import calibration as calibrate

@@ -1,61 +1,20 @@
 """What once gave plausible wrong answers: reverse, rollback, standing, charging, the battery's end, rated limits."""
 
 import json
-import re
 
 import jax
 import numpy as np
 import pytest
 
 import mmrjax as api
-from calibration.data import robot_file, runs
-from calibration.data.input_errors import BadConfiguration, BadData
-from mmrjax.fidelities.drive import drive_batch
+from calibration.data import robot_file
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import paper_robots, signals
-from sweeps.commands.simulate import PEAK, run_remarks
+from sweeps.commands.simulate import run_remarks
 from sweeps.pages import figure_style, history_figures, words
 from sweeps.report import runs_report
-from tests.commands import ends, read_json, read_rig, text_file
+from tests.commands import ends, read_json, read_rig
 from tests.commands import rows as table
-
-SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
-SPEED_REST = 0.1 * SPEED_STATIC
-
-
-@pytest.fixture(scope="module")
-def anywhere():
-    """Random conditions, parked ones among them, with what `steady` and `drive` make of them."""
-    rng, count = np.random.default_rng(14), 400
-    voltage, slope = rng.uniform(-33, 33, count), rng.uniform(-20, 20, count)
-    voltage[:80], voltage[80:160] = 0.0, rng.uniform(-3, 3, 80)  # parked, and about breaking away
-    slope[:6] = slope[-6:] = 0.0
-    kind, payload = np.where(rng.random(count) < 0.5, "6T2A", "4W2T"), rng.uniform(0, 8, count)
-    conditions = api.Conditions(kind, voltage, slope, payload)
-    robot = paper_robots.nominal()
-    settled = api.simulate(robot, conditions)
-    return voltage, slope, settled, api.simulate(robot, conditions, "drive", history=False)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["steady", "drive"])
-def test_a_status_agrees_with_the_numbers(anywhere, model):
-    voltage, slope, *results = anywhere
-    found = results[model == "drive"]
-    status, speed = found.statuses, np.asarray(found.speed)
-    theoretical = np.asarray(found.theoretical_speed)
-    for name in ("converged", "reverses", "rolls_back", "stalled"):
-        assert (status == name).any()
-    assert ((speed > 0) & (voltage >= 0))[status == "converged"].all()
-    assert ((speed < 0) & (voltage < 0))[status == "reverses"].all()
-    back = status == "rolls_back"
-    assert (np.where(voltage == 0, speed < 0, speed * voltage < 0) & (speed * slope < 0))[back].all()
-    assert (np.maximum(np.abs(speed), np.abs(theoretical)) >= SPEED_REST)[back].all()
-    moves = (status == "converged") | (status == "reverses")
-    assert (np.abs(theoretical)[moves & (voltage != 0)] >= SPEED_REST).all()
-    # A robot that stands: at rest in `steady`; in `drive` within the creep of its contacts.
-    assert (np.abs(speed)[status == "stalled"] < (SPEED_REST if model == "steady" else SPEED_STATIC)).all()
-    assert set(status[voltage == 0]) <= {"stalled", "rolls_back", "converged"}
-    assert (status[(voltage == 0) & (slope >= 0)] != "converged").all()
 
 
 def test_the_words_name_the_same_statuses_as_the_codes():
@@ -138,40 +97,10 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
     assert row["total_current_A"] in {r["total_current_A"] for r in rows}
 
 
-COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm"
-
-
-@pytest.mark.parametrize(
-    ("row", "sentence"),
-    [
-        ("6T2A,-15,13.1,0,0,-2.1,5292", "motor_speed_rpm: got 5292 at -15 V; expected readings with their signs"),
-        ("6T2A,-15,13.1,0,-5,2.6,-5292", "total_current_A: got 2.6 at -15 V; expected readings with their signs"),
-    ],
-)
-def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
-    with pytest.raises(BadData, match=f"mine.csv row 2, {sentence}"):
-        runs.read_runs(text_file(tmp_path / "mine.csv", f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n{row}\n"))
-
-
 @pytest.fixture(scope="module")
 def climb():
     robot = paper_robots.nominal()
     return robot, api.simulate(robot, api.Conditions(0, [33.0, -33.0], [10.0, -10.0]), "drive", duration=5.0)
-
-
-@pytest.mark.slow
-def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path, robot):
-    _, found = climb
-    fine = drive_batch(robot, api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
-    peak = float(np.max(np.asarray(fine.signals.total_current)))
-    assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
-    _, out, _ = ends(mmrjax("simulate --model drive --slope", 10, "--no-report", "--out", "a"), code=0)
-    assert re.search(rf"peak current, all motors \[A\] +{peak:.1f}", out)
-    (row,) = table(tmp_path / "a/runs.csv")
-    assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
-    kept = [float(r["total_current_A"]) for r in table(tmp_path / "a/history.csv")]
-    assert 0.999 * float(row[PEAK]) < max(kept) < float(row[PEAK])
-    assert read_json(tmp_path / "a/result.json")[PEAK] == pytest.approx(float(row[PEAK]))
 
 
 @pytest.mark.slow

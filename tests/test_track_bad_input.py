@@ -1,7 +1,5 @@
 """What the track model says to input that it cannot run, before and after the run."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -126,31 +124,6 @@ def test_standing_robot_is_in_balance(robot):
         _, at, _ = instant(run, stand(run))
         weight = (run.half.chassis + 2 * run.half.pulley) * 9.80665 * np.cos(0.1)
         assert float(at.normal) == pytest.approx(float(weight), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_member_that_blows_up_fails_alone(robot):
-    """A step far too long, on the door's inner side: its status says so, its neighbour runs on."""
-    gear = robot.running_gear
-    stiff = dataclasses.replace(gear, contact_stiffness=jnp.asarray(1e15), contact_damping=jnp.asarray(1e8))
-
-    @jax.jit
-    def both(stiffness, damping):
-        from mmrjax.fidelities.track import track
-
-        def one(c, b):
-            own = dataclasses.replace(gear, contact_stiffness=c, contact_damping=b)
-            changed = dataclasses.replace(robot, running_gear=own)
-            return track(changed, Conditions(), duration=0.2, rolling=True).result
-
-        return jax.vmap(one)(stiffness, damping)
-
-    answer = both(
-        jnp.stack([stiff.contact_stiffness, gear.contact_stiffness]),
-        jnp.stack([stiff.contact_damping, gear.contact_damping]),
-    )
-    assert int(answer.status[0]) == FAILED and int(answer.status[1]) != FAILED
-    assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))
 
 
 @pytest.mark.slow

@@ -12,8 +12,16 @@ from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import side_contacts
-from mmrjax.undercarriage.belt import POLYGON, BeltPath, belt_runs, belt_travel, tension_along, tips_on_path
-from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
+from mmrjax.undercarriage.running_gear import (
+    GROUSERS,
+    POLYGON,
+    TEETH_BELT,
+    BeltPath,
+    belt_runs,
+    belt_travel,
+    tension_along,
+    tips_on_path,
+)
 
 
 @pytest.fixture(scope="module")

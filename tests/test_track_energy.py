@@ -11,8 +11,8 @@ from mmrjax.fidelities.track import track
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.belt import belt_travel
 from mmrjax.undercarriage.half_robot import advance, build_system, centre_of_mass, instant, stand
+from mmrjax.undercarriage.running_gear import belt_travel
 
 RUNS = Conditions(
     voltage=[33.0, 15.0, 24.0, 33.0],

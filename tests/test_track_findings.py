@@ -10,8 +10,8 @@ from mmrjax.fidelities.track import _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
-from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch, touchdown_times
+from mmrjax.undercarriage.running_gear import BeltPath
 
 pytestmark = pytest.mark.slow
 

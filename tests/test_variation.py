@@ -91,15 +91,6 @@ def test_every_condition_has_words_and_limits(robot):
     assert all(axis.meaning for axis in Variation(robot, tuple(CONDITIONS)).axes.values())
 
 
-def test_unknown_and_repeated_names_are_refused_with_those_that_are_near(robot):
-    with pytest.raises(
-        UsageError, match=r"motor\.resistanse: .*did you mean motor\.resistance.*allowed: .*slope_deg"
-    ):
-        Variation(robot, ("motor.resistanse",))
-    with pytest.raises(UsageError, match="voltage: stated twice"):
-        Variation(robot, ("voltage", "voltage"))
-
-
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("model", ["steady", "drive"])
 def test_unknown_output_is_refused_with_the_choices(variation, model):

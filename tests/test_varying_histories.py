@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import Analyst
 
 from calibration.data import runs as records
+from calibration.data.clock import applied_drive, course_of_each_row, intervals_by_run, rows_of_varying_runs
 from calibration.data.columns import DRIVEN
-from calibration.data.courses import applied_drive, course_of_each_row, intervals_by_run, rows_of_varying_runs
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.reach import reach_of_table

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from calibration.data import Names, surfaces
+from calibration.data import Names, configuration_tables
 from calibration.data.columns import (
     CURRENT,
     DRIVEN,
@@ -68,7 +68,7 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
     """Allowed words, for the error message about a wrong one. Empty if the word is allowed."""
     if column == "surface":
-        return surfaces.allowed_labels(word, layout)
+        return configuration_tables.allowed_labels(word, layout)
     if column == "mode" and word not in DRIVEN:
         return f"one of these; {allowed_words(word, DRIVEN)}"
     if column == "configuration" and not word:

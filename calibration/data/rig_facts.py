@@ -9,13 +9,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.data import Names, rig_file
+from calibration.data.clock import applied_drive, changing_columns, intervals_by_run
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
-from calibration.data.courses import applied_drive, changing_columns, intervals_by_run
 from calibration.data.input_errors import three_digits
-from calibration.data.invalid_readings import drive_heading
 from calibration.data.robot_file import RobotFile
 from calibration.data.row_checks import JUMP, time_constant
 from calibration.data.runs import Runs
+from calibration.data.unused_readings import drive_heading
 from mmrjax.model import channels, params
 from mmrjax.model.quantities import RPM, VOLTAGE
 from mmrjax.model.robot import Robot

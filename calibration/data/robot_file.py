@@ -25,7 +25,7 @@ from calibration.data.input_errors import (
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
-from mmrjax.compile.precision import in_double
+from mmrjax.compile.compiling import in_double
 from mmrjax.effects.base import scaled_effect
 from mmrjax.errors import list_some, printable
 from mmrjax.model import paper_robots, params, power

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Columns, Names, surfaces
+from calibration.data import Columns, Names, configuration_tables
 from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
@@ -231,7 +231,7 @@ def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout)
         return
     if "configuration" not in columns and layout.configurations:
         labels = np.unique(columns.get("surface", np.zeros(0, str)))
-        configuration = surfaces.common_configuration(layout.configurations, labels)
+        configuration = configuration_tables.common_configuration(layout.configurations, labels)
         if configuration is None:
             raise BadData(
                 f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"

@@ -23,19 +23,18 @@ from calibration.data import (
     column_names,
     contradictions,
     delimited,
-    instruments,
+    inferred_facts,
     presets_file,
     row_checks,
-    sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.invalid_readings import drop_computed_torques, without_held, without_unread
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
 from calibration.data.sources.columnar import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
+from calibration.data.unused_readings import drop_computed_torques, without_held, without_unread
 from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.rig import STARTS
@@ -151,14 +150,14 @@ def runs_of_arrays(
     settled: Names = ()
     if measured and robot is not None:
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
-    notes = (*arrays.notes, *settled, *sides.duties_from_side_voltages(name, columns, battery))
+    notes = (*arrays.notes, *settled, *contradictions.duties_from_side_voltages(name, columns, battery))
     is_kept, copied = row_checks.distinct_rows(name, columns)
     columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
         begins = () if robot is None else row_checks.split_at_jumps(name, columns, robot.rig.start == STARTS[0])
         notes = (*notes, *copied, *begins, *_drop_repeats(name, columns, layout))
-    table_instruments = instruments.infer_instruments(layout.instruments, columns)
-    unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
+    table_instruments = inferred_facts.infer_instruments(layout.instruments, columns)
+    unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in table_instruments})
     layout = dataclasses.replace(layout, instruments=(*table_instruments, *unsigned))
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Columns
+from calibration.data.clock import applied_drive, differs_from_row_before
 from calibration.data.columns import LOAD, SPEED
 from calibration.data.contradictions import GAP
-from calibration.data.courses import applied_drive, differs_from_row_before
+from calibration.data.inferred_facts import common_step
 from calibration.data.input_errors import BadData
-from calibration.data.instruments import common_step
 from calibration.data.row_checks import inertia_at_motor
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun

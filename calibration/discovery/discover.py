@@ -24,7 +24,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference.observers.windows import Windows
 from calibration.inference.optimizers import CORES
 from mmrjax import effects
-from mmrjax.compile import precision
+from mmrjax.compile import compiling
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
@@ -33,7 +33,7 @@ from mmrjax.model.robot import Robot
 FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 
 
-@precision.in_double
+@compiling.in_double
 def discover(
     runs: Runs,
     robot: Robot,
@@ -71,10 +71,10 @@ def discover(
 
     Raises:
         BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
-            experiments, or a call inside `jax.jit` while JAX uses single precision.
+            experiments, or a call inside `jax.jit` while JAX uses single compiling.
     """
-    if not precision.is_double():
-        raise BadConfiguration(f"discover: {precision.SINGLE}")
+    if not compiling.is_double():
+        raise BadConfiguration(f"discover: {compiling.SINGLE}")
     tell = report_in_words(progress)
     prepare = functools.partial(
         loop_input.prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates,
@@ -95,7 +95,7 @@ def discover(
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    threads = precision.Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
+    threads = compiling.Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
     sensitivity, outstanding = list[result.NoiseVerdict](), list[float]()
     try:
         if factors:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from calibration.data import Names, Priors, columns, own_mass
+from calibration.data import Names, Priors, columns, inferred_facts
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
@@ -200,10 +200,13 @@ def build_candidate_space(
     programs. A mass in the table replaces the robot's mass. Ground friction without a stated prior gets a wide one
     for any surface, because the prior of a wrong surface would bias parameters that depend on slip.
     """
-    robot = own_mass.with_table_mass(robot, runs)
+    robot = inferred_facts.with_table_mass(robot, runs)
     kind = observers.observer_kind(runs)
     index, real = kind.padded_rows(len(runs))
-    idle = (*(() if kind.axis else priors.OVER_TIME), *(f"{n}.mass" for n in own_mass.stated_masses(robot, runs)))
+    idle = (
+        *(() if kind.axis else priors.OVER_TIME),
+        *(f"{n}.mass" for n in inferred_facts.stated_masses(robot, runs)),
+    )
     names = priors.loop_parameter_names(robot, runs.configurations_named(robot), *kind.free(), idle)
     unread = fidelities.unread_parameters("drive" if kind.axis else "steady", names, runs.turns)
     names = tuple(n for n in names if n not in unread)

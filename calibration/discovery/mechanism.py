@@ -7,11 +7,11 @@ mechanism explains, its predictions, and its repetition without parts of the dat
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from calibration.data import Names
+from calibration.data import Columns, Names
 from calibration.data.runs import Runs
 from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
@@ -25,10 +25,11 @@ from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
 from calibration.discovery.projection import explained_function
 from calibration.discovery.score_tests import augment_with_columns, family_columns
 from calibration.discovery.settings import Settings
+from calibration.discovery.smooth import fit_smooth_curve
 from calibration.discovery.standing import changed_run, evidence_over_curves, kept_readings, recurrence_of_families
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
-from calibration.inference.bases import Bases
+from calibration.inference.bases import Bases, place_signature
 from calibration.inference.held_out import predict_unseen
 
 #: Least change of a reading by a mechanism, over the largest rms change of a channel, for it to count [σ over σ].
@@ -83,22 +84,21 @@ def find_mechanism(
     ]
     mechanisms: list[Mechanism] = []
     excess = excess_misfit(space, base)
-    curved = location_families[0] in alike and location_families[0] not in by_name and space.bare.observe.reads
-    curve = location_families[:1] if curved else ()
+    curved = location_families[0] in alike and space.bare.observe.reads
+    curve = [(location_families[0], False)] if curved else []
+    named = [(family, True) for family in by_name]
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
     run, changed, root_changed = changed_run(space, linear, bases, *fit) if over_time else (None, "", 0.0)
-    for leader in (*by_name[:1], *curve, *by_name[1:]):
+    for leader, with_effects in (*named[:1], *curve, *named[1:]):
         # A driver whose form a curve refutes is no better than those that smooth curves cannot separate.
-        refuted = leader in by_name and (
+        refuted = with_effects and (
             evidence_over_curves(space, best[leader], base, best[leader].effects, left.linear, bases, settings)
             < -BETTER
         )
-        others = (
-            [*alike, *location_families] if refuted else alike if leader in by_name else [*alike, *other_families]
-        )
+        others = [*alike, *location_families] if refuted else alike if with_effects else [*alike, *other_families]
         families = (leader, *(f for f in others if f != leader))
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
-        if leader in by_name:
+        if with_effects:
             alone = _best_and_single(space, ladder, best[leader])
             compared = [*(FitsWithAndWithout(c, base) for c in alone), pairs[leader]]
             gains = {pair: _hold_out_gain(space, runs, pair, predicted) for pair in compared}
@@ -258,34 +258,51 @@ def _hold_out_gain_of_curve(
     }
     changed = _changed_readings(space, runs, _simulated_reading(space, base), curve.reading)
     score = prediction.score_predictions(space, runs, predictions)
-    in_seen_range = {
-        kind: _within_seen_range(space, beside, list(blocks_by_name.values()))
-        for kind, blocks_by_name in kinds.items()
-    }
-    inside = {kind: np.where(in_seen_range[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
-    score = dataclasses.replace(score, by_kind=inside)
+    score = _where_seen(space, beside, score, kinds)
     return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
+
+
+def _where_seen(
+    space: CandidateSpace, beside: BaseCurve, score: HeldOutScore, kinds: Mapping[str, Columns]
+) -> HeldOutScore:
+    """The hold-out score without rows outside the range of the curve's variable in their fit."""
+    seen = {kind: _within_seen_range(space, beside, list(by_name.values())) for kind, by_name in kinds.items()}
+    return dataclasses.replace(
+        score, by_kind={kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
+    )
 
 
 def _linear_gain_of_curve(space: CandidateSpace, runs: Runs, beside: BaseCurve) -> Gain:
     """The gain of `_hold_out_gain_of_curve` for a log, to first order at the base fit.
 
     A simulated fit of a curve takes minutes, and windows have no simulation. A wave has its own phase in each run, so
-    only parts of runs can be predicted.
+    only parts of runs can be predicted. Beyond the range that a fit saw, the curve is level: later readings remember
+    the error of an extrapolation.
     """
-    linear, rows, kinds = beside.left.linear, len(runs), blocks_room.predictable_blocks(runs, space.bare)
-    if beside.where.variable in bases_room.ORDERS:
-        kinds = {blocks_room.PART: blocks_room.parts_over_time(runs)}
-    columns = location_columns(linear, beside.bases, beside.where)
-    fits = (np.asarray(linear.jacobian), np.asarray(linear.residual)), augment_with_columns(linear, columns)
+    linear, where, rows = beside.left.linear, beside.where, len(runs)
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
+    if where.variable in bases_room.ORDERS:
+        kinds = {blocks_room.PART: blocks_room.parts_of_runs(runs)}
 
-    def residuals(fit: tuple[np.ndarray, np.ndarray], out: np.ndarray) -> np.ndarray:
-        jacobian, residual = fit
+    def base_fit(_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(linear.jacobian), np.asarray(linear.residual)
+
+    def curve_fit(included: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if where.variable not in bases_room.VARIABLES:
+            return augment_with_columns(linear, location_columns(linear, beside.bases, where))
+        curve = fit_smooth_curve(linear, where.place, where.variable, included)
+        x, way = linear.curve_variable(where.place, where.variable)
+        columns = place_signature(linear, where.place, way[:, None] * curve.basis(x))
+        return augment_with_columns(linear, curve.scale * columns @ curve.root)
+
+    def residuals(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], out: np.ndarray) -> np.ndarray:
+        included = space.included & ~np.append(out, np.zeros(len(space.included) - rows, bool))
+        jacobian, residual = fit(included)
         kept = np.append(kept_readings(space, out, linear.readings), np.ones(len(residual) - linear.readings, bool))
         z = np.linalg.lstsq(jacobian[kept], -residual[kept], rcond=None)[0]
         return (residual + jacobian @ z)[: linear.readings].reshape(len(space.included), -1)[:rows]
 
-    def score(fit: tuple[np.ndarray, np.ndarray]) -> HeldOutScore:
+    def score(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> HeldOutScore:
         nothing = np.zeros((rows, linear.readings // len(space.included)))
         errors = {
             kind: sum((np.where(out[:, None], residuals(fit, out), 0.0) for out in by_name.values()), nothing)
@@ -294,8 +311,8 @@ def _linear_gain_of_curve(space: CandidateSpace, runs: Runs, beside: BaseCurve) 
         return prediction.score_readings(errors, nothing, nothing + 1.0, space.weight[:rows] > 0, kinds)
 
     sd, none = np.asarray(space.bare.data.sd)[:rows], np.zeros(rows, bool)
-    changed = _changed_readings(space, runs, *(sd * residuals(fit, none) for fit in fits))
-    return _gain_over_changed(score(fits[1]), score(fits[0]), changed)
+    changed = _changed_readings(space, runs, sd * residuals(base_fit, none), sd * residuals(curve_fit, none))
+    return _gain_over_changed(_where_seen(space, beside, score(curve_fit), kinds), score(base_fit), changed)
 
 
 def _within_seen_range(space: CandidateSpace, beside: BaseCurve, masks: Sequence[np.ndarray]) -> np.ndarray:

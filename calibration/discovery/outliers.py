@@ -31,7 +31,7 @@ from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import fit_from_each_start
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import Threads
 
 # --- clusters of outliers in time, angle, order or condition --------------------------------------
 

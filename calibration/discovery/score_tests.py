@@ -23,8 +23,7 @@ from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.optimizers import CORES, with_solved_rows
 from calibration.inference.problem import Problem
-from mmrjax.compile.compiling import SELDOM, SMALL, compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import SELDOM, SMALL, Threads, compiled
 from mmrjax.numerics.linear_equations import solve_lower
 
 #: Share of a signature's norm below which the free parameters absorb it completely.

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.data import Columns, Names
+from calibration.data.clock import rows_of_varying_runs
 from calibration.data.columns import CURRENT, LOAD, SPEED
-from calibration.data.courses import rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import held_out as refits
 from calibration.inference.problem import Problem
@@ -88,6 +88,12 @@ def parts_over_time(runs: Runs) -> Columns:
         edges = np.linspace(time.min(), time.max(), PARTS + 1)
         part[run == k] = np.searchsorted(edges[1:-1], time, side="right")
     return {f"{k + 1} of {PARTS}": part == k for k in np.unique(part)}
+
+
+def parts_of_runs(runs: Runs) -> Columns:
+    """Label → mask of its rows, for each part of each run over time."""
+    names, parts = runs.run_names, parts_over_time(runs)
+    return {f"{run} {label}": (names == run) & part for run in np.unique(names) for label, part in parts.items()}
 
 
 def blocks_of_kind(runs: Runs, by: str) -> Columns:

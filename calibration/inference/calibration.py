@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Names, Priors, surfaces
+from calibration.data import Names, Priors, configuration_tables
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
@@ -41,7 +41,7 @@ from calibration.inference.problem import MARGIN, Problem
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
-from mmrjax.compile.precision import SINGLE, in_double, is_double
+from mmrjax.compile.compiling import SINGLE, in_double, is_double
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import DONE, FLAGS, STATUSES
 
@@ -157,7 +157,7 @@ def _free_names(
         BadConfiguration: a name is unknown, or the fidelity does not use the parameter.
     """
     robot, computes = prepared.robot, observers.facts_of_fidelity(fidelity).computes
-    words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
+    words = [configuration_tables.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     present = _configurations_present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)

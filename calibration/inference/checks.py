@@ -11,11 +11,11 @@ import numpy as np
 from scipy.optimize import nnls
 
 from calibration.data import Names
+from calibration.data.clock import applied_drive
 from calibration.data.columns import LOAD, SPEED, SUPPLY
-from calibration.data.courses import applied_drive
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.invalid_readings import line_through
 from calibration.data.runs import Runs
+from calibration.data.unused_readings import line_through
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Remark

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.data import Names
-from calibration.data.courses import applied_drive, rows_of_varying_runs
+from calibration.data.clock import applied_drive, rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.fit_notes import Remark

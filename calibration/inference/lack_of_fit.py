@@ -17,7 +17,7 @@ from numpy.polynomial import legendre
 from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data import Names
-from calibration.data.courses import course_of_each_row
+from calibration.data.clock import course_of_each_row
 from calibration.data.runs import DUTY, Runs
 from calibration.described import describe
 from calibration.inference.fit_notes import AdequacyFinding

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.data.clock import applied_drive
 from calibration.data.columns import SUPPLY
-from calibration.data.courses import applied_drive
 from calibration.data.runs import Runs
 from calibration.inference.fit_notes import Remark
 from mmrjax.model.robot import Robot

@@ -30,8 +30,7 @@ from calibration.inference.levenberg_marquardt import (
     zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from mmrjax.compile.compiling import OVER_TIME, SELDOM, SMALL, compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, SMALL, Threads, compiled
 from mmrjax.model.robot import Robot
 from mmrjax.numerics.linear_equations import solve_lower
 

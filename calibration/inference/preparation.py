@@ -10,9 +10,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
 
-from calibration.data import Names, Priors, input_errors, instruments, own_mass, rig_facts, settling, surfaces
+from calibration.data import Names, Priors, configuration_tables, inferred_facts, input_errors, rig_facts, settling
 from calibration.data.runs import Runs
-from calibration.data.thinning import used_rows
+from calibration.data.unused_readings import used_rows
 from calibration.described import describe
 from calibration.inference import checks, fit_notes, observers, repeats
 from calibration.inference import noise as noise_room
@@ -121,11 +121,13 @@ def prepare_input(
     except UsageError as error:
         raise input_errors.BadConfiguration(str(error)) from error
     observe = observers.observer_kind(runs)
-    robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
-    priors = surfaces.values_of_surface_configurations(stated or {}, robot, runs)
-    own_mass.check_priors(priors, robot, runs)
-    as_stated, weighed = robot, own_mass.mass_notes(robot, runs)
-    robot = own_mass.with_table_mass(robot, runs)
+    robot = configuration_tables.with_surface_configurations(
+        inferred_facts.with_inferred_instruments(robot, runs), runs
+    )
+    priors = configuration_tables.values_of_surface_configurations(stated or {}, robot, runs)
+    inferred_facts.check_priors(priors, robot, runs)
+    as_stated, weighed = robot, inferred_facts.mass_notes(robot, runs)
+    robot = inferred_facts.with_table_mass(robot, runs)
     noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
     noise_sds, larger = repeats.enlarge_noise(noise_sds, runs)
     robot = observe.with_initial_states(robot, runs, noise_sds)

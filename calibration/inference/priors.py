@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Names, Priors
+from calibration.data.configuration_tables import GROUND
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
 from mmrjax.model.params import Parameter, parameters_by_name

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.special import ndtr
 
 from calibration.data.columns import DRIVEN, SUPPLY
-from calibration.data.instruments import display_step
+from calibration.data.inferred_facts import display_step
 from calibration.data.runs import Runs
 from mmrjax.model.channels import Channel
 

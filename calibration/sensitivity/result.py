@@ -12,7 +12,7 @@ from calibration.data.runs import Runs
 from calibration.data.writing import entries_of, json_value
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Remark
-from calibration.sensitivity.replicates import LEVEL, REPLICATES, IntervalEstimate
+from calibration.sensitivity.sampled_indices import LEVEL, REPLICATES, IntervalEstimate
 from mmrjax.model.quantities import Quantity
 
 SCHEMA = "mmrjax.sensitivity/2"

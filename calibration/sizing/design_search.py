@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 
 from calibration.data import Names
 from calibration.data.input_errors import stated_word
-from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.sizing import sheet
@@ -31,7 +30,7 @@ from calibration.sizing.design import (
     build_sizing_task,
     evaluate_design,
 )
-from calibration.sizing.part_options import DriveOption, PartOptions, options_for_robot
+from calibration.sizing.part_options import CellSheet, DriveOption, PartOptions, options_for_robot
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 

@@ -14,23 +14,13 @@ from calibration.inference.fit_notes import Remark as Remark
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.sensitivity.result import SensitivityResult
-from calibration.words import (
-    experiment_words,
-    feedforward_words,
-    fit_words,
-    loop_words,
-    sensitivity_words,
-    settle_words,
-    step_words,
-    table_words,
-)
+from calibration.words import experiment_words, fit_words, loop_words, sensitivity_words, step_words, table_words
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 NOTES: dict[str, str | Callable[..., str]] = {
     "step": step_words.step_sentence,
     "residual_cluster": lambda cluster: fit_words.residual_cluster(cluster),
     **table_words.SAID,
-    **feedforward_words.SAID,
     **fit_words.SAID,
     **loop_words.SAID,
     **experiment_words.SAID,
@@ -38,7 +28,7 @@ NOTES: dict[str, str | Callable[..., str]] = {
 }
 #: Kind of result, or part of one → the function that makes its sentence.
 RESULTS: dict[type, Callable[..., str]] = {
-    Feedforward: feedforward_words.feedforward_statement,
+    Feedforward: fit_words.feedforward_statement,
     fit_notes.Determination: fit_words.is_determined_answer,
     fit_notes.ReachedBound: fit_words.distance_from_prior,
     fit_notes.DependentPair: fit_words.determined_combination,
@@ -54,7 +44,7 @@ RESULTS: dict[type, Callable[..., str]] = {
     formula.Proposal: lambda found: found.expression or loop_words.NO_FORMULA,
     loop_results.UnnamedDiscrepancy: loop_words.curve_course,
     SensitivityResult: sensitivity_words.sensitivity_statement,
-    Settled: settle_words.settle_statement,
+    Settled: table_words.settle_statement,
 }
 #: The same of parts of results, by name.
 PARTS: dict[tuple[type, str], Callable[..., str]] = {

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.climbing import footing
 from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, ContactShape, Footing
-from mmrjax.climbing.lever_drives import LeverDrive, LeverStep, lever_drive, step_levers
+from mmrjax.climbing.levers import LeverDrive, LeverStep, lever_drive, step_levers
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SMALL, compiled
 from mmrjax.fidelities.drive import current_after

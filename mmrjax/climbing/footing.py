@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.climbing import belt_loop
-from mmrjax.climbing.belt_loop import BeltLoop
+from mmrjax.climbing.levers import BeltLoop, gaps_to_belt, gaps_to_grousers, grouser_tips, running_direction
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model import contact
 from mmrjax.model.chassis import Chassis
@@ -157,7 +156,7 @@ def _belt_contacts(
     """
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
-    tips, rate = belt_loop.grouser_tips(belt, place)
+    tips, rate = grouser_tips(belt, place)
     points = frame.world(tips)
     gap, normal = terrain.distance(points)
 
@@ -169,7 +168,7 @@ def _belt_contacts(
     corners = terrain.corners
     local = frame.within(corners)
     for gap, outward, rate, place in (
-        belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local),
+        gaps_to_belt(belt, local), gaps_to_grousers(belt, drawn, local),
     ):  # fmt: skip
         normal = -frame.along(outward)
         points = corners + terrain.nose * -normal
@@ -196,7 +195,7 @@ def _wheel_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> l
         normal = jnp.concatenate([normals, arm / to_corner[:, None]])
         touch_points = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
         zeros = jnp.zeros_like(gap)
-        rate = shape.wheel * belt_loop.running_direction(-normal)
+        rate = shape.wheel * running_direction(-normal)
         groups.append(_ContactGroup(touch_points, gap, normal, rate, None, zeros, zeros + 1 - shape.on_tracks))
     return groups
 
@@ -231,7 +230,7 @@ def contacts_with_terrain(shape: ContactShape, terrain: Terrain, q: Array, v: Ar
     points, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
     gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
     rolls = np.concatenate([np.full(len(g.gap), g.rolls) for g in groups])
-    along = belt_loop.running_direction(normal)
+    along = running_direction(normal)
     carried, own_loads = [], []
     for direction in (normal, along):
         columns = [direction[:, 0], direction[:, 1], _speed_about_axle(direction, points - body.origin)]

@@ -4,7 +4,7 @@ JAX's own cache is consulted only after tracing and lowering, which is most of t
 nothing. Here a program is found by its name, a hash of all inputs of its tracing. These are the source of our
 packages, the versions of the libraries, JAX's settings, and the arguments with shapes in place of arrays. Arguments
 that cannot be named (a class of a user's own file, an array of keys) are compiled as usual. A program is native code:
-it is read only from a folder that nobody but the user can change (`mmrjax.compile.private`).
+it is read only from a folder that nobody but the user can change (`exposure_reason`).
 
 In addition to JAX's cache this saves processor time of warm commands (docs/lab/figures.md, 2026-11-28). It saves 27 %
 of `simulate` (7.6 → 5.6 s), 23 % of a `sweep` and 45 % of `loop measured` (68 → 37 s). `jax.export` saves no more: it
@@ -22,6 +22,7 @@ import importlib.metadata
 import io
 import os
 import pickle
+import stat
 import sys
 import threading
 import types
@@ -37,7 +38,55 @@ import jax.monitoring
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
 
-from mmrjax.compile.private import exposure_reason
+
+def exposure_reason(folder: Path) -> str:
+    """Reason why another user could place files in a folder, empty if only the user and root can.
+
+    The folder and its files have to belong to the user, and neither the group nor others may write to it. Each folder
+    above it has to belong to the user or to root, and be sticky if others may write to it: they could rename it.
+
+    Args:
+        folder: may not exist yet. The folders above it are checked then.
+    """
+    if not hasattr(os, "geteuid"):  # a system without owners and modes
+        return ""
+    absolute_folder = folder.absolute()
+    try:
+        for part in (absolute_folder, *absolute_folder.parents):
+            if part.exists() and (reason := _folder_exposure_reason(part, part == absolute_folder)):
+                return reason
+        if absolute_folder.resolve() != absolute_folder:
+            return exposure_reason(absolute_folder.resolve())
+        for entry in absolute_folder.iterdir() if absolute_folder.is_dir() else ():
+            if entry.lstat().st_uid != os.geteuid():
+                return f"{entry} belongs to another user"
+    except OSError as error:
+        return f"{error.filename or folder}: {error.strerror}"
+    return ""
+
+
+def _folder_exposure_reason(part: Path, itself: bool) -> str:
+    """Reason why another user could replace a folder above, or place files in the folder itself."""
+    state = part.stat(follow_symlinks=itself)
+    if state.st_uid != os.geteuid() and (itself or state.st_uid != 0):
+        return f"{part} belongs to another user"
+    writable = state.st_mode & stat.S_IWOTH or (state.st_mode & stat.S_IWGRP and not _own_group(state.st_gid))
+    sticky = state.st_mode & stat.S_ISVTX and not itself
+    if writable and not sticky and not stat.S_ISLNK(state.st_mode):
+        return f"others may write to {part}"
+    return ""
+
+
+def _own_group(group: int) -> bool:
+    """True if a group has the user's name: many systems create one for each user."""
+    import grp
+    import pwd
+
+    try:
+        return grp.getgrgid(group).gr_name == pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return False
+
 
 #: Environment variable with the folder for programs; if it is unset or empty, none are stored.
 VARIABLE = "MMRJAX_PROGRAMS"

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch
+from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch, result_of_signals, withhold_numbers
 from mmrjax.fidelities.rest import HELD, holds, standing_signals, status_moving, voltage_at_rest
-from mmrjax.fidelities.result import result_of_signals, withhold_numbers
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions

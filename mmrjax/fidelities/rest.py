@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax.fidelities.result import movers_slip, travel_status
+from mmrjax.fidelities.base import movers_slip, travel_status
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.driver import STEEPNESS

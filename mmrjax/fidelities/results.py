@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax.compile.compiling import compiled
-from mmrjax.compile.precision import computed_outside_trace, on_host
+from mmrjax.compile.compiling import compiled, computed_outside_trace, on_host
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words, count_noun
 from mmrjax.fidelities import outputs

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from mmrjax import fidelities
-from mmrjax.compile.precision import as_jax_arrays, in_double, in_trace
+from mmrjax.compile.compiling import as_jax_arrays, in_double, in_trace
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities.base import History

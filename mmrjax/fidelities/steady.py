@@ -14,7 +14,15 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Fidelity, ImplicitSolution, Progress, RunBatch
+from mmrjax.fidelities.base import (
+    Fidelity,
+    ImplicitSolution,
+    Progress,
+    RunBatch,
+    result_of_signals,
+    travel_status,
+    withhold_numbers,
+)
 from mmrjax.fidelities.rest import (
     admitted_current,
     is_at_rest,
@@ -24,7 +32,6 @@ from mmrjax.fidelities.rest import (
     voltage_at_rest,
     without_diode,
 )
-from mmrjax.fidelities.result import result_of_signals, travel_status, withhold_numbers
 from mmrjax.model import balances, channels, contact, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar

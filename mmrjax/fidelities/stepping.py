@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from mmrjax.compile.compiling import compiled
-from mmrjax.compile.precision import as_floats
+from mmrjax.compile.compiling import as_floats, compiled
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import drive

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch
-from mmrjax.fidelities.result import flag_mask, withhold_numbers
+from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch, flag_mask, withhold_numbers
 from mmrjax.model import balances, contact, masses
 from mmrjax.model.balances import signals_of
 from mmrjax.model.conditions import Conditions

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.result import flag_mask, withhold_numbers
+from mmrjax.fidelities.base import flag_mask, withhold_numbers
 from mmrjax.missions import mission_straight, mission_turning
 from mmrjax.missions.mission_steps import EVENTS, FIRST, IntegrationState, MotionLaw, SegmentInputs, integrate_segment
 from mmrjax.missions.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile

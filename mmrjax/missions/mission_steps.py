@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mmrjax.fidelities.base import flag_mask
 from mmrjax.fidelities.rest import smallest_of
-from mmrjax.fidelities.result import flag_mask
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, Scalars

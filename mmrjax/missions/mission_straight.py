@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities import rest, result
+from mmrjax.fidelities import base, rest
 from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import MOTOR_SPEED, SPEED, Profile
 from mmrjax.model import balances, energy
@@ -29,7 +29,7 @@ CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len
 
 #: Unknowns that are 0 at rest; position of the heading: none.
 STOPS, HEADING = (MOTOR, GROUND), slice(0)
-LONG, AT_REST, RESULT = False, rest, result.result_of_signals
+LONG, AT_REST, RESULT = False, rest, base.result_of_signals
 
 #: Integrated quantities: name, and unit of a total.
 TOTALS: dict[str, str] = {
@@ -185,7 +185,7 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
 
 def exceeded(robot: Robot, found: Signals) -> Scalars:
     is_too_hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
-    return {**result.exceeded_limits(robot, found), "too_hot": is_too_hot}
+    return {**base.exceeded_limits(robot, found), "too_hot": is_too_hot}
 
 
 def limited(robot: Robot, y: Array) -> Array:

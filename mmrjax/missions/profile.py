@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.compile.precision import as_array
+from mmrjax.compile.compiling import as_array
 from mmrjax.errors import UsageError, count_noun
 from mmrjax.model.conditions import Conditions, Number
 from mmrjax.model.params import Scalar

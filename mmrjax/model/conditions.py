@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.compile.precision import is_double
+from mmrjax.compile.compiling import is_double
 from mmrjax.errors import UsageError
 from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import Robot

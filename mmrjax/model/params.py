@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.compile.precision import as_array
+from mmrjax.compile.compiling import as_array
 from mmrjax.errors import similar_words
 
 #: A number, or an array of numbers (a batch or a tracer).

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import rest
+from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, withhold_numbers
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
-from mmrjax.fidelities.result import mask_unknown, power_ratio, result_of_signals, withhold_numbers
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions

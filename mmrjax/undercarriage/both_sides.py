@@ -31,9 +31,9 @@ from mmrjax.numerics.linear_equations import factorise, solve_factorised
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES, ContactLaw, GroundForces
 from mmrjax.undercarriage import half_robot, side_contacts
-from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.half_robot import Average, HalfRobotState, HalfRobotSystem, SteadyAverages
 from mmrjax.undercarriage.mjcf import mjx
+from mmrjax.undercarriage.running_gear import BeltPath
 from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions
 
 #: Coordinates of the robot, or their velocities or forces.

@@ -20,7 +20,7 @@ from mmrjax.model.chassis import Chassis
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.elementary import cosine, sine, value_and_slope
-from mmrjax.undercarriage.belt import BeltPath, belt_runs, tips_on_path
+from mmrjax.undercarriage.running_gear import BeltPath, belt_runs, tips_on_path
 from mmrjax.undercarriage.side_contacts import (
     WHEEL,
     ContactState,

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mmrjax.fidelities.base import result_of_signals, travel_status
 from mmrjax.fidelities.drive import current_after
 from mmrjax.fidelities.rest import STARTS, is_at_rest, status_with_slip, travel_direction, voltage_at_rest
-from mmrjax.fidelities.result import result_of_signals, travel_status
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import balances
 from mmrjax.model.chassis import Chassis, inertia_reduced
@@ -41,9 +41,9 @@ from mmrjax.model.signals import (
 from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solve_factorised
 from mmrjax.numerics.newton import root
 from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
-from mmrjax.undercarriage.belt import BeltPath, belt_runs
 from mmrjax.undercarriage.contact_sums import LinearizedSums
 from mmrjax.undercarriage.mjcf import mjx
+from mmrjax.undercarriage.running_gear import BeltPath, belt_runs
 from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions, contact_damping
 
 #: Coordinates of half a robot, or their velocities or forces.

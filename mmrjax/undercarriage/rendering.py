@@ -15,8 +15,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import BODY_HEIGHT
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.belt import BeltPath, tips_on_path
-from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
+from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, BeltPath, tips_on_path
 from mmrjax.undercarriage.side_contacts import lever_tips
 
 FORCE = 1 / 800  # length of an arrow [m/N]

@@ -16,9 +16,8 @@ from scipy.signal import find_peaks, peak_widths
 from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED
-from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.modes import Mode
-from mmrjax.undercarriage.running_gear import TEETH_PULLEY
+from mmrjax.undercarriage.running_gear import TEETH_PULLEY, BeltPath
 
 Series = Float[np.ndarray, " samples"]
 

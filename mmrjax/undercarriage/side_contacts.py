@@ -25,8 +25,16 @@ from mmrjax.model.masses import lever_angles
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.elementary import cosine, sine
-from mmrjax.undercarriage.belt import BeltPath, BeltRuns, belt_runs, tension_along, tips_on_path
-from mmrjax.undercarriage.running_gear import GROUSERS, WHEELS, RunningGear
+from mmrjax.undercarriage.running_gear import (
+    GROUSERS,
+    WHEELS,
+    BeltPath,
+    BeltRuns,
+    RunningGear,
+    belt_runs,
+    tension_along,
+    tips_on_path,
+)
 
 #: A number of each contact.
 PerContact = Float[Array, " contacts"]

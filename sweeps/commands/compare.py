@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, Names, instruments
+from calibration.data import Columns, Names, inferred_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
@@ -43,7 +43,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     second = _second_robot(config, file)
     if runs.sampled:
         return _compare_histories(config, file, second, runs, beside)
-    robot = instruments.with_inferred_instruments(file.robot, runs)
+    robot = inferred_facts.with_inferred_instruments(file.robot, runs)
     if beside.own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     remarks = sentences(check_ranges(runs, robot))
@@ -52,7 +52,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(measured_runs, table, robot)
         if second is not None:
-            other = instruments.with_inferred_instruments(second.robot, runs)
+            other = inferred_facts.with_inferred_instruments(second.robot, runs)
             comparison = add_second_robot(
                 comparison, measured_runs.channels, run.evaluate_runs(other, runs, config, folder=None)
             )

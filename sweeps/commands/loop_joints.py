@@ -21,7 +21,7 @@ from calibration.data.input_errors import BadConfiguration, BadData, allowed_wor
 from calibration.data.named_arrays import NamedArrays, column_numbers, column_texts
 from calibration.data.runs import Runs
 from calibration.data.sources import reading
-from calibration.data.thinning import thin_rows
+from calibration.data.unused_readings import thin_rows
 from calibration.inference.observers import observer_kind
 from calibration.inference.series_noise import estimate_noise
 from mmrjax.model import channels

@@ -11,7 +11,7 @@ from calibration.data.settling import Settled
 from calibration.described import sentences
 from calibration.inference import ranges
 from calibration.inference.observers import SettledRuns
-from calibration.words import settle_words
+from calibration.words import table_words
 from sweeps import config as configuration
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import settle_report
@@ -25,7 +25,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     column_options = [] if config.columns is None else ["--columns", config.columns]
     loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *column_options])
     settled = settling.settle_log(runs, robot, shortest=config.shortest_s, drift=config.drift)
-    few_runs_sentence = settle_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
+    few_runs_sentence = table_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", segments_table(settled))
@@ -53,7 +53,7 @@ def segments_table(found: Settled) -> Columns:
         "first_row": np.array([s.rows[0] + 1 for s in stretches]),
         "last_row": np.array([s.rows[-1] + 1 for s in stretches]),
         "imposed": np.array([s.imposed for s in stretches]),
-        "left_out": np.array([settle_words.left_out_reason(s) if s.why else "" for s in stretches]),
+        "left_out": np.array([table_words.left_out_reason(s) if s.why else "" for s in stretches]),
     }
     for signal in found.signals:
         channel = signal.channel
@@ -69,10 +69,10 @@ def segments_table(found: Settled) -> Columns:
 
 def to_json(found: Settled, few: str = "") -> Json:
     """`result.json`. `few` is the sentence of `words.sentence_on_few_settled_runs`."""
-    omitted = settle_words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
+    omitted = table_words.omitted_stretches(found.stretches, bool(few) and not found.runs.turns)
     return {
         "schema": "mmrjax.settle/1",
-        "statement": settle_words.settle_statement(found),
+        "statement": table_words.settle_statement(found),
         "samples": len(found.runs),
         "settled": len(found.kept),
         "shortest_s": found.shortest,
@@ -83,5 +83,5 @@ def to_json(found: Settled, few: str = "") -> Json:
             s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
         },
         "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in omitted],
-        "notes": [*filter(None, [few]), *settle_words.settle_remarks(found)],
+        "notes": [*filter(None, [few]), *table_words.settle_remarks(found)],
     }

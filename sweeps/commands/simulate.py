@@ -18,8 +18,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.derived.start_figures import curve_peak, stages_of_histories
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import History, RunBatch
-from mmrjax.fidelities.result import result_of_signals
+from mmrjax.fidelities.base import History, RunBatch, result_of_signals
 from mmrjax.model import channels, contact, quantities
 from mmrjax.model.gearmotor import Motor
 from mmrjax.model.params import Scalar

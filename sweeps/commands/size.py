@@ -8,11 +8,11 @@ from pathlib import Path
 
 from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration, stated_word
-from calibration.data.parts import packaged_motors
 from calibration.described import report_in_words
 from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size_robot as search
+from calibration.sizing.part_options import packaged_motors
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message, step_reporter

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from calibration.data import Columns, Json, sides
+from calibration.data import Columns, Json, contradictions
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import fidelities
@@ -128,7 +128,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
             f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, the voltage of --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
-    source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))
+    source, duties = contradictions.supply_and_shares(volts, None if supply is None else np.asarray(supply))
     return columns | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 

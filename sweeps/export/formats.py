@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.posterior_file import FILE, Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from mmrjax.compile.precision import in_double
+from mmrjax.compile.compiling import in_double
 from mmrjax.errors import count_noun
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import params

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
-from mmrjax.climbing import belt_loop, footing
+from mmrjax.climbing import footing, levers
 from mmrjax.climbing.footing import PITCH, SHAFT
 from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, SideOutline
 from mmrjax.model.paper_tables import BODY_HEIGHT
@@ -49,7 +49,7 @@ def _belt_outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, 
     outlines = []
     for belt, frame, belt_angle in belts:
         path = frame.world(belt.point(jnp.linspace(0.0, belt.length, 120)[:-1]))
-        tips = frame.world(belt_loop.grouser_tips(belt, belt.places(belt.first * belt_angle))[0])
+        tips = frame.world(levers.grouser_tips(belt, belt.places(belt.first * belt_angle))[0])
         outlines.append((np.asarray(path), np.asarray(tips)))
     if np.asarray(chassis.on_tracks) < 0.5:
         round_ = np.linspace(0, 2 * np.pi, 60)

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.data import Columns
-from calibration.data.courses import applied_drive
+from calibration.data.clock import applied_drive
 from calibration.data.runs import Runs
 from calibration.data.settling import Settled
 from mmrjax.derived.start_figures import (

@@ -24,8 +24,7 @@ from jaxtyping import Array, Float
 
 from calibration.data import Columns, Json, Names
 from mmrjax import WORKER, fidelities
-from mmrjax.compile.compiling import compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import Threads, compiled
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate_points, pick_outputs
 from mmrjax.missions.profile import Profile

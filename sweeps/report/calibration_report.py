@@ -12,7 +12,7 @@ from calibration.inference import blocks
 from calibration.inference.feedforward import Feedforward, constant_units, interval_95
 from calibration.inference.result import CalibrationResult
 from calibration.inference.simulation_errors import OF_SIZE
-from calibration.words import feedforward_words, fit_words
+from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from sweeps.pages import words
 from sweeps.report import catalogue, fit_tables, run_tables
@@ -121,7 +121,7 @@ def feedforward_document(found: Feedforward) -> Document:
         blocks += [catalogue.table("feedforward.gains", gains), *remarks((option_rows,), "asked")]
     return Document(
         f"Feedforward of {'an' if found.mechanism[0] in 'ae' else 'a'} {found.mechanism} mechanism",
-        feedforward_words.feedforward_statement(found),
+        fit_words.feedforward_statement(found),
         tuple(blocks),
         (Section("Windows", _figures(found)),),
     )

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calibration.data import Columns
-from calibration.data.courses import applied_drive
+from calibration.data.clock import applied_drive
 from calibration.data.runs import Runs
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import r_squared

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from calibration.data import Names
 from calibration.data.settling import Settled, Stretch
-from calibration.words import settle_words as words
+from calibration.words import table_words as words
 from sweeps.report import catalogue
 from sweeps.report.document import Document, Note, Section, Table, columns, remarks
 

@@ -73,9 +73,9 @@ NPY = Format("a NumPy file", "arrays", "signals_of_npy")
 JSON = Format("a JSON file", "json_records", "signals_of_json")
 BAG = Format("a ROS bag", "bags", "signals_of_bag", "rosbags")
 MCAP = Format("an MCAP file", "bags", "signals_of_bag", "rosbags")
-ULOG = Format("a ULog file", "ulog", "signals_of_ulog", "pyulog")
-MDF = Format("an MDF file", "mdf", "signals_of_mdf", "asammdf")
-WPILOG = Format("a WPILOG file", "wpilog", "signals_of_wpilog")
+ULOG = Format("a ULog file", "recorders", "signals_of_ulog", "pyulog")
+MDF = Format("an MDF file", "recorders", "signals_of_mdf", "asammdf")
+WPILOG = Format("a WPILOG file", "recorders", "signals_of_wpilog")
 WORKBOOK = Format("a workbook", "workbook", "signals_of_workbook", "python-calamine")
 
 #: First bytes of each format.

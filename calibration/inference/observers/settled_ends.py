@@ -24,8 +24,7 @@ from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.optimizers import CORES, Optimum, Pin, levenberg_marquardt
 from calibration.inference.priors import TIED
 from calibration.inference.problem import Problem, data_from_readings
-from mmrjax.compile.compiling import compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import Threads, compiled
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 

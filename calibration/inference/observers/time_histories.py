@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.data import Columns, Names
-from calibration.data.columns import SUPPLY
-from calibration.data.courses import (
+from calibration.data.clock import (
     ConstantInterval,
     applied_drive,
     changing_columns,
@@ -32,6 +31,7 @@ from calibration.data.courses import (
     divide_run,
     intervals_by_run,
 )
+from calibration.data.columns import SUPPLY
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -68,8 +68,7 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from calibration.inference.weak_form import fit_weak_form
 from mmrjax import fidelities
-from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
-from mmrjax.compile.precision import Threads
+from mmrjax.compile.compiling import OVER_TIME, SELDOM, Threads, compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS
 from mmrjax.fidelities.drive import drive_rates, moving, state_of_unknowns

@@ -1,4 +1,4 @@
-"""Mass of a robot without payload: from its file, or from a table of runs.
+"""Facts that a table of runs states or shows: mass of the robot, sign and resolution of its instruments.
 
 A table with `total_mass_kg` is simulated with that mass instead of the robot's own. A robot that is fitted to the
 table needs the same mass: otherwise an effect on the mass would be fitted relative to the table's mass, but written
@@ -7,20 +7,25 @@ to a file with another.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.named_arrays import check_rows
 from calibration.data.table import Runs, rows_of_scaled_adhesion
-from mmrjax.model import params
+from mmrjax.model import channels, params
+from mmrjax.model.channels import Channel
 from mmrjax.model.paper_tables import BENCH
+from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot
 
 #: Masses that differ by less are equal within rounding [kg].
-ROUNDING = 1e-6
+MASS_ROUNDING = 1e-6
 
 
 def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, float, bool]]:
@@ -48,7 +53,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, flo
     for index in np.unique(configuration_index):
         is_own_row = configuration_index == index
         m = own_masses[is_own_row]
-        constant = bool(np.ptp(runs["total_mass_kg"][is_own_row]) <= ROUNDING)
+        constant = bool(np.ptp(runs["total_mass_kg"][is_own_row]) <= MASS_ROUNDING)
         median = round(float(np.median(m)), 6)
         masses[robot.configurations.names[index]] = (median, float(m.min()), float(m.max()), constant)
     return masses
@@ -61,7 +66,7 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
         BadData: for the same reasons as `stated_masses`.
     """
     own_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
-    masses = {n: m for n, (m, *_) in stated_masses(robot, runs).items() if abs(m - own_masses[n]) > ROUNDING}
+    masses = {n: m for n, (m, *_) in stated_masses(robot, runs).items() if abs(m - own_masses[n]) > MASS_ROUNDING}
     return params.replace(robot, {f"{name}.mass": jnp.asarray(mass, float) for name, mass in masses.items()})
 
 
@@ -74,13 +79,13 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     notes = []
     for name, (median, low, high, constant) in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
-        if high - low > ROUNDING:
+        if high - low > MASS_ROUNDING:
             why = "; does total_mass_kg exclude the payload?" if constant else ""
             notes.append(
                 f"{name}: total_mass_kg minus payload_kg varies from {low:.4g} to {high:.4g} kg. robot.toml "
                 f"contains the median, {median:.4g} kg, so it does not reproduce the fit in other rows{why}"
             )
-        elif abs(median - mass) > ROUNDING:
+        elif abs(median - mass) > MASS_ROUNDING:
             notes.append(
                 f"{name}: the table states {median:.6g} kg without payload, the robot's file {mass:.6g} "
                 f"kg. {median:.6g} kg is used, and written to robot.toml"
@@ -112,3 +117,91 @@ def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
                 f"--prior {name}.mass: {runs.source} has a column total_mass_kg, which sets the mass of each "
                 "run; remove that column or the prior"
             )
+
+
+#: Smallest step, and largest rounding error of a printed reading, as shares of the largest difference.
+SMALLEST, ROUNDING = 1e-5, 1e-7
+#: Fewest different readings that show a step. In 99 % of tables the common divisor of so many random multiples is the
+#: step itself, with four multiples in 83 %.
+FEWEST = 8
+#: Coarsest step of a display, as a share of the largest reading. Coarser steps are levels that a person set.
+COARSEST = 0.25
+
+
+def common_step(readings: np.ndarray) -> float:
+    """Largest common divisor of all differences between readings (Euclid's algorithm).
+
+    0 if that step is not larger than rounding errors, or if there are too few different readings. Evenly spaced
+    readings that occur equally often, with at most one level missing, were set by a person. They do not show the
+    resolution of a display.
+    """
+    levels, counts = np.unique(readings[np.isfinite(readings)], return_counts=True)
+    if levels.size < FEWEST:
+        return 0.0
+    step, largest = 0.0, float(np.ptp(levels))
+    for difference in np.diff(levels):
+        a, b = float(difference), step
+        while b > ROUNDING * largest:
+            remainder = a - b * round(a / b)
+            a, b = b, abs(remainder)
+        step = a
+        if step < SMALLEST * largest:
+            return 0.0
+    ladder = largest < (levels.size + 0.5) * step and np.min(np.abs(levels)) < 1.5 * step
+    set_by_hand = ladder and np.ptp(counts) == 0
+    return 0.0 if set_by_hand else step
+
+
+def display_step(readings: np.ndarray, channel: Channel) -> float:
+    """Resolution of the display of a channel [SI]. 0 if the readings show none.
+
+    It is the `common_step`. With too few different readings, it is the largest power of ten, in the unit of the
+    column, that divides all of them. It is at most `COARSEST` of the largest reading.
+
+    Args:
+        readings: readings [SI].
+        channel: the channel.
+    """
+    step = common_step(readings)
+    levels = np.unique(readings[np.isfinite(readings)]) / channel.factor
+    if step or not 2 <= levels.size < FEWEST:
+        return step
+    largest = float(np.max(np.abs(levels)))
+    powers = 10.0 ** np.arange(math.floor(math.log10(COARSEST * largest)), math.log10(SMALLEST * largest), -1)
+    fits = [p for p in powers if np.all(np.abs(levels / p - np.round(levels / p)) < 1e-6)]
+    return float(fits[0] * channel.factor) if fits else 0.0
+
+
+def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> tuple[Instrument, ...]:
+    """Instruments whose sign and resolution are inferred from the readings, where they are not stated.
+
+    An instrument shows only the magnitude if no reading is negative although some runs go backward.
+
+    Args:
+        columns: columns of the table, in their units.
+    """
+    runs_backward = any(
+        (columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns
+    )
+    inferred = []
+    for instrument in instruments:
+        channel = channels.find_channel(instrument.channel)
+        readings = columns.get(channel.column, np.zeros(0))
+        signed, quantum = instrument.signed, instrument.quantum
+        if signed is None:
+            signed = not runs_backward or bool((readings < 0).any())
+        if quantum is None:
+            quantum = common_step(readings) * channel.factor
+        inferred.append(Instrument(instrument.channel, signed, quantum))
+    return tuple(inferred)
+
+
+def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
+    """Robot with the instruments inferred from its table."""
+    rig_instruments = robot.rig.instruments
+    all_instruments = runs.layout.instruments if any(i.free for i in rig_instruments) else rig_instruments
+    channel_names = {i.channel for i in all_instruments}
+    all_instruments = (*all_instruments, *(i for i in runs.layout.instruments if i.channel not in channel_names))
+    if all_instruments == rig_instruments:
+        return robot
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=all_instruments))

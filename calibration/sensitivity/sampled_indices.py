@@ -1,12 +1,18 @@
-"""Variance-based (Sobol) indices of independent inputs: first, total and second order (Sobol' 1993, Homma and
-Saltelli 1996).
+"""Sobol' indices (Sobol' 1993, Homma and Saltelli 1996) and elementary effects (Morris 1991), from replicates.
 
 S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that vanishes if x_i is known. T_i = E[Var(y | all but
 x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions. S_ij is the joint
 effect of x_i and x_j in addition to their single effects. Designs (Saltelli's scheme on a scrambled Sobol sequence)
 and estimators are those of SALib: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first order and, after Jansen
-(1999), for the total, and Saltelli, ibid. 145 (2002) for second order, as the mean of both orders. Intervals are from
-whole replicates.
+(1999), for the total, and Saltelli, ibid. 145 (2002) for second order, as the mean of both orders.
+
+Every index is a ratio of means: a numerator over a variance. A bootstrap over the points of a scrambled Sobol
+sequence would treat them as independent, but they are correlated by construction. Whole replicates with different
+scramblings are independent (Owen, Monte Carlo variance of scrambled net quadrature, SIAM J. Numer. Anal. 34 (1997)).
+The spread between replicates is therefore that of the estimate, and Student's t gives the interval.
+
+μ* is the mean magnitude of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22
+(2007)). σ is the standard deviation of the change between places, due to nonlinearity or interactions.
 """
 
 from __future__ import annotations
@@ -14,10 +20,61 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from scipy import stats
 
-from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate, ratio_estimate
+#: Replicates of a design.
+REPLICATES = 32
+#: Probability of the intervals.
+LEVEL = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class IntervalEstimate:
+    """Estimates with their 95 % intervals.
+
+    Attributes:
+        value: estimates, any shape.
+        low, high: ends of the 95 % interval.
+    """
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __getitem__(self, k: Any) -> IntervalEstimate:
+        return IntervalEstimate(self.value[k], self.low[k], self.high[k])
+
+
+def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEstimate:
+    """Ratio of the means of two quantities over replicates, with its interval.
+
+    Its variance is that of the linearised ratio, e = (numerator - ratio · denominator) / mean denominator (Cochran,
+    Sampling Techniques (1977), eq. 6.9). The bias of the ratio decreases with the total number of points, not with
+    the number in a replicate.
+
+    Args:
+        numerator: shape (replicates, ...).
+        denominator: shape (replicates,), not negative.
+
+    Returns:
+        NaN if the denominator is 0: without variance there are no shares.
+    """
+    count = len(numerator)
+    mean_denominator = float(np.mean(denominator))
+    shape = (-1,) + (1,) * (numerator.ndim - 1)
+    if not mean_denominator > 0:
+        undefined = np.full(numerator.shape[1:], np.nan)
+        return IntervalEstimate(undefined, undefined, undefined)
+    mean_numerator = np.mean(numerator, 0)
+    value = mean_numerator / mean_denominator
+    error = (numerator - mean_numerator - value * (denominator - mean_denominator).reshape(shape)) / mean_denominator
+    sd = np.sqrt(np.sum(error**2, 0) / (count * (count - 1)))
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, count - 1)) * sd
+    return IntervalEstimate(value, value - width, value + width)
+
 
 #: Fewest points of a replicate.
 FEWEST = 4
@@ -184,3 +241,92 @@ def indices_of_terms(terms: VarianceTerms) -> SobolIndices:
     return SobolIndices(
         ratio_estimate(first, variance), ratio_estimate(terms.total, variance), second, float(variance.mean())
     )
+
+
+#: Levels of the grid of the trajectories.
+LEVELS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class ElementaryEffects:
+    """Elementary effects of each input on an output [unit of the output per range of the input], shape (inputs,).
+
+    Attributes:
+        mean: μ, mean of the effects.
+        size: μ*, mean magnitude of the effects, with its interval.
+        spread: σ, standard deviation of the effects.
+        trajectories: number of included trajectories.
+        lost: number of omitted trajectories, at a point of which the model has no value.
+    """
+
+    mean: np.ndarray
+    size: IntervalEstimate
+    spread: np.ndarray
+    trajectories: int
+    lost: int
+
+
+def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
+    """Trajectories in the unit cube, shape (trajectories · (inputs + 1), inputs)."""
+    from SALib.sample import morris as sampling
+
+    # The sampler uses NumPy's global generator despite its seed argument, so the state is restored.
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        return sampling.sample(_problem(inputs), trajectories, num_levels=LEVELS, seed=seed)
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def elementary_effects(points: np.ndarray, values: np.ndarray) -> ElementaryEffects | None:
+    """Elementary effects of each input on one output.
+
+    Args:
+        points: points from `morris_design`.
+        values: values of the output there.
+
+    Returns:
+        None if fewer than two trajectories have values at all points.
+    """
+    from SALib.analyze.morris import analyze
+
+    count, steps = len(points) // (points.shape[1] + 1), points.shape[1] + 1
+    values_by_path = values.reshape(count, steps)
+    finite = np.isfinite(values_by_path).all(1)
+    finite_points = np.repeat(finite, steps)
+    if finite.sum() < 2:
+        return None
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        analysis = analyze(
+            _problem(points.shape[1]), points[finite_points], values[finite_points], num_levels=LEVELS, seed=0
+        )
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    size = np.asarray(analysis["mu_star"], float)
+    # change of the output per change of the moved input, shape (trajectories, inputs)
+    steps_taken = np.diff(points[finite_points].reshape(-1, steps, points.shape[1]), axis=1)
+    moved_input = np.abs(steps_taken).argmax(-1)
+    change = (
+        np.diff(values_by_path[finite], axis=1) / np.take_along_axis(steps_taken, moved_input[..., None], -1)[..., 0]
+    )
+    elementary = np.zeros_like(change)
+    np.put_along_axis(elementary, moved_input, change, 1)
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
+    error = width * np.abs(elementary).std(0, ddof=1)
+    return ElementaryEffects(
+        np.asarray(analysis["mu"], float),
+        IntervalEstimate(size, size - error, size + error),
+        np.asarray(analysis["sigma"], float),
+        int(finite.sum()),
+        int(count - finite.sum()),
+    )
+
+
+def _problem(inputs: int) -> dict[str, object]:
+    return {
+        "num_vars": inputs,
+        "names": [str(k) for k in range(inputs)],
+        "bounds": [[0.0, 1.0]] * inputs,
+        "groups": None,
+    }
