@@ -15,13 +15,13 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
-from calibration.discovery import log_stages, loop_input, outliers, preference, result, stages, verdict
+from calibration.discovery import log_stages, loop_input, outliers, preference, stages, verdict
 from calibration.discovery.assembly import assemble_result
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.result import DiscoveryResult, NoiseVerdict
 from calibration.discovery.settings import FIT
 from calibration.inference import fit_notes, population
 from calibration.inference import noise as noise_room
-from calibration.inference.observers.windows import Windows
 from calibration.inference.optimizers import CORES
 from mmrjax import effects
 from mmrjax.compile import compiling
@@ -49,7 +49,7 @@ def discover(
     progress: Callable[[str], None] = lambda text: None,
     keep: population.StoreStage = population.compute_without_storing,
     left: Callable[[], float | None] = lambda: None,
-) -> result.DiscoveryResult:
+) -> DiscoveryResult:
     """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
 
     Args:
@@ -71,7 +71,7 @@ def discover(
 
     Raises:
         BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
-            experiments, or a call inside `jax.jit` while JAX uses single compiling.
+            experiments, or a call inside `jax.jit` while JAX uses single precision.
     """
     if not compiling.is_double():
         raise BadConfiguration(f"discover: {compiling.SINGLE}")
@@ -96,7 +96,7 @@ def discover(
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
     threads = compiling.Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
-    sensitivity, outstanding = list[result.NoiseVerdict](), list[float]()
+    sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
             tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
@@ -117,7 +117,7 @@ def discover(
                     not other.ends.test.rejected_with_margin,
                     verdict.verdict_summary(other, ready.numbers),
                 )
-                sensitivity.append(result.NoiseVerdict(f, other.verdict, summary, other.members, adequate))
+                sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
     finally:  # an interruption or the time limit waits for none of them
@@ -199,8 +199,7 @@ def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate
     """Stages of the windows of a log with a long run. The start of its simulated fit if the windows find nothing,
     which readings may still do. None if they do not show the states, or not this start.
     """
-    other = given.known is not None and not isinstance(given.known.screened.base.space.bare.observe, Windows)
-    if given.equations is not None or other or (windows := log_stages.windows_of_log(given)) is None:
+    if (windows := log_stages.windows_of_log(given)) is None:
         return None
     space = given.space.with_room(given.known_room)
     confirm = functools.partial(log_stages.best_simulated_size, space, given.settings)

@@ -24,7 +24,7 @@ from calibration.inference import observers, priors
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.observers.linear_rows import problem_of_readings
-from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.observers.windows import Windows, problem_of_windows
 from calibration.inference.weak_form import fit_weak_form
 
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
@@ -45,10 +45,14 @@ RIVALS = 3
 
 def windows_of_log(given: LoopInput) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states, or if its
-    longest run has fewer than `LONG` steps.
+    longest run has fewer than `LONG` steps, and for equations or other known results.
 
     Windows use every row of a log, except for an angle alone. Simulations use fewer.
     """
+    if given.equations is not None:
+        return None
+    if given.known is not None and not isinstance(given.known.screened.base.space.bare.observe, Windows):
+        return None
     space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < LONG:
