@@ -234,6 +234,8 @@ class SupplyPart(Part):
 
 
 SURFACE = "Surface of Table 5, or one of the rig's"
+FRONT = "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)"
+REAR = "Angle of the rear levers, likewise"
 
 
 def _values_text(values: Iterable[float]) -> str:
@@ -261,12 +263,8 @@ class OneRun(Part):
     total_mass_kg: float | None = option_field(
         None, "Total mass", usual="the robot's mass and the payload", flag="--mass"
     )
-    levers_front_deg: float | None = option_field(
-        None,
-        "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
-        usual="the robot's",
-    )
-    levers_rear_deg: float | None = option_field(None, "Angle of the rear levers, likewise", usual="the robot's")
+    levers_front_deg: float | None = option_field(None, FRONT, usual="the robot's")
+    levers_rear_deg: float | None = option_field(None, REAR, usual="the robot's")
     load_torque_Nm: float | None = option_field(
         None, "Brake torque at each output (N·m), for a shaft",
         usual="none"
@@ -496,14 +494,19 @@ class Render(RobotPart, FidelityPart, SupplyPart):
     model: Literal["track"] = "track"
 
 
-class Resonance(RobotPart, FidelityPart, OutputPart):
+class ConfigurationPart(Part):
+    """One configuration of a robot."""
+
+    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
+
+
+class Resonance(RobotPart, ConfigurationPart, FidelityPart, OutputPart):
     """A map of ripple over speed and payload, of the fidelity that resolves the running gear."""
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
         None, "Length of a run (s). Its second half shows the ripple", usual="1.5", minimum=0.5
     )
-    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
         "Supply voltages (V), at least 5",
@@ -521,25 +524,10 @@ Angle = Annotated[float, number_between(-360, 360)]
 Height = Annotated[float, positive_number(5000)]
 
 
-class Climb(RobotPart, SupplyPart, OutputPart):
-    """One robot over an obstacle, or the largest that it gets over."""
+class ClimbPart(Part):
+    """Edges of an obstacle, lever angles during a climb, and its integration."""
 
-    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
-    step_mm: Height | None = option_field(None, "Height of a step")
-    stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
-    gap_mm: Height | None = option_field(None, "Width of a trench")
-    terrain: Path | None = option_field(
-        None, "CSV of the ground with columns x_m and z_m, or x_mm and z_mm", format="path"
-    )
     nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Edge radius of steps and stairs")
-    levers_front_deg: Angle | None = option_field(
-        None,
-        "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
-        usual="from the robot's file",
-    )
-    levers_rear_deg: Angle | None = option_field(
-        None, "Angle of the rear levers, likewise", usual="from the robot's file"
-    )
     sequence: Path | None = option_field(
         None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg. "
             "Or front_V and rear_V, voltages of the lever motors",
@@ -548,6 +536,21 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     levers_voltage_V: Annotated[float, positive_number(1e6)] | None = option_field(
         None, "Highest voltage of the levers' motors (V)", usual="that of the supply"
     )
+    duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
+    time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step")
+
+
+class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
+    """One robot over an obstacle, or the largest that it gets over."""
+
+    step_mm: Height | None = option_field(None, "Height of a step")
+    stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
+    gap_mm: Height | None = option_field(None, "Width of a trench")
+    terrain: Path | None = option_field(
+        None, "CSV of the ground with columns x_m and z_m, or x_mm and z_mm", format="path"
+    )
+    levers_front_deg: Angle | None = option_field(None, FRONT, usual="the robot's")
+    levers_rear_deg: Angle | None = option_field(None, REAR, usual="the robot's")
     supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
     payload_kg: Payload = option_field(0.0, "Additional load mass")
     surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
@@ -562,8 +565,6 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         "Compute derivatives by these, comma-separated: any parameter, adhesion, payload, voltage (with "
         "--battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
-    duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
-    time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step")
 
     @model_validator(mode="after")
     def _one_obstacle(self) -> Self:
@@ -651,7 +652,7 @@ class Settle(RobotPart, DataPart, OutputPart):
     )
 
 
-class Export(RobotPart, OutputPart):
+class Export(RobotPart, ConfigurationPart, OutputPart):
     """A drive in the format of another simulator."""
 
     robot: str = option_field(
@@ -665,7 +666,6 @@ class Export(RobotPart, OutputPart):
         "mujoco", "Format (docs/howto/export.md)"
     )
     data: str | None = option_field(None, "Runs or log to compare with", usual="a grid without readings")
-    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     joint: str = option_field("drive", "Name of the joint, for mujoco")
     draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(
         1000, "Samples from the posterior, for randomization"

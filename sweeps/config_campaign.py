@@ -15,9 +15,9 @@ from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
 from sweeps.config import (
     BatchPart,
+    ClimbPart,
     FolderPart,
     OutputPart,
-    Part,
     ProfilePart,
     RobotPart,
     Sweep,
@@ -41,19 +41,14 @@ GRID = (
 SIZE = "obstacle_mm"
 
 
-class Obstacle(Part):
-    """Obstacle that every point of a sweep climbs (`sweeps.points.climbs`). Its size is the axis `obstacle_mm`, or
+class Obstacle(ClimbPart):
+    """Obstacle that every point of a sweep climbs (`sweeps.points.tasks`). Its size is the axis `obstacle_mm`, or
     found by a search."""
 
     kind: Literal["step", "stairs", "gap"]
     find: bool = False
     tread_mm: float = Field(default=290.0, ge=10, le=5000)
     count: int = Field(default=3, ge=1, le=50)
-    nose_mm: float = Field(default=0.0, ge=0, le=500)
-    sequence: Path | None = None
-    levers_voltage_V: float | None = Field(default=None, gt=0, le=1e6)
-    duration_s: float = Field(default=20.0, gt=0, le=600)
-    time_step_s: float = Field(default=1e-4, gt=0, le=1e-3)
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> Self:

@@ -19,7 +19,7 @@ from mmrjax.numerics.elementary import value_and_slope
 from sweeps.export import jax_actuator, mujoco
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, ComparisonRuns, EffectFate
 from sweeps.export.joint import DriveJoint
-from sweeps.export.law_source import LawConstant, jax_source, module_from_source
+from sweeps.export.law_source import LawConstant, filled_template, jax_source, module_from_source
 
 #: Points of an axis on each side of rest. Ratio of the axes to the range of the runs.
 POINTS, BEYOND = 20, 1.2
@@ -188,56 +188,13 @@ def _c_array(values: np.ndarray) -> str:
 
 def c_header(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> str:
     """Text of a C header: axes, tables, and a function that reads each of them."""
-    name = joint.name
-    guard = f"{name}_FEED_FORWARD_H".upper()
-    shape = f"[{len(found.speed)}][{len(found.torque)}]"
     tables = {"voltage": found.values["voltage"], "current": found.values["current"], "efficiency": found.efficiency}
-    arrays = "\n".join(
-        f"static const float {name}_{key}{shape} = {{\n"
-        + ",\n".join(f"  {{{_c_array(row)}}}" for row in values)
-        + "\n};\n"
-        for key, values in tables.items()
-    )
-    units = {"voltage": "Voltage at the driver's output [V]", "current": "Current of one motor [A]",
-             "efficiency": "Power given over power taken [-]"}  # fmt: skip
-    readers = "\n".join(
-        f"/* {what} for a speed [rad/s] and a torque [N*m] of the joint; clamped to the tables' range. */\n"
-        f"static inline float {name}_get_{key}(float speed, float torque) {{\n"
-        f"  return {name}_read({name}_{key}, speed, torque);\n}}\n"
-        for key, what in units.items()
-    )
     origin = f"Feed-forward of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     # Names come from users, so nothing in them can end the comment.
     words = (" ".join(printable(text).split()) for text in (origin, *notes))
-    comment = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
-    return f"""/* {comment}
- * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of steady motion.
- * When accelerating, add armature * acceleration to it.
- */
-#ifndef {guard}
-#define {guard}
-
-static const float {name}_speed[{len(found.speed)}] = {{{_c_array(found.speed)}}};
-static const float {name}_torque[{len(found.torque)}] = {{{_c_array(found.torque)}}};
-
-{arrays}
-static inline int {name}_place(const float *axis, int points, float x, float *share) {{
-  int k = 0;
-  if (x <= axis[0]) {{ *share = 0.0f; return 0; }}
-  if (x >= axis[points - 1]) {{ *share = 1.0f; return points - 2; }}
-  while (axis[k + 1] < x) k++;
-  *share = (x - axis[k]) / (axis[k + 1] - axis[k]);
-  return k;
-}}
-
-static inline float {name}_read(const float table{shape}, float speed, float torque) {{
-  float a, b;
-  int i = {name}_place({name}_speed, {len(found.speed)}, speed, &a);
-  int j = {name}_place({name}_torque, {len(found.torque)}, torque, &b);
-  return (1 - a) * ((1 - b) * table[i][j] + b * table[i][j + 1])
-       + a * ((1 - b) * table[i + 1][j] + b * table[i + 1][j + 1]);
-}}
-
-{readers}
-#endif
-"""
+    return filled_template(
+        "feed_forward.h", name=joint.name, speed=_c_array(found.speed), speeds=len(found.speed),
+        torque=_c_array(found.torque), torques=len(found.torque),
+        comment=[text.replace("*/", "* /").replace("/*", "/ *") for text in words],
+        tables={key: [_c_array(row) for row in values] for key, values in tables.items()},
+    )  # fmt: skip

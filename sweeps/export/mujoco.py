@@ -22,7 +22,7 @@ from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, ComparisonRuns, EffectFate, JointResult
 from sweeps.export.joint import DriveJoint
-from sweeps.export.law_source import LawConstant
+from sweeps.export.law_source import LawConstant, filled_template
 
 #: First version with `<dcmotor>`.
 FIRST = (3, 7, 0)
@@ -452,40 +452,11 @@ def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: floa
             float(moved_load.angle_zero),
         )
         head, arm = "The rig's shaft", 0.05
-    body = _body_text(inertia, weight, angle)
-    return (
-        "<mujoco>\n"
-        + _comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  ")
-        + '  <include file="drive.xml"/>\n'
-        '  <compiler angle="radian"/>\n'
-        '  <option timestep="' + ("0.0005" if joint.loose else "0.001") + '" integrator="implicitfast"/>\n'
-        '  <visual><headlight ambient="0.5 0.5 0.5"/></visual>\n'
-        "  <worldbody>\n"
-        '    <geom name="floor" type="plane" size="1 1 0.01" pos="0 0 -0.3" rgba="0.9 0.9 0.9 1" contype="0" '
-        'conaffinity="0"/>\n'
-        '    <body name="output">\n'
-        f'      <joint name="{at}" class="{name}" type="hinge" axis="0 1 0"/>\n'
-        f"{body}"
-        f'      <geom type="cylinder" size="{_numbers_text(arm)} 0.015" euler="1.5707963 0 0" rgba="0.2 0.4 0.7 1" '
-        'contype="0" conaffinity="0" mass="0"/>\n'
-        f'      <geom type="capsule" size="0.004" fromto="0 -0.02 0 {_numbers_text(arm)} -0.02 0" '
-        'rgba="0.8 0.3 0.1 1" '
-        'contype="0" conaffinity="0" mass="0"/>\n'
-        "    </body>\n"
-        "  </worldbody>\n"
-        "  <actuator>\n"
-        + _comment_lines(["Torque against forward rotation [N·m]."], "    ")
-        + f'    <motor name="load" joint="{at}" gear="-1"/>\n'
-        "  </actuator>\n"
-        "  <sensor>\n"
-        f'    <jointvel name="speed" joint="{at}"/>\n'
-        f'    <actuatorfrc name="motor_torque" actuator="{name}"/>\n'
-        "  </sensor>\n"
-        "  <keyframe>\n"
-        f'    <key name="run" ctrl="{_numbers_text(command, load)}"/>\n'
-        "  </keyframe>\n"
-        "</mujoco>\n"
-    )
+    return filled_template(
+        "scene.xml", at=at, name=name, timestep="0.0005" if joint.loose else "0.001",
+        head=_comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  "),
+        body=_body_text(inertia, weight, angle), arm=_numbers_text(arm), run=_numbers_text(command, load),
+    )  # fmt: skip
 
 
 def _body_text(inertia: float, weight: float, angle: float) -> str:

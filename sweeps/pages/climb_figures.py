@@ -58,15 +58,6 @@ def _belt_outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, 
     return outlines
 
 
-def _draw_ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
-    points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
-    points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
-    bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
-    outline = np.concatenate([points, [[points[-1, 0], bottom], [points[0, 0], bottom]]])
-    axes.add_patch(Polygon(np.maximum(outline, [-1e9, bottom]), color=_GROUND, alpha=0.55, lw=0))
-    axes.plot(*points.T, color=INK, lw=1.2)
-
-
 def _draw_robot(axes: Any, found: ClimbResult, q: np.ndarray) -> None:
     outlines = _belt_outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
@@ -107,7 +98,14 @@ def draw_silhouettes(found: ClimbResult) -> Figure:
     q = footing_coordinates(found.table)
     fig, axes = new_figure(-(-len(instants) // 3), 3, 2.7 * -(-len(instants) // 3))
     for n, (ax, (name, k)) in enumerate(zip(axes.ravel(), instants, strict=False), 1):
-        _draw_ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
+        begin = q[k, 0] - 0.5
+        end = q[k, 0] + 0.5
+        points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
+        points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
+        bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
+        outline = np.concatenate([points, [[points[-1, 0], bottom], [points[0, 0], bottom]]])
+        ax.add_patch(Polygon(np.maximum(outline, [-1e9, bottom]), color=_GROUND, alpha=0.55, lw=0))
+        ax.plot(*points.T, color=INK, lw=1.2)
         _draw_robot(ax, found, q[k])
         ax.set(xlim=(q[k, 0] - 0.48, q[k, 0] + 0.48), ylim=(q[k, 1] - 0.38, q[k, 1] + 0.38), aspect="equal")
         ax.set_title(f"{n}: {found.table['time_s'][k]:.2f} s, {name}", fontsize=9)

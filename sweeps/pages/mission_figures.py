@@ -238,12 +238,6 @@ def _draw_outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: 
     axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})
 
 
-def _set_plan_axes(axes: Axes) -> None:
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("to the right of the start [m]", color=INK)
-    axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
-
-
 def path_arcs(
     x: np.ndarray, y: np.ndarray, yaw: np.ndarray
 ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
@@ -273,7 +267,9 @@ def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.nda
     axes.plot(-aside, ahead, color=BLUE)
     for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
         _draw_outline(axes, robot, row, x[k], y[k], yaw[k], color)
-    _set_plan_axes(axes)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("to the right of the start [m]", color=INK)
+    axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
     return fig
 
 

@@ -14,7 +14,7 @@ from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
 from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, EffectFate
 from sweeps.export.formats import FORMATS, Export
 from sweeps.export.joint import INSIDE, DriveJoint
-from sweeps.export.law_source import jax_source, module_from_source
+from sweeps.export.law_source import filled_template, jax_source, module_from_source
 from sweeps.report import catalogue
 from sweeps.report.document import Cell, Document, Note, Section, Table, remarks
 
@@ -284,61 +284,23 @@ def escape_markdown(text: str) -> str:
 def law_text(found: Export) -> str:
     """Text of LAW.md."""
     drive, compared = found.joint, found.comparison
-    law_values = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
-    constants = "\n".join(
-        f"| `{escape_markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
-        f"{escape_markdown(c.source)} |"
-        for c in found.constants
+    shares = {f.name: share_kept(f) for f in compared.fates}
+    return filled_template(
+        "LAW.md",
+        origin=escape_markdown(f"{drive.file.name}, {drive.configuration}"),
+        version=__version__,
+        format=FORMATS[found.format],
+        use=USE[found.format].format(name=drive.name, at="drive", armature=rotor_inertia(found)),
+        command=command_sentence(found),
+        equations=law_equations(found),
+        constants=[(c, escape_markdown(c.name), escape_markdown(c.source)) for c in found.constants],
+        cited=any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants),
+        refitted=[(n, compared.translated[n], v) for n, v in compared.refitted.items()],
+        fates=[(f.name, verdicts[f.verdict], f.how, shares[f.name]) for f in compared.fates],
+        errors_title=errors_title(found).capitalize(),
+        channels=[f"{channels.find_channel(n).label} [%]" for n in compared.errors[NATIVE]],
+        errors=[(label, [f"{x:.3g}" for x in percent.values()]) for label, percent in compared.errors.items()],
+        seen=[escape_markdown(line) for line in conditions_seen(found)],
+        untested=not_tested(found),
     )
-    refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
-    table = f"\n| of the format | translated | refitted |\n|---|---|---|\n{refitted}\n" if refitted else ""
-    errors = "\n".join(
-        f"| {label} | {' | '.join(f'{x:.3g}' for x in percent.values())} |"
-        for label, percent in compared.errors.items()
-    )
-    names = [f"{channels.find_channel(n).label} [%]" for n in compared.errors[NATIVE]]
-    fates = "\n".join(
-        f"* {f.name}: {verdicts[f.verdict]} "
-        f"{f.how}{f' ({share_kept(f)} of its change is kept)' if share_kept(f) else ''}"
-        for f in compared.fates
-    )
-    cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
-    paper = "\nNumbers of equations and tables are those of the paper that describes this robot.\n" if cited else ""
-    bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
-    origin = escape_markdown(f"{drive.file.name}, {drive.configuration}")
-    return f"""# The law of this drive
-A motor with its gearbox on one joint: {origin}. The program mmrjax {__version__}
-obtained the parameters of this drive from measurements or data sheets, and exported the drive as
-{FORMATS[found.format]}. You need no other file of that program. All units are SI.
-The joint is the driven wheel or output shaft.
-
-## How to use it
-{USE[found.format].format(**law_values)}{command_sentence(found)}
-
-## Equations
-{bullets(law_equations(found))}
-
-## Constants
-| name | value | unit | interval | meaning | source |
-|---|---|---|---|---|---|
-{constants}
-{paper}{table}
-## What this format holds
-{fates}
-
-Percentages compare currents and speeds of settled runs with and without the effect.
-
-## How good it is
-{errors_title(found).capitalize()}:
-
-| model | {" | ".join(names)} |
-|---|{"---|" * len(names)}
-{errors}
-
-## Conditions seen
-{bullets(map(escape_markdown, conditions_seen(found)))}
-
-## Not tested
-{bullets(not_tested(found))}
-"""

@@ -192,19 +192,6 @@ def _advice(found: DiscoveryResult) -> Table:
     return catalogue.table("loop.advice", rows)
 
 
-def _adequacy(found: DiscoveryResult, missing: bool) -> str:
-    """Sentences on the misfit before and after, and on the rows."""
-    (before, after), unusable_count = found.chi2_of_readings, len(found.unusable)
-    chi = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
-    verb = "are consistent with" if found.after.adequate else "exceed"
-    aside = f" ({unusable_count} without a result of the fitted model, {len(found.outliers)} set aside as outliers)"
-    return (
-        f"The residuals {verb} the noise (χ² of {found.readings} readings {chi} σ², {found.replicates} bootstrap "
-        f"tables). {int(found.included.sum())} of {len(found.runs)} {_rows_are(found)} are used"
-        f"{aside * bool(unusable_count or len(found.outliers))}."
-    )
-
-
 def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     """Sections on the certainty of the answer and its limits."""
     standing = loop_words.support_sentence(found)
@@ -212,12 +199,22 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
+    (before, after), unusable_count = found.chi2_of_readings, len(found.unusable)
+    chi = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
+    verb = "are consistent with" if found.after.adequate else "exceed"
+    aside = f" ({unusable_count} without a result of the fitted model, {len(found.outliers)} set aside as outliers)"
     blocks = [
         Note(f"{_noise_alone(found)}{found.verdict_statement}", name="statement", terminal=True),
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *([Note(standing, name="standing", terminal=True)] if standing else []),
         *remarks(also, "also"),
-        Note(_adequacy(found, missing), name="adequacy", terminal=True),
+        Note(
+            f"The residuals {verb} the noise (χ² of {found.readings} readings {chi} σ², {found.replicates} bootstrap "
+            f"tables). {int(found.included.sum())} of {len(found.runs)} {_rows_are(found)} are used"
+            f"{aside * bool(unusable_count or len(found.outliers))}.",
+            name="adequacy",
+            terminal=True,
+        ),
     ]
     yield Section("How certain the verdict is", tuple(blocks))
     yield Section("Before you use it", remarks(filter(None, notes)))

@@ -18,7 +18,7 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import signals
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.points.climbs import LARGEST, SIZE, VERDICT
+from sweeps.points.tasks import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, StoreLayout
 from sweeps.report import catalogue, run_tables
 from sweeps.report.climb_report import VERDICTS
@@ -42,6 +42,12 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
         maps.append(dataclasses.replace(figure, name=f"sweep_{c.name}"))
     axes = "; ".join(_levels(runs, c) for c in _axes(runs))
     extremes = (*(c.column for c in file.robot.channels), "slip", "winding_settled_C")
+    kinds, flag_index = np.unique(runs["flags"], return_inverse=True)
+    rows = []
+    for flag, meaning in words.FLAGS.items():
+        is_flagged = np.array([flag in str(f).split(";") for f in kinds])[flag_index]
+        if is_flagged.any():
+            rows.append((f"{meaning} (`{flag}`)", int(is_flagged.sum()), _ranges_of_runs(runs, is_flagged)))
     return Document(
         f"Sweep of {count_noun(len(runs['status']), 'run')}",
         sweep_answer(runs),
@@ -50,7 +56,7 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
             run_tables.endings_table(
                 {s: statuses[s] for s in statuses_known}, beyond_a_limit=flagged_by_status, where=ranges_by_status
             ),
-            _limits(runs),
+            catalogue.table("sweep.limits", rows),
             _extremes(shown_runs, extremes),
             *remarks(notes),
         ),
@@ -73,17 +79,6 @@ def sweep_answer(runs: Columns) -> str:
         f"{first_words}. {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit. Most "
         f"often, {words.FLAGS.get(most_frequent, most_frequent)} ({count_noun(times, 'run')})."
     )
-
-
-def _limits(runs: Columns) -> Table:
-    """Table of limits that some runs exceed, with the number of runs and where they are."""
-    kinds, flag_index = np.unique(runs["flags"], return_inverse=True)
-    rows = []
-    for flag, meaning in words.FLAGS.items():
-        is_flagged = np.array([flag in str(f).split(";") for f in kinds])[flag_index]
-        if is_flagged.any():
-            rows.append((f"{meaning} (`{flag}`)", int(is_flagged.sum()), _ranges_of_runs(runs, is_flagged)))
-    return catalogue.table("sweep.limits", rows)
 
 
 def _axes(runs: Columns) -> list[str]:
