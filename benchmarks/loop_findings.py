@@ -178,7 +178,6 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     Args:
         runs: further runs of the same robot, with an equal number, so that programs are shared.
     """
-    from calibration.discovery import findings as results
     from calibration.discovery import prediction
     from calibration.discovery.loop_input import build_candidate_space
 
@@ -191,7 +190,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
         return {}
     off, score = [], []
     for candidate in (base, best):
-        fitted = results.FittedProblem(there.equipped, candidate.z, there.library.indices(candidate.active))
+        fitted = prediction.FittedProblem(there.equipped, candidate.z, there.library.indices(candidate.active))
         seen = fitted.observation()
         lost = there.equipped.observe.unreachable(np.asarray(seen.status))[:rows, None]
         off.append(np.where(lost, np.nan, (np.asarray(seen.reading)[:rows] - measured) / sd))

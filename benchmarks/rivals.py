@@ -260,10 +260,10 @@ def sindy(p: Posed) -> Found:
 
 def _of_base(p: Posed) -> np.ndarray:
     """Readings of our base fit [SI], shape (rows, channels)."""
-    from calibration.discovery import findings
+    from calibration.discovery import prediction
 
     problem, z, active = p.space.fit_of(p.fitted.candidate.active, p.fitted.candidate.z)
-    return np.asarray(findings.FittedProblem(problem, z, active).observation().reading)[: len(p.measured)]
+    return np.asarray(prediction.FittedProblem(problem, z, active).observation().reading)[: len(p.measured)]
 
 
 # --- regressions on what the refit leaves -----------------------------------------------------------------------

@@ -39,7 +39,7 @@ _ABOVE = {
     "calibrate": "calibration",
     "describe": "calibration.described",
     "discover": "calibration",
-    "export": "sweeps.export.drive_export",
+    "export": "sweeps.commands.export_drive",
     "keep_programs": "sweeps.compilation_cache",
     "read_robot": "calibration",
     "read_runs": "calibration",

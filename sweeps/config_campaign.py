@@ -42,7 +42,7 @@ SIZE = "obstacle_mm"
 
 
 class Obstacle(ClimbPart):
-    """Obstacle that every point of a sweep climbs (`sweeps.points.climbs`). Its size is the axis `obstacle_mm`, or
+    """Obstacle that every point of a sweep climbs (`sweeps.points.tasks`). Its size is the axis `obstacle_mm`, or
     found by a search."""
 
     kind: Literal["step", "stairs", "gap"]

@@ -16,7 +16,8 @@ import mmrjax as mm
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery.result import DiscoveryResult, ReadingsOfRows
+from calibration.discovery.prediction import ReadingsOfRows
+from calibration.discovery.result import DiscoveryResult
 from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
 from mmrjax.fidelities.steady import steady_batch

@@ -7,7 +7,7 @@ import pytest
 from synthetic import Analyst
 
 from calibration.data.runs import Runs, read_runs
-from calibration.discovery import loop_input
+from calibration.discovery import scales
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import Histories, SettledRuns
@@ -52,7 +52,7 @@ def table(name, amplitude, voltages):
 
 def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
     measured = read_runs("measured")
-    assert not loop_input.goes_both_ways(measured)
+    assert not scales.goes_both_ways(measured)
     columns, rows = dict(measured.columns), len(measured)
     speeds = [c.column for c in channels.usual_channels() if c.zero_at_rest]
 
@@ -61,15 +61,15 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
 
     turned = np.where(np.arange(rows) == 3, -1.0, 1.0)
     for name in ("supply_voltage_V", *speeds):
-        assert loop_input.goes_both_ways(changed(**{name: columns[name] * turned}))
-        assert not loop_input.goes_both_ways(changed(**{name: np.full(rows, np.nan)}))
+        assert scales.goes_both_ways(changed(**{name: columns[name] * turned}))
+        assert not scales.goes_both_ways(changed(**{name: np.full(rows, np.nan)}))
     noise = np.where(turned < 0, -0.01, 1.0) * np.nanmax(columns[speeds[0]])  # about rest
-    assert not loop_input.goes_both_ways(changed(**{speeds[0]: noise}))
+    assert not scales.goes_both_ways(changed(**{speeds[0]: noise}))
 
 
 @pytest.mark.parametrize("kind", [SettledRuns, Histories])
 def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind, robot):
-    names = [{e.name for e in loop_input.visible_effects(BY_NAME, robot, kind, way)} for way in (True, False)]
+    names = [{e.name for e in scales.visible_effects(BY_NAME, robot, kind, way)} for way in (True, False)]
     # A constant torque is directional friction in settled travel.
     only = {
         "directional_friction",
@@ -93,11 +93,8 @@ def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(sup
     columns = {"configuration": np.full(3, "6T2A"), "supply_voltage_V": np.array(supply)}
     columns |= {} if duty is None else {"duty": np.array(duty)}
     runs = Runs("synthetic", columns)
-    assert loop_input.has_partial_duty(runs) is below_one and varied_by_duty(runs) is alone
-    names = {
-        e.name
-        for e in loop_input.visible_effects(BY_NAME, robot, SettledRuns, True, loop_input.has_partial_duty(runs))
-    }
+    assert scales.has_partial_duty(runs) is below_one and varied_by_duty(runs) is alone
+    names = {e.name for e in scales.visible_effects(BY_NAME, robot, SettledRuns, True, scales.has_partial_duty(runs))}
     assert ("coast_decay" in names) is below_one
     where = DiscrepancyLocation("electrical", "voltage", ("electrical",), (), 9.0, 9.0, by_duty=alone)
     assert where.family.endswith("duty" if alone else "voltage")

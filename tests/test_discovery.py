@@ -14,7 +14,7 @@ from synthetic import FEW, SETTLED, known, parts, small, table
 from worlds import settled, tables
 
 from calibration.data.runs import read_runs as read_runs
-from calibration.discovery import loop_input
+from calibration.discovery import scales
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
 from calibration.inference import bases
 from calibration.inference.held_out import hold_out_blocks
@@ -173,7 +173,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
     """Of the whole library, against differentiation of the steady model in every amplitude, at two points a shape."""
     problem = clean.space.bare
     z = jnp.asarray(clean.base.z[: clean.space.free])
-    library = loop_input.visible_effects(looks.library, problem.base, SettledRuns)
+    library = scales.visible_effects(looks.library, problem.base, SettledRuns)
     names, shapes = [e.name for e in library], [free_shape_parameter(e) for e in library]
     unit = jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in library])
     instances = tuple(with_shape_grid(e, (-1.5, 0.75)) for e in library)

@@ -15,7 +15,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.discovery import discover, loop_input, result_remarks, verdict
-from calibration.inference import calibration
+from calibration.inference import calibration, shown_states
 from calibration.inference.conduct import error_after_steps
 from mmrjax.model import channels
 
@@ -218,9 +218,9 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
 
 def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
     runs = Runs("log.csv", motor()).of(robot)
-    assert loop_input.missing_states_remarks(runs, robot) == []
+    assert shown_states.missing_states_remarks(runs, robot) == []
     silent = Runs("log.csv", {**motor(), SPEED: np.full(600, np.nan)}).of(robot)
-    (note,) = loop_input.missing_states_remarks(silent, robot)
+    (note,) = shown_states.missing_states_remarks(silent, robot)
     assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)
 
 

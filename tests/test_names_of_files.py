@@ -27,7 +27,7 @@ from mmrjax.missions import mission_batch
 from mmrjax.model import channels, quantities
 from mmrjax.undercarriage.ripple_peaks import SIGNALS
 from sweeps import capabilities, cli, config
-from sweeps.points import export
+from sweeps.commands import sweep
 from tests.commands import read_json
 
 #: Ends of names, and the unit of each.
@@ -310,7 +310,7 @@ def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
         *capabilities.OF_GROUND,
         *capabilities.OF_TRAVEL,
         *capabilities.RESTS_ON,
-        *(column for column, _ in export.COLUMNS.values()),
+        *(column for column, _ in sweep.COLUMNS.values()),
     }
     assert {n for n in lists if END.search(n) and not known(n, {*registries(), *MORE})} == set()
     of_heat = {

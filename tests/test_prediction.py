@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from calibration.data.runs import Runs
-from calibration.discovery import findings, mechanism, prediction
+from calibration.discovery import mechanism, prediction
 from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
 from calibration.inference.blocks import distinct_held_out_blocks, predictable_blocks, unpredictable_kinds
 
@@ -132,7 +132,7 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         fitted.append(z[0])
         return SimpleNamespace(reading=np.full((12, 2), -1.0))
 
-    monkeypatch.setattr(findings, "predict_unseen", unseen)
+    monkeypatch.setattr(prediction, "predict_unseen", unseen)
     problem = SimpleNamespace(
         base=None,
         coordinates=NONE_FREE,
@@ -141,7 +141,7 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
     before, after = (Fit(problem, c.z) for c in candidates)
     known = predicted[prediction.candidate_key(candidates[0])]
     kinds = predictable_blocks(runs, problem)
-    found = findings.readings_of_rows(runs, np.ones((12, 2)), kinds, before, after, known)
+    found = prediction.readings_of_rows(runs, np.ones((12, 2)), kinds, before, after, known)
     assert fitted == [1.0]
     assert_array_equal(found.held_out["slope"][0], known["slope"])
     assert_array_equal(found.held_out["slope"][1], -1.0)

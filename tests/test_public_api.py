@@ -55,7 +55,7 @@ def test_layers_above_are_imported_when_they_are_asked_for_and_not_before():
     )
     first, second, third = python(code).splitlines()
     assert first == "[]" and second == "['calibration']" and third.startswith("['calibration', 'pydantic', 'sweeps']")
-    assert third.endswith("calibration.inference.calibration sweeps.points.door")
+    assert third.endswith("calibration.inference.calibration sweeps.points.grid")
     assert set(mm._ABOVE) == set(mm.__all__) - set(mm._HOME) - {"__version__"}
 
 

@@ -225,9 +225,9 @@ def test_no_effect_is_named_if_the_simulation_behind_the_windows_misses_a_channe
     monkeypatch.setattr(log_stages, "simulate_models", lambda *_, **__: run)
     monkeypatch.setattr(log_stages, "delayed_by_rows", lambda given, fit: fit)
     monkeypatch.setattr(log_stages, "excess_misfit", lambda *_: 1e3)
-    monkeypatch.setattr(log_stages, "unused_inputs", lambda _: ("angle",))
+    monkeypatch.setattr(verdict, "unused_inputs", lambda _: ("angle",))
     missed_by = {id(base): (MissedChannel("position", 0.8, 0.0),), id(best): missed}
-    monkeypatch.setattr(log_stages, "missed_channels", lambda space, runs, noise, fit: missed_by[id(fit)])
+    monkeypatch.setattr(verdict, "missed_channels", lambda space, runs, noise, fit: missed_by[id(fit)])
     given = SimpleNamespace(
         known=None, shows_unmodelled_backlash=False, progress=lambda _: None, runs=None, noise=None, settings=None,
         space=SimpleNamespace(with_room=lambda _: None),

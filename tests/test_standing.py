@@ -344,7 +344,7 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
     monkeypatch.setattr("calibration.discovery.standing.bases_room.family_names", lambda _: families)
     error = rng.standard_normal((readings, 1))
     monkeypatch.setattr(
-        "calibration.discovery.standing.family_columns", lambda _, __, k: np.c_[error, 2 * error][:, : 2 * k]
+        "calibration.discovery.score_tests.family_columns", lambda _, __, k: np.c_[error, 2 * error][:, : 2 * k]
     )
     jacobian, residual = augment_with_columns(toy.linear, rng.standard_normal((readings, 2)))
     residual[:readings] += 9.0 * error[:, 0] * np.repeat(np.isin(np.arange(toy.rows), runs[2]), 3)
@@ -520,10 +520,10 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
 
     monkeypatch.setattr(preference, "judge_names", judged)
     monkeypatch.setattr(preference.prediction, "smallest_predictive_set", lambda *a: few)
-    monkeypatch.setattr(preference, "diagnose_candidate", lambda *a: seen)
-    monkeypatch.setattr(preference, "start_of_fit", lambda *a: None)
+    monkeypatch.setattr(preference.search, "diagnose_candidate", lambda *a: seen)
+    monkeypatch.setattr(preference.candidates, "start_of_fit", lambda *a: None)
     monkeypatch.setattr(
-        preference,
+        preference.candidates,
         "fit_candidates",
         lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
     )
@@ -534,9 +534,8 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     )
     left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
     searched = SearchResult((candidate_of("a"), candidate_of("b"), best), best, seen)
-    found, _, stood = preference.choose_effects(
-        None, screened, left, searched, SETTLED.settings, lambda note: None, None, None
-    )
+    given = SimpleNamespace(runs=None, settings=SETTLED.settings, progress=lambda note: None)
+    found, _, stood = preference.choose_effects(given, screened, left, searched, None, None)
     assert (None if found is None else tuple(sorted(found[0].effects))) == model
     assert asked == [best.effects if adequate or few is None else few.effects]
     if found is not None:

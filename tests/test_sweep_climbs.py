@@ -15,7 +15,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
 from sweeps.pages.sweep_figures import VariedQuantity, draw_grid_statuses
-from sweeps.points import axes, climbs, scale
+from sweeps.points import axes, scale, tasks
 from tests.commands import ends, read_json
 
 ROBOT = nominal()
@@ -30,13 +30,13 @@ def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
             calls.append(sizes)
             self.verdict = np.where(sizes <= limits, OVER, np.where(sizes > 200, TIPS, SLIDES))
 
-    found = climbs._search_all(
+    found = tasks._search_all(
         Obstacle(kind="step", find=True), 5, lambda sizes, told: Ended(sizes), lambda share: None
     )
-    largest = found[climbs.LARGEST]
-    assert largest[0] == 0 and np.all(largest <= limits) and np.all(limits[1:4] - largest[1:4] <= climbs.NEAR)
-    assert largest[4] > climbs.SOUGHT["step"][1] - climbs.NEAR
-    assert [NAMES[k] for k in found[climbs.VERDICT]] == ["slides", "slides", "slides", "tips", "over"]
+    largest = found[tasks.LARGEST]
+    assert largest[0] == 0 and np.all(largest <= limits) and np.all(limits[1:4] - largest[1:4] <= tasks.NEAR)
+    assert largest[4] > tasks.SOUGHT["step"][1] - tasks.NEAR
+    assert [NAMES[k] for k in found[tasks.VERDICT]] == ["slides", "slides", "slides", "tips", "over"]
     assert len(calls) == 10
 
 
@@ -82,11 +82,11 @@ def test_each_point_has_its_own_robot_levers_and_obstacle(monkeypatch):
         asked.update(robot=robot, conditions=conditions, ground=ground, sequence=sequence)
         raise StopIteration
 
-    monkeypatch.setattr(climbs, "climb_batch", recorded)
+    monkeypatch.setattr(tasks, "climb_batch", recorded)
     variation = Variation(ROBOT, ("levers_front_deg", "motor.resistance"))
     conditions = Conditions(np.zeros(2, int), voltage=np.full(2, 24.0)).resolved(ROBOT)
     with pytest.raises(StopIteration):
-        climbs.compute_climbs(
+        tasks.compute_climbs(
             Obstacle(kind="stairs", tread_mm=300, count=2, levers_voltage_V=8.0), variation, conditions,
             np.array([[30.0, 0.6], [50.0, 1.5]]), np.array([60.0, 90.0]), lambda share: None,
         )  # fmt: skip
@@ -141,10 +141,10 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
         if next(interrupts):
             raise KeyboardInterrupt
         climbed.append(np.asarray(values)[:, 0].tolist())
-        found = {name: np.asarray(values)[:, 0] + sizes for name in climbs.climb_attributes(of)}
-        return {**found, climbs.VERDICT: np.zeros(2, np.uint8), STATUS: np.zeros(2, np.uint8)}
+        found = {name: np.asarray(values)[:, 0] + sizes for name in tasks.climb_attributes(of)}
+        return {**found, tasks.VERDICT: np.zeros(2, np.uint8), STATUS: np.zeros(2, np.uint8)}
 
-    monkeypatch.setattr(climbs, "compute_climbs", closed)
+    monkeypatch.setattr(tasks, "compute_climbs", closed)
     (tmp_path / "map.toml").write_text(MAP)
     assert mmrjax("sweep map.toml --out map")[0] == 130
     assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
@@ -160,12 +160,12 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
 
     def closed(of, variation, conditions, values, sizes, told):
         most = np.array([70, 250, 40])[(np.asarray(values)[:, 0] / 30).astype(int)]
-        own = {climbs.LARGEST: most * 1.0} if of.find else {climbs.VERDICT: np.where(sizes <= most, OVER, TIPS)}
-        found = {name: np.full(len(most), 1.0) for name in climbs.climb_attributes(of)} | own
-        found[climbs.VERDICT] = found[climbs.VERDICT].astype(np.uint8)
+        own = {tasks.LARGEST: most * 1.0} if of.find else {tasks.VERDICT: np.where(sizes <= most, OVER, TIPS)}
+        found = {name: np.full(len(most), 1.0) for name in tasks.climb_attributes(of)} | own
+        found[tasks.VERDICT] = found[tasks.VERDICT].astype(np.uint8)
         return {**found, STATUS: np.zeros(len(most), np.uint8)}
 
-    monkeypatch.setattr(climbs, "compute_climbs", closed)
+    monkeypatch.setattr(tasks, "compute_climbs", closed)
     text = MAP.replace("report = false", "")
     (tmp_path / "map.toml").write_text(text)
     (tmp_path / "find.toml").write_text(

@@ -120,7 +120,7 @@ def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before,
         kept.append(name)
         return found
 
-    monkeypatch.setattr(stages, "fit_base", fit_base)
+    monkeypatch.setattr(stages.candidates, "fit_base", fit_base)
     runs, library = Runs("synthetic", motor()).of(space.bare.base), {n: BY_NAME[n] for n in NAMES}
     noise = SimpleNamespace(sd=np.broadcast_to(SD, runs.measured().shape))
     with pytest.raises(InterruptedError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Sequence
 
 import equinox as eqx
@@ -14,7 +15,10 @@ from jaxtyping import Array, Float, Int
 
 from calibration.data import Names
 from calibration.data.effect_file import Library
+from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
+from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.linearization import (
+    Linearization,
     ScoredEffect,
     amplitude_of,
     free_shape_parameter,
@@ -22,11 +26,13 @@ from calibration.inference.linearization import (
     shape_scales,
     with_shape_grid,
 )
+from calibration.inference.optimizers import informative_residuals
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.model import params
+from mmrjax.model.params import Spec
 from mmrjax.model.robot import Robot
 
 
@@ -269,3 +275,69 @@ def candidate_space(
         Problem(robot, coordinates, bare.observe, data),
         ScoredLibrary(tuple(effects), grids, effect, np.concatenate([s.at for s in grids])),
     )
+
+
+def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear: Linearization) -> Posterior:
+    """Posterior distribution of a fit of the base with effects, from its linearization.
+
+    Args:
+        active: effect in each slot, "" if empty.
+        z: coordinates of the fit, of the base only or of all.
+        linear: linearization of the fit.
+    """
+    jacobian = np.asarray(linear.jacobian)
+    size = jacobian.shape[1]
+    problem = space.bare if size == space.free else space.equipped
+    informed = jacobian[informative_residuals(problem.data)]
+    covariance = np.linalg.inv(informed.T @ informed)
+    parts, kept_places = coordinate_groups(problem.coordinates, space, active, np.asarray(z)[:size])
+    return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
+
+
+def coordinate_groups(
+    coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: Names, z: np.ndarray
+) -> tuple[list[Posterior], list[int]]:
+    """Posterior of each group of coordinates, and the indices of these coordinates in z. Empty slots and missing
+    shapes are left out.
+    """
+    if not isinstance(coordinates, ActiveSet):
+        return [posterior_of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
+    p, slots = len(coordinates.base), coordinates.slots
+    parts, kept_places = [posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
+    for slot, name in enumerate(active):
+        if not name:
+            continue
+        effect = space.library[name]
+        amplitude = amplitude_of(effect)
+        sd = float(coordinates.sd[coordinates.names.index(name)])
+        of_amplitude = clipped_parameters(
+            (f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]])
+        )
+        parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
+        kept_places.append(p + slot)
+        shape = free_shape_parameter(effect)
+        if shape is None:
+            continue
+        value, spread, angle_sd, low, high = shape_scales(shape)
+        log = spread > 0
+        of_shape = clipped_parameters((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
+        bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
+        parts.append(
+            dataclasses.replace(
+                of_shape, mean=z[p + slots + slot, None], location=np.array([math.log(value) if log else value]),
+                spread=np.array([spread if log else angle_sd]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
+                kinds=(LOG if log else ANGLE,),
+            )
+        )  # fmt: skip
+        kept_places.append(p + slots + slot)
+    return parts, kept_places
+
+
+def clipped_parameters(names: Names, specs: list[Spec], mean: np.ndarray) -> Posterior:
+    """Posterior of parameters that are their own coordinates, clipped at their bounds."""
+    size = len(names)
+    return Posterior(
+        coordinates=names, units=tuple(s.unit for s in specs), mean=mean, covariance=np.eye(size),
+        location=np.zeros(size), spread=np.ones(size), low=np.array([s.bounds[0] for s in specs], float),
+        high=np.array([s.bounds[1] for s in specs], float), softness=np.zeros(size), kinds=(NORMAL,) * size,
+    )  # fmt: skip

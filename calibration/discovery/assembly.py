@@ -4,41 +4,37 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 
 import numpy as np
 
-from calibration.data import Names
-from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
+from calibration.data import Names, posterior_file
 from calibration.data.runs import Runs
-from calibration.discovery import findings, prediction, preference
-from calibration.discovery.active_set import ActiveSet, CandidateSpace
-from calibration.discovery.discrepancy import CurveCoordinates, Discrepancy
-from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
-from calibration.discovery.loop_input import LoopInput, goes_both_ways
-from calibration.discovery.result import DiscoveryResult, Errors, FoundEffect, ReadingsOfRows
-from calibration.discovery.result_remarks import loop_remarks, noise_remarks_before_verdict, worse_than_stated
+from calibration.discovery import (
+    active_set,
+    discrepancy,
+    experiments,
+    findings,
+    hidden,
+    loop_input,
+    prediction,
+    preference,
+    result,
+    result_remarks,
+    verdict,
+)
+from calibration.discovery.candidates import residuals_by_channel
+from calibration.discovery.scales import goes_both_ways
 from calibration.discovery.settings import WITHOUT_NAME, Settings
-from calibration.discovery.verdict import LoopStages, verdict_summary
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
-from calibration.inference import observers
-from calibration.inference.fit_notes import Remark, progress_remark
-from calibration.inference.identifiability import posterior_of_coordinates
-from calibration.inference.lack_of_fit import Residuals
-from calibration.inference.linearization import Linearization, amplitude_of, free_shape_parameter, shape_scales
-from calibration.inference.noise import Noise
-from calibration.inference.optimizers import informative_residuals
-from calibration.inference.priors import Coordinates
+from calibration.inference import fit_notes
 from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax.model import channels, params
-from mmrjax.model.params import Spec
 
 
-def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
+def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> result.DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
     screened, diagnosis, noise = traced.screened, traced.left, traced.sds.noise
@@ -54,19 +50,19 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     # The fit of the result: with the named effects, or with the curve if no name is given.
     beside = traced.beside if nameless and run is None else None
     if beside is not None:
-        progress(progress_remark("shape"))
-    before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
+        progress(fit_notes.progress_remark("shape"))
+    before, curve = prediction.FittedProblem(*space.fit_of(base.active, base.z)), None
     after, z, sd, cost = None, best.z, best.sd, best.cost
     if beside is not None and best is base:
         curve, ends = beside.curve, beside.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
-        after = findings.FittedProblem(curve.problem, z, None)
+        after = prediction.FittedProblem(curve.problem, z, None)
     elif best is not base:
-        after = findings.FittedProblem(*space.fit_of(best.active, z))
-    progress(progress_remark("errors"))
+        after = prediction.FittedProblem(*space.fit_of(best.active, z))
+    progress(fit_notes.progress_remark("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    row_readings = findings.readings_of_rows(
+    row_readings = prediction.readings_of_rows(
         runs, noise.sd, kinds, before, after, predictions[0], None if best is base else predictions[1]
     )
     compared = traced.held_out
@@ -81,28 +77,32 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     else:
         fit, of_fit = (best, ends) if written else (base, shown)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
-        posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
-    progress(progress_remark("next"))
+        posterior = active_set.posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
+    progress(fit_notes.progress_remark("next"))
     remaining = residuals_by_channel(space, runs, ends.linear, row_readings.after, z)
 
-    def error(simulated: np.ndarray) -> Errors:
+    def error(simulated: np.ndarray) -> result.Errors:
         simulated = np.where(included[:, None], simulated, np.nan)
         return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
     ladder = () if traced.searched is None else (traced.alike or traced.searched).ladder
     cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
-    found: tuple[FoundEffect, ...] = ()
-    concealed: tuple[HiddenEffect, ...] = ()
+    found: tuple[result.FoundEffect, ...] = ()
+    concealed: tuple[hidden.HiddenEffect, ...] = ()
     if traced.alike is not None:
         named, base_there = dataclasses.replace(best, cost=decided[1].cost), screened.base.candidate
         found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
         if not nameless and run is None:
             ask = observe.menu and not observe.long
-            concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
+            concealed = hidden.find_hidden_effects(
+                space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask
+            )
     scores = findings.effect_scores(decided[0], diagnosis.scores, settings)
-    summary, kind = verdict_summary(traced, numbers), type(observe)
-    result = DiscoveryResult(
+    summary, kind = verdict.verdict_summary(traced, numbers), type(observe)
+    with np.errstate(invalid="ignore"):
+        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
+    assembled = result.DiscoveryResult(
         verdict=traced.verdict,
         summary=summary,
         robot=robot,
@@ -149,30 +149,43 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
         held_out_worse=preference.worse_predictions(row_readings.held_out, error),
         alternatives_held_out=compared,
-        noise=_noise_by_channel(runs, noise, kind),
+        noise={
+            name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
+            for k, name in enumerate(channels.channel_names(noise.channels))
+            if noise.source[k] != "no readings"
+        },
         settings=settings,
         replicates=len(diagnosis.test.null.single),
     )
     # A temporary change is not uniform.
     is_event = traced.where is not None and bases_room.window_from_name(traced.where.variable) is not None
-    of_noise = () if is_event and not traced.sds.factors else noise_remarks_before_verdict(traced.sds, remaining)
+    of_noise = (
+        ()
+        if is_event and not traced.sds.factors
+        else result_remarks.noise_remarks_before_verdict(traced.sds, remaining)
+    )
     if run is not None and run.contradicts:
-        of_noise = (Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
+        of_noise = (fit_notes.Remark("contradicted", promised=run.promised, gained=run.gained), *of_noise)
     return dataclasses.replace(
-        result, remarks=(*of_noise, *worse_than_stated(row_readings, noise, included), *loop_remarks(result))
+        assembled,
+        remarks=(
+            *of_noise,
+            *result_remarks.worse_than_stated(row_readings, noise, included),
+            *result_remarks.loop_remarks(assembled),
+        ),
     )
 
 
 def errors_on_common_rows(
-    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
-) -> tuple[Errors, Errors]:
+    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], result.Errors]
+) -> tuple[result.Errors, result.Errors]:
     """Errors of two sets of readings, over the readings that both fits predict."""
     in_both = np.isfinite(before) & np.isfinite(after)
     return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
 
 
 def _hold_out_gains(
-    space: CandidateSpace, runs: Runs, traced: LoopStages, seen: ReadingsOfRows
+    space: active_set.CandidateSpace, runs: Runs, traced: verdict.LoopStages, seen: prediction.ReadingsOfRows
 ) -> tuple[tuple[Names, prediction.Gain], ...]:
     """Hold-out gain of each set of effects over the refit, ordered by the number of effects. The proposal is last.
 
@@ -191,125 +204,36 @@ def _hold_out_gains(
     return tuple((names, score(reading).gain(score(refit))) for names, reading in scored)
 
 
-def residuals_by_channel(
-    space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
-) -> Residuals:
-    """Residuals of a fit, with their statistics, by channel.
-
-    Args:
-        linear: linearization of the fit at z.
-        reading: simulated reading of each row [SI], shape (rows or more, channels).
-    """
-    rows, count = len(runs), len(runs.channels)
-    counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
-    jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
-    whitened = np.where(counts, np.asarray(linear.by_row())[:rows], 0.0)
-    return Residuals(
-        type(space.bare.observe), runs, reading[:rows], whitened, counts, jacobian, z[: jacobian.shape[1]]
-    )
-
-
-def _next_experiment(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
+def _next_experiment(
+    space: active_set.CandidateSpace, traced: verdict.LoopStages, settings: Settings
+) -> experiments.Proposal | None:
     """Next experiment. None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
     if not space.bare.observe.menu or space.bare.base.rig.follows_goal:
-        return propose_nothing(space) if traced.verdict != "none" else None
+        return experiments.propose_nothing(space) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
-        return propose_denser_runs(space, traced.where, settings)
-    return None if traced.alike is None else propose_separating(space, traced.best, traced.alike, settings)
+        return experiments.propose_denser_runs(space, traced.where, settings)
+    return (
+        None if traced.alike is None else experiments.propose_separating(space, traced.best, traced.alike, settings)
+    )
 
 
-def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
-    """Source and median relative size [%] of the sd of each channel."""
-    with np.errstate(invalid="ignore"):
-        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
-    return {
-        name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
-        for k, name in enumerate(channels.channel_names(noise.channels))
-        if noise.source[k] != "no readings"
-    }
-
-
-def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear: Linearization) -> Posterior:
-    """Posterior distribution of a fit of the base with effects, from its linearization.
-
-    Args:
-        active: effect in each slot, "" if empty.
-        z: coordinates of the fit, of the base only or of all.
-        linear: linearization of the fit.
-    """
-    jacobian = np.asarray(linear.jacobian)
-    size = jacobian.shape[1]
-    problem = space.bare if size == space.free else space.equipped
-    informed = jacobian[informative_residuals(problem.data)]
-    covariance = np.linalg.inv(informed.T @ informed)
-    parts, kept_places = _coordinate_groups(problem.coordinates, space, active, np.asarray(z)[:size])
-    return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
-
-
-def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
+def posterior_of_curve(
+    space: active_set.CandidateSpace, active: Names, curve: discrepancy.Discrepancy
+) -> posterior_file.Posterior:
     """Posterior distribution of a fit with a smooth curve. The ordinates are linear in their coordinates and come
     last.
     """
-    shaped: CurveCoordinates = curve.problem.coordinates
+    shaped: discrepancy.CurveCoordinates = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
-    base, kept_places = _coordinate_groups(shaped.base, space, active, curve.z[:inner])
+    base, kept_places = active_set.coordinate_groups(shaped.base, space, active, curve.z[:inner])
     spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
-    ordinates = _clipped_parameters(
+    ordinates = active_set.clipped_parameters(
         shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
     )
     places = [*kept_places, *range(inner, len(shaped))]
     covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
-    return join_posteriors([*base, ordinates], covariance)
-
-
-def _coordinate_groups(
-    coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: Names, z: np.ndarray
-) -> tuple[list[Posterior], list[int]]:
-    """Posterior of each group of coordinates, and the indices of these coordinates in z. Empty slots and missing
-    shapes are left out.
-    """
-    if not isinstance(coordinates, ActiveSet):
-        return [posterior_of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
-    p, slots = len(coordinates.base), coordinates.slots
-    parts, kept_places = [posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
-    for slot, name in enumerate(active):
-        if not name:
-            continue
-        effect = space.library[name]
-        amplitude = amplitude_of(effect)
-        sd = float(coordinates.sd[coordinates.names.index(name)])
-        of_amplitude = _clipped_parameters(
-            (f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]])
-        )
-        parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
-        kept_places.append(p + slot)
-        shape = free_shape_parameter(effect)
-        if shape is None:
-            continue
-        value, spread, angle_sd, low, high = shape_scales(shape)
-        log = spread > 0
-        of_shape = _clipped_parameters((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
-        bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
-        parts.append(
-            dataclasses.replace(
-                of_shape, mean=z[p + slots + slot, None], location=np.array([math.log(value) if log else value]),
-                spread=np.array([spread if log else angle_sd]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
-                kinds=(LOG if log else ANGLE,),
-            )
-        )  # fmt: skip
-        kept_places.append(p + slots + slot)
-    return parts, kept_places
-
-
-def _clipped_parameters(names: Names, specs: list[Spec], mean: np.ndarray) -> Posterior:
-    """Posterior of parameters that are their own coordinates, clipped at their bounds."""
-    size = len(names)
-    return Posterior(
-        coordinates=names, units=tuple(s.unit for s in specs), mean=mean, covariance=np.eye(size),
-        location=np.zeros(size), spread=np.ones(size), low=np.array([s.bounds[0] for s in specs], float),
-        high=np.array([s.bounds[1] for s in specs], float), softness=np.zeros(size), kinds=(NORMAL,) * size,
-    )  # fmt: skip
+    return posterior_file.join_posteriors([*base, ordinates], covariance)

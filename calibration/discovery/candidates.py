@@ -13,12 +13,14 @@ from jaxtyping import Array, Float
 
 from calibration.data import Names
 from calibration.data.input_errors import BadData
+from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import scans
 from calibration.inference.held_out import fit_from_each_start
-from calibration.inference.linearization import amplitude_of
+from calibration.inference.lack_of_fit import Residuals
+from calibration.inference.linearization import Linearization, amplitude_of
 from calibration.inference.observers import Observer
 from calibration.inference.optimizers import Optimum, observe_at
 from calibration.inference.problem import Observation
@@ -333,3 +335,21 @@ def start_of_fit(
             z[p + slot] = np.clip(float(scores.amplitude[m]) / settings.width, -1.5, 1.5)
             z[p + s + slot] = space.library.at[m]
     return z
+
+
+def residuals_by_channel(
+    space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
+) -> Residuals:
+    """Residuals of a fit, with their statistics, by channel.
+
+    Args:
+        linear: linearization of the fit at z.
+        reading: simulated reading of each row [SI], shape (rows or more, channels).
+    """
+    rows, count = len(runs), len(runs.channels)
+    counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
+    jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
+    whitened = np.where(counts, np.asarray(linear.by_row())[:rows], 0.0)
+    return Residuals(
+        type(space.bare.observe), runs, reading[:rows], whitened, counts, jacobian, z[: jacobian.shape[1]]
+    )

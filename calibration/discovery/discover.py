@@ -9,32 +9,22 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from calibration.data import Names, Priors
+from calibration.data import Priors
 from calibration.data.columns import ROWS
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
-from calibration.discovery import log_stages, stages
+from calibration.discovery import log_stages, loop_input, outliers, preference, stages, verdict
 from calibration.discovery.assembly import assemble_result
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.loop_input import LoopInput, prepare_loop, settled_input
-from calibration.discovery.outliers import (
-    Screening,
-)
-from calibration.discovery.result import (
-    DiscoveryResult,
-    NoiseVerdict,
-)
+from calibration.discovery.result import DiscoveryResult, NoiseVerdict
 from calibration.discovery.settings import FIT
-from calibration.discovery.verdict import LoopStages, VerdictNoise, verdict_summary
+from calibration.inference import fit_notes, population
 from calibration.inference import noise as noise_room
-from calibration.inference.fit_notes import Notes, Remark, progress_remark, remarks_with_codes
-from calibration.inference.observers.windows import Windows
 from calibration.inference.optimizers import CORES
-from calibration.inference.population import StoreStage, compute_without_storing
 from mmrjax import effects
-from mmrjax.compile.compiling import SINGLE, Threads, in_double, is_double
+from mmrjax.compile import compiling
 from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
@@ -43,7 +33,7 @@ from mmrjax.model.robot import Robot
 FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 
 
-@in_double
+@compiling.in_double
 def discover(
     runs: Runs,
     robot: Robot,
@@ -57,7 +47,7 @@ def discover(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
-    keep: StoreStage = compute_without_storing,
+    keep: population.StoreStage = population.compute_without_storing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
     """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
@@ -83,16 +73,16 @@ def discover(
         BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
             experiments, or a call inside `jax.jit` while JAX uses single precision.
     """
-    if not is_double():
-        raise BadConfiguration(f"discover: {SINGLE}")
+    if not compiling.is_double():
+        raise BadConfiguration(f"discover: {compiling.SINGLE}")
     tell = report_in_words(progress)
     prepare = functools.partial(
-        prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed,
-        prefer=prefer, forbidden=forbidden, rows=rows,
+        loop_input.prepare_loop, robot=robot, noise=noise, stated=stated, library=library, replicates=replicates,
+        seed=seed, prefer=prefer, forbidden=forbidden, rows=rows,
     )  # fmt: skip
     ready = prepare(runs)
     given = dataclasses.replace(
-        ready, progress=tell, keep=keep, settled=functools.cache(lambda: settled_input(ready, prepare))
+        ready, progress=tell, keep=keep, settled=functools.cache(lambda: loop_input.settled_input(ready, prepare))
     )
     for note in ready.at_first:
         tell(note)
@@ -100,18 +90,18 @@ def discover(
     if traced.settled and (table := given.settled()) is not None:
         ready, given = table, dataclasses.replace(table, progress=tell, keep=keep)
     known = ready.noise
-    refuted = remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
-    notes: Notes = tuple(n for n in ready.notes if n not in refuted)
+    refuted = fit_notes.remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
+    notes: fit_notes.Notes = tuple(n for n in ready.notes if n not in refuted)
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    threads = Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
+    threads = compiling.Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
     sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
-            tell(progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
+            tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
 
-        def trace_with_noise(factor: float) -> LoopStages:
+        def trace_with_noise(factor: float) -> verdict.LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
             scaled = dataclasses.replace(ready, noise=noise, known=traced)
             return keep(f"noise {factor:g}", functools.partial(trace_verdict, scaled))
@@ -119,28 +109,31 @@ def discover(
         verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
         found = keep("result", lambda: assemble_result(given, traced))
         if not all(one.done() for one in verdicts.values()):
-            tell(progress_remark("others"))
+            tell(fit_notes.progress_remark("others"))
         for f, pending in verdicts.items():
             try:
                 other = pending.result(left())
-                adequate, summary = not other.ends.test.rejected_with_margin, verdict_summary(other, ready.numbers)
+                adequate, summary = (
+                    not other.ends.test.rejected_with_margin,
+                    verdict.verdict_summary(other, ready.numbers),
+                )
                 sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
     finally:  # an interruption or the time limit waits for none of them
         threads.shutdown(wait=False, cancel_futures=True)
     if outstanding:
-        notes = (Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
+        notes = (fit_notes.Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
     if assumed:
         notes = (
             *notes,
-            Remark(
+            fit_notes.Remark(
                 "assumed_noise", channels=channels.channel_names(assumed), usual=noise_room.default_noise(assumed)
             ),
         )
     if known.along_series:
-        notes = (*notes, Remark("noise_from_series", noise=known.along_series))
+        notes = (*notes, fit_notes.Remark("noise_from_series", noise=known.along_series))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
 
 
@@ -160,13 +153,13 @@ class Stage(NamedTuple):
     """
 
     name: str
-    inputs: Names
+    inputs: tuple[str, ...]
     function: Callable[..., Any]
-    results: Names = ()
+    results: tuple[str, ...] = ()
     stored: bool = False
 
 
-def trace_verdict(given: LoopInput, ahead: bool = False) -> LoopStages:
+def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.LoopStages:
     """Runs the stages of the loop up to the verdict, in the order of `STAGES`.
 
     With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
@@ -174,20 +167,20 @@ def trace_verdict(given: LoopInput, ahead: bool = False) -> LoopStages:
     If results with other sds are `known` for the same included rows, their bootstrap replicates are reused. In
     units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
     """
-    traced = LoopStages()
+    traced = verdict.LoopStages()
     with contextlib.ExitStack() as others:
         given = dataclasses.replace(given, others=others if ahead else None, later=[], ranked=[])
         for stage in STAGES:
             make = functools.partial(stage.function, given, *(getattr(traced, name) for name in stage.inputs))
             results = given.keep(stage.name, make) if stage.stored else make()
-            if isinstance(results, LoopStages):
+            if isinstance(results, verdict.LoopStages):
                 return results
             each = results if len(stage.results) > 1 else (results,)
             traced = dataclasses.replace(traced, **dict(zip(stage.results, each, strict=False)))
     return traced
 
 
-def trace_known_readings(given: LoopInput) -> LoopStages | None:
+def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | None:
     """Stages of the known linear readings of a log with other noise. None for other tables."""
     known = given.known
     if known is None or (run := known.run) is None or not known.screened.base.space.bare.observe.reads:
@@ -202,12 +195,11 @@ def trace_known_readings(given: LoopInput) -> LoopStages | None:
     return dataclasses.replace(traced, verdict="place") if refuted else traced
 
 
-def trace_windows(given: LoopInput) -> LoopStages | Candidate | None:
+def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate | None:
     """Stages of the windows of a log with a long run. The start of its simulated fit if the windows find nothing,
     which readings may still do. None if they do not show the states, or not this start.
     """
-    other = given.known is not None and not isinstance(given.known.screened.base.space.bare.observe, Windows)
-    if given.equations is not None or other or (windows := log_stages.windows_of_log(given)) is None:
+    if (windows := log_stages.windows_of_log(given)) is None:
         return None
     space = given.space.with_room(given.known_room)
     confirm = functools.partial(log_stages.best_simulated_size, space, given.settings)
@@ -220,7 +212,9 @@ def trace_windows(given: LoopInput) -> LoopStages | Candidate | None:
     return None if slides else log_stages.delayed_by_rows(given, traced.screened.base.candidate)
 
 
-def trace_settled_runs(given: LoopInput, begin: Candidate | None, screened: Screening) -> LoopStages | None:
+def trace_settled_runs(
+    given: loop_input.LoopInput, begin: Candidate | None, screened: outliers.Screening
+) -> verdict.LoopStages | None:
     """Stages of the settled runs of a log that no fit describes. None for others, and if these are too few."""
     base = screened.base
     if given.shows_unmodelled_backlash or not base.space.bare.observe.long:
@@ -234,8 +228,8 @@ def trace_settled_runs(given: LoopInput, begin: Candidate | None, screened: Scre
 
 
 def trace_readings(
-    given: LoopInput, begin: Candidate | None, screened: Screening, sds: VerdictNoise
-) -> LoopStages | None:
+    given: loop_input.LoopInput, begin: Candidate | None, screened: outliers.Screening, sds: verdict.VerdictNoise
+) -> verdict.LoopStages | None:
     """Stages of the linear readings of a log about its simulated fit, and the simulation of the model that they
     choose. None for other tables, and for a log with backlash that the robot lacks.
     """
@@ -255,8 +249,9 @@ STAGES = (
     Stage("search", ("screened", "sds"), stages.search_until_clean, ("screened", "left", "searched")),
     Stage("no search", ("screened", "left", "sds", "searched"), stages.end_without_search),
     Stage("confirm", ("screened", "left", "sds", "searched"), stages.confirm_search, ("searched",)),
-    Stage("effects", ("screened", "left", "searched"), stages.choose_effects,
-          ("beside", "predicted", "chosen", "searched", "standing")),
+    Stage("curve", ("screened", "left"), stages.curve_of_base, ("beside",)),
+    Stage("effects", ("screened", "left", "searched", "beside", "predicted"),
+          preference.choose_effects, ("chosen", "searched", "standing")),
     Stage("described", ("screened", "left", "sds", "searched", "chosen", "beside", "predicted"),
           stages.check_described, ("missed",)),
     Stage("mechanism", ("screened", "left", "searched", "chosen", "standing", "beside", "predicted"),

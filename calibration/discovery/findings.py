@@ -4,53 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Columns, Names
-from calibration.data.runs import Runs
+from calibration.data import Names
+from calibration.discovery import adequacy, classes, mechanism, projection, result, search
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
-from calibration.discovery.mechanism import excess_misfit, share_of_excess
-from calibration.discovery.projection import BalanceError, balance_error_by_row
-from calibration.discovery.result import (
-    ClassMember,
-    EffectRanking,
-    EffectScore,
-    Evidence,
-    FoundEffect,
-    KindOfEvidence,
-    ParameterEstimate,
-    ParameterShift,
-    RankedEffect,
-    ReadingsOfRows,
-    RejectedCandidate,
-    StatedValue,
-    UnnamedDiscrepancy,
-)
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.search import WeakFormScreening, refit_without_each, single_p_value
 from calibration.discovery.settings import Settings
-from calibration.inference import bases
+from calibration.inference import bases, linearization
 from calibration.inference.estimates import SIDE_OF_BOUND
-from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
-from calibration.inference.linearization import (
-    amplitude_of,
-    amplitude_unit,
-    free_shape_parameter,
-    shape_parameter_at,
-    shape_scales,
-)
-from calibration.inference.problem import Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model import params
 from mmrjax.model.balances import BALANCES
@@ -60,23 +31,28 @@ from mmrjax.model.robot import Robot
 
 
 def found_effects(
-    space: CandidateSpace, base: Candidate, best: Candidate, found: Classes, test: AdequacyTest, settings: Settings
-) -> tuple[FoundEffect, ...]:
+    space: CandidateSpace,
+    base: Candidate,
+    best: Candidate,
+    found: classes.Classes,
+    test: adequacy.AdequacyTest,
+    settings: Settings,
+) -> tuple[result.FoundEffect, ...]:
     """Result entry of each effect of the best candidate: its class, its parameters and its evidence.
 
     Args:
         test: adequacy test of the base fit. Its bootstrap gives the p-values.
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
-    others = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, found.ladder)
+    others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, settings, found.ladder)
     gains = [2 * (c.cost - best.cost) for c in others]
-    null, excess = np.asarray(test.null.single), excess_misfit(space, base)
+    null, excess = np.asarray(test.null.single), mechanism.excess_misfit(space, base)
     effects = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
         equation, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
         effects.append(
-            FoundEffect(
+            result.FoundEffect(
                 name=effect.name,
                 members={name: _class_member(space, best, found, slot, name) for name in members},
                 stated={s.name: _stated_value(space, best, s) for s in found.stated[slot]},
@@ -86,9 +62,9 @@ def found_effects(
                 equation=" ".join(equation.split()),
                 source=" ".join(source.split()),
                 parameters=_effect_parameters(space, best, slot, settings),
-                p_value=single_p_value(gains[slot], null),
+                p_value=search.single_p_value(gains[slot], null),
                 score=float(gains[slot]),
-                share=share_of_excess(excess, float(gains[slot])),
+                share=mechanism.share_of_excess(excess, float(gains[slot])),
             )
         )
     return tuple(effects)
@@ -96,57 +72,61 @@ def found_effects(
 
 def _effect_parameters(
     space: CandidateSpace, best: Candidate, slot: int, settings: Settings
-) -> dict[str, ParameterEstimate]:
+) -> dict[str, result.ParameterEstimate]:
     effect, p = space.library[best.active[slot]], space.free
-    amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
+    amplitude, unit = linearization.amplitude_of(effect), linearization.amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
     held_names = held_by_prior(best.sd)
     values = {
-        amplitude.name: ParameterEstimate(
+        amplitude.name: result.ParameterEstimate(
             float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
         )
     }
-    shape = free_shape_parameter(effect)
+    shape = linearization.free_shape_parameter(effect)
     if shape is not None:
-        k, scales = p + settings.slots + slot, shape_scales(shape)
+        k, scales = p + settings.slots + slot, linearization.shape_scales(shape)
         value, slope = _shaped(scales, best.z[k])
-        values[shape.name] = ParameterEstimate(
+        values[shape.name] = result.ParameterEstimate(
             float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held_names[k])
         )
     return values
 
 
-_shaped = jax.jit(jax.value_and_grad(shape_parameter_at, argnums=1))
+_shaped = jax.jit(jax.value_and_grad(linearization.shape_parameter_at, argnums=1))
 
 
-def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> ClassMember:
+def _class_member(
+    space: CandidateSpace, best: Candidate, found: classes.Classes, slot: int, name: str
+) -> result.ClassMember:
     """Result entry of an alternative effect of a class."""
     active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == active_names)
     position = other.active.index(name)
-    amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
-    return ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
+    amplitude = other.amplitude[position] * linearization.amplitude_unit(space.library[name])
+    return result.ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
-def _stated_value(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
+def _stated_value(space: CandidateSpace, best: Candidate, shift: classes.Shift) -> result.StatedValue:
     coordinates, p, k = space.coordinates.base, space.free, shift.index
     value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
     rise = float(2 * (shift.fit.cost - best.cost))
-    return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
+    return result.StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
 
 
 def unnamed_discrepancy(
     beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int
-) -> UnnamedDiscrepancy:
+) -> result.UnnamedDiscrepancy:
     """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
     curve, linear, lacks = beside.curve, beside.diagnosis.linear, None
     happens = bases.window_from_name(where.variable)
     x, way = linear.curve_variable(curve.balance, where.variable if happens is None else happens.axis)
     if curve.defect is not None:
-        lacks = balance_error_by_row(linear, curve.balance)
+        lacks = projection.balance_error_by_row(linear, curve.balance)
         turn = 2 * np.pi if where.variable in bases.ORDERS else None
-        lacks = BalanceError(np.interp(x, curve.grid, curve.curve, period=turn) + way * lacks.value, lacks.sd)
-    return UnnamedDiscrepancy(
+        lacks = projection.BalanceError(
+            np.interp(x, curve.grid, curve.curve, period=turn) + way * lacks.value, lacks.sd
+        )
+    return result.UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=curve.unit,
         families=(where.family,),
@@ -167,7 +147,7 @@ def unnamed_discrepancy(
 
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
-) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:
+) -> tuple[tuple[result.RejectedCandidate, ...], tuple[result.RejectedCandidate, ...]]:
     """Candidates that explain the data nearly as well as the proposal, and separately those of implausible
     size.
 
@@ -178,7 +158,7 @@ def listed_alternatives(
         cost: objective of the proposal [½σ²].
         best: the proposal, if it is a candidate.
     """
-    near: tuple[list[RejectedCandidate], list[RejectedCandidate]] = ([], [])
+    near: tuple[list[result.RejectedCandidate], list[result.RejectedCandidate]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
     for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
@@ -192,7 +172,7 @@ def listed_alternatives(
     return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> RejectedCandidate:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> result.RejectedCandidate:
     sds, sizes, why = {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
@@ -202,12 +182,12 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
         if name in c.supplying:
             why.append(RuledOut(name, "power"))
         elif size >= 1:
-            check = space.library[name].rests_on or (amplitude_of(space.library[name]).spec.meaning,)
+            check = space.library[name].rests_on or (linearization.amplitude_of(space.library[name]).spec.meaning,)
             why.append(RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
-    amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
-    return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
+    amplitudes = {name: a * linearization.amplitude_unit(space.library[name]) for name, a in sds.items()}
+    return result.RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
@@ -220,20 +200,20 @@ def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
 # --- the base and the library ---------------------------------------------------------------------------
 
 
-def evidence_of_test(test: AdequacyTest, adequate: bool) -> Evidence:
+def evidence_of_test(test: adequacy.AdequacyTest, adequate: bool) -> result.Evidence:
     """Strongest statistic of each kind, its critical value, and its p-value by bootstrap."""
     kinds = {
-        kind: KindOfEvidence(
+        kind: result.KindOfEvidence(
             float(getattr(test.found, kind)), test.threshold(kind), test.p(kind), np.asarray(getattr(test.null, kind))
         )
         for kind in test.settings.shares
     }
-    return Evidence(kinds, test.p_value, adequate)
+    return result.Evidence(kinds, test.p_value, adequate)
 
 
 def parameter_shifts(
     space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd: np.ndarray
-) -> dict[str, ParameterShift]:
+) -> dict[str, result.ParameterShift]:
     """Every base parameter before and after effects were added, in its unit and in prior sds.
 
     Args:
@@ -247,7 +227,7 @@ def parameter_shifts(
     fields, held_names = params.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])
     return {
-        name: ParameterShift(
+        name: result.ParameterShift(
             prior=float(value[0][k]),
             before=float(value[1][k]),
             after=float(value[2][k]),
@@ -263,7 +243,7 @@ def parameter_shifts(
     }
 
 
-def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
+def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.EffectScore, ...]:
     """Score of each effect at its best shape and a plausible amplitude, strongest first. Equal scores are sorted by
     name.
     """
@@ -272,44 +252,46 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
         amplitude, explained = _plausible_amplitude_and_score(space, effect, scores, settings)
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
         score_list.append(
-            EffectScore(
+            result.EffectScore(
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
-                amplitude=amplitude * amplitude_unit(effect),
+                amplitude=amplitude * linearization.amplitude_unit(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
     return tuple(sorted(score_list, key=lambda s: (-round(s.score, 9), s.name)))
 
 
-def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> EffectRanking:
+def rank_library(space: CandidateSpace, left: adequacy.Diagnosis, settings: Settings) -> result.EffectRanking:
     """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
     test = left.test
     ranking = _rank_effects(space, left.scores, settings)
-    return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
+    return result.EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
 
 
-def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, settings: Settings) -> EffectRanking:
+def rank_effects_by_weak_form(
+    space: CandidateSpace, known: search.WeakFormScreening, settings: Settings
+) -> result.EffectRanking:
     """Ranking of the effects by the equations of a log in weak form, before any simulation."""
-    p = single_p_value(float(np.max(known.scores.single**2)), known.null)
+    p = search.single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     ranking = _rank_effects(space, known.scores, settings)
     shifts = parameter_shifts(space, known.base.z, known.base.z, known.base.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
-    return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
+    return result.EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 
 
-def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[RankedEffect, ...]:
+def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.RankedEffect, ...]:
     """Effects sorted by score. Effects that would supply power come last."""
     ranking = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
-        sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
-        unit = amplitude_of(effect).spec.unit
+        sd = linearization.amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
+        unit = linearization.amplitude_of(effect).spec.unit
         # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
-        ranking.append(RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
+        ranking.append(result.RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(ranking, key=lambda e: e.supplies))
 
 
@@ -319,7 +301,9 @@ def _plausible_amplitude_and_score(
     """Best amplitude within plausible limits [prior sds], and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     amplitude_wanted, score = float(scores.amplitude[m]), float(scores.left[m])
-    low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
+    low = max(
+        -settings.plausible, linearization.amplitude_of(effect).spec.bounds[0] / linearization.amplitude_unit(effect)
+    )
     amplitude = min(max(amplitude_wanted, low), settings.plausible)
     return amplitude, float(scores.single[m] ** 2 - ((amplitude_wanted - amplitude) * score) ** 2)
 
@@ -338,62 +322,3 @@ def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Setti
 
 
 # --- readings and errors --------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class FittedProblem:
-    """A problem with the coordinates of its fit and the active effects (None without slots)."""
-
-    problem: Problem
-    z: np.ndarray
-    active: tuple[int, ...] | None
-
-    def observation(self) -> Observation:
-        """Simulated observation at the fit."""
-        return self.problem.observe.observation_at(self.problem, self.z, self.active)
-
-
-#: Kind of block → hold-out predictions of each row, shape (rows, channels).
-HeldOutReadings = Columns
-
-
-def readings_of_rows(
-    runs: Runs,
-    sd: np.ndarray,
-    kinds: Mapping[str, Columns],
-    before: FittedProblem,
-    after: FittedProblem | None,
-    known_before: HeldOutReadings | None = None,
-    known_after: HeldOutReadings | None = None,
-) -> ReadingsOfRows:
-    """Simulated readings of both fits for all rows, fitted and held out for each kind of block. `after` = None: both
-    are equal.
-
-    Args:
-        kinds: blocks from `blocks.predictable_blocks`.
-        known_before, known_after: hold-out readings, if they are already known.
-    """
-    rows = len(runs)
-
-    def fitted_reading(fitted: FittedProblem) -> np.ndarray:
-        observation = fitted.observation()
-        unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
-        return np.where(unreachable, np.nan, np.asarray(observation.reading)[:rows])
-
-    def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
-        return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
-
-    values, labels = {}, {}
-    for kind, blocks_by_name in kinds.items():
-        masks = list(blocks_by_name.values())
-        first = held_out_reading(before, masks) if known_before is None else known_before[kind]
-        later = first
-        if after is not None:
-            later = held_out_reading(after, masks) if known_after is None else known_after[kind]
-        values[kind], labels[kind] = (first, later), tuple(blocks_by_name)
-    stated_readings, fitted = (
-        fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))),
-        fitted_reading(before),
-    )
-    later = fitted if after is None else fitted_reading(after)
-    return ReadingsOfRows(runs.measured(), sd[:rows], stated_readings, fitted, later, values, labels)

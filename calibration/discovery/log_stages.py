@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.discovery.active_set import CandidateSpace, candidate_space
+from calibration.discovery import active_set, verdict
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.log_simulation import refine_by_simulation, simulate_models
@@ -20,12 +20,11 @@ from calibration.discovery.mechanism import excess_misfit, find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
 from calibration.discovery.settings import Settings, settings_for
-from calibration.discovery.verdict import LoopStages, VerdictNoise, missed_channels, unused_inputs
 from calibration.inference import observers, priors
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.observers.linear_rows import problem_of_readings
-from calibration.inference.observers.windows import problem_of_windows
+from calibration.inference.observers.windows import Windows, problem_of_windows
 from calibration.inference.weak_form import fit_weak_form
 
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
@@ -46,10 +45,14 @@ RIVALS = 3
 
 def windows_of_log(given: LoopInput) -> LoopInput | None:
     """The same input with the windows of a log as its table. None if the log does not show its states, or if its
-    longest run has fewer than `LONG` steps.
+    longest run has fewer than `LONG` steps, and for equations or other known results.
 
     Windows use every row of a log, except for an angle alone. Simulations use fewer.
     """
+    if given.equations is not None:
+        return None
+    if given.known is not None and not isinstance(given.known.screened.base.space.bare.observe, Windows):
+        return None
     space, runs, sd, numbers = given.space, given.runs.whole, given.noise.sd, given.numbers
     observe: Any = space.bare.observe
     if not observe.long or observe.times.shape[1] < LONG:
@@ -71,7 +74,7 @@ def windows_of_log(given: LoopInput) -> LoopInput | None:
 
     settings = given.settings
     posed, rows = problem_of_windows(bare, fit, space.library.scored, columns, settings.width)
-    table = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    table = active_set.candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
     noise = dataclasses.replace(given.noise, sd=sd[rows])
     shares = settings_for(type(posed.observe), settings.replicates).shares
     return dataclasses.replace(
@@ -80,7 +83,7 @@ def windows_of_log(given: LoopInput) -> LoopInput | None:
     )  # fmt: skip
 
 
-def readings_of_log(given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: bool) -> LoopInput:
+def readings_of_log(given: LoopInput, screened: Screening, sds: verdict.VerdictNoise, ranked: bool) -> LoopInput:
     """The same input with the readings of a log as linear equations about the simulated fit of its base.
 
     Args:
@@ -93,7 +96,9 @@ def readings_of_log(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
     problem = space.with_noise(None, weight).bare
     z = screened.base.candidate.z[: space.free]
     posed = problem_of_readings(problem, z, space.library.scored, settings.width)
-    equations = candidate_space(posed, space.library.effects, given.library, settings.slots, settings.width)
+    equations = active_set.candidate_space(
+        posed, space.library.effects, given.library, settings.slots, settings.width
+    )
     apart = given.kept_apart("readings")
 
     def keep(name: str, make: Callable[[], Any]) -> Any:
@@ -107,8 +112,8 @@ def readings_of_log(given: LoopInput, screened: Screening, sds: VerdictNoise, ra
 
 
 def confirm_readings(
-    given: LoopInput, readings: LoopInput, screened: Screening, sds: VerdictNoise, traced: LoopStages
-) -> LoopStages:
+    given: LoopInput, readings: LoopInput, screened: Screening, sds: verdict.VerdictNoise, traced: verdict.LoopStages
+) -> verdict.LoopStages:
     """Stages of a log's linear readings after the simulation of the model that they choose.
 
     Args:
@@ -134,13 +139,13 @@ def confirm_readings(
     if not confirmed.rejected and traced.screened.cluster is None:
         left = dataclasses.replace(traced.left, test=confirmed)
         none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
-        return LoopStages("none", traced.screened, left, traced.sds, run=none)
+        return verdict.LoopStages("none", traced.screened, left, traced.sds, run=none)
     return _lower_if_contradicted(readings, traced)
 
 
 def smallest_confirmed(
-    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
-    noise: Noise,
+    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis,
+    searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search with the smallest set whose simulation leaves no discrepancy, or else the largest set.
 
@@ -174,14 +179,14 @@ def smallest_confirmed(
     return searched
 
 
-def _has_room(space: CandidateSpace, fit: Candidate) -> bool:
+def _has_room(space: active_set.CandidateSpace, fit: Candidate) -> bool:
     """True if the program of a log's simulations has room for a set of effects, or has not been determined."""
     return not space.room or {*fit.effects} <= {*space.room}
 
 
 def best_simulated_size(
-    space: CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis, searched: SearchResult,
-    noise: Noise,
+    space: active_set.CandidateSpace, settings: Settings, screened: Screening, left: Diagnosis,
+    searched: SearchResult, noise: Noise,
 ) -> SearchResult:  # fmt: skip
     """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
 
@@ -202,7 +207,7 @@ def best_simulated_size(
     return dataclasses.replace(searched, best=best, diagnosis=diagnosis)
 
 
-def _chosen_fit(traced: LoopStages) -> Candidate:
+def _chosen_fit(traced: verdict.LoopStages) -> Candidate:
     """Fit of the verdict: the proposal, or else the best set of its mechanism."""
     base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
     if searched is None or traced.best is not base:
@@ -228,7 +233,7 @@ def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
     return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
 
 
-def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
+def _lower_if_contradicted(windows: LoopInput, traced: verdict.LoopStages) -> verdict.LoopStages:
     """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
     run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
     if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
@@ -243,7 +248,7 @@ def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages
     return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
 
 
-def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
+def confirm_windows(given: LoopInput, windows: LoopInput, traced: verdict.LoopStages) -> verdict.LoopStages | None:
     """Stages of a log's windows after the simulation of the base model and of the chosen one.
 
     None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
@@ -252,9 +257,11 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) ->
     """
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
 
-    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
-        return LoopStages("undescribed", screened, left, traced.sds, searched, beside=beside, run=traced.run,
-                          predicted=traced.predicted, missed=missed, unused=unused_inputs(given.runs))  # fmt: skip
+    def undescribed(missed: tuple[MissedChannel, ...]) -> verdict.LoopStages:
+        return dataclasses.replace(
+            verdict.LoopStages("undescribed", screened, left, traced.sds, searched), beside=beside, run=traced.run,
+            predicted=traced.predicted, missed=missed, unused=verdict.unused_inputs(given.runs),
+        )  # fmt: skip
 
     if given.known is not None:  # only the noise differs
         if given.known.verdict == "undescribed":
@@ -273,5 +280,5 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) ->
         return None
     traced = dataclasses.replace(traced, run=run)
     linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
-    refit, fit = (missed_channels(run.space, given.runs, given.noise, x) for x in linear)
+    refit, fit = (verdict.missed_channels(run.space, given.runs, given.noise, x) for x in linear)
     return undescribed(refit) if fit else _lower_if_contradicted(windows, traced)

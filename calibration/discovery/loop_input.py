@@ -9,38 +9,23 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from calibration.data import Names, Priors, inferred_facts
-from calibration.data.columns import ROWS, SIDES, WHEN
+from calibration.data import Names, Priors, columns, inferred_facts
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
-from calibration.discovery import menu, scales
-from calibration.discovery.active_set import CandidateSpace, candidate_space
-from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import BaseFit
-from calibration.discovery.outliers import Screening
-from calibration.discovery.result import EffectRanking
+from calibration.discovery import active_set, menu, scales
+from calibration.discovery import settings as settings_room
 from calibration.discovery.search import SearchResult
-from calibration.discovery.settings import FIT, Settings, settings_for
 from calibration.discovery.verdict import LoopStages
-from calibration.inference import observers, preparation, priors
-from calibration.inference.fit_notes import Notes, Remark, remarks_with_codes
+from calibration.inference import fit_notes, observers, population, preparation, priors, shown_states
 from calibration.inference.noise import Noise
-from calibration.inference.population import StoreStage, compute_without_storing
-from calibration.inference.shown_states import MissingStates, state_plan_or_reason
 from mmrjax import effects, fidelities
-from mmrjax.effects import Effect
 from mmrjax.errors import count_noun
-from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 
 #: Callback for progress notes.
-Tell = Callable[[Remark | str], None]
-
-
-#: Share of the largest speed or voltage above which a value is not noise about rest [-].
-EITHER_WAY = 0.05
+Tell = Callable[[fit_notes.Remark | str], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +47,8 @@ class LoopInput:
         known: results for the same table with other sds.
         settled: function that returns the input of settled runs that replace a log, None if these are too few.
         equations: candidate space of the windows or the linear readings of a log, whose rows are equations.
-        confirm: function that chooses from the sets of a search in such equations by their simulation.
+        confirm: function that chooses from the sets of a search in such equations by their simulation. Its
+            arguments are base fit, its diagnosis, search and noise.
         others: open while later programs are compiled on other cores. None if there is nothing to compile.
         later: functions that begin to compile these programs from the fit of the base.
         ranked: not empty once the library is ranked.
@@ -73,21 +59,21 @@ class LoopInput:
     robot: Robot
     noise: Noise
     stated: Priors
-    settings: Settings
+    settings: settings_room.Settings
     library: Library
-    notes: Notes = ()
-    at_first: Notes = ()
+    notes: fit_notes.Notes = ()
+    at_first: fit_notes.Notes = ()
     progress: Tell = lambda note: None
-    keep: StoreStage = compute_without_storing
+    keep: population.StoreStage = population.compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
-    equations: CandidateSpace | None = None
-    confirm: Callable[[Screening, Diagnosis, SearchResult, Noise], SearchResult] | None = None
+    equations: active_set.CandidateSpace | None = None
+    confirm: Callable[..., SearchResult] | None = None
     settled: Callable[[], LoopInput | None] = lambda: None
-    later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
-    ranked: list[EffectRanking] = dataclasses.field(default_factory=list)
+    later: list[Callable[..., None]] = dataclasses.field(default_factory=list)
+    ranked: list[object] = dataclasses.field(default_factory=list)
 
-    def kept_apart(self, word: str) -> StoreStage:
+    def kept_apart(self, word: str) -> population.StoreStage:
         """Storage of stages apart from those of the log over time. Only the ranking has the same name."""
         return lambda name, make: self.keep(name if name == "ranking" else f"{word} {name}", make)
 
@@ -97,14 +83,14 @@ class LoopInput:
         return () if self.known is None or self.known.searched is None else self.known.searched.room
 
     @functools.cached_property
-    def space(self) -> CandidateSpace:
+    def space(self) -> active_set.CandidateSpace:
         """Candidate space of the runs."""
         return build_candidate_space(self.runs, self.robot, self.noise.sd, self.settings, self.stated, self.library)
 
     @property
     def shows_unmodelled_backlash(self) -> bool:
         """True if the log shows backlash but the robot has none."""
-        return bool(remarks_with_codes(self.at_first, "lost_motion"))
+        return bool(fit_notes.remarks_with_codes(self.at_first, "lost_motion"))
 
 
 def prepare_loop(
@@ -116,10 +102,10 @@ def prepare_loop(
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
-    prefer: str = FIT,
+    prefer: str = settings_room.FIT,
     forbidden: Sequence[str] = (),
-    rows: int = ROWS,
-    settled: Notes = (),
+    rows: int = columns.ROWS,
+    settled: fit_notes.Notes = (),
 ) -> LoopInput:
     """Prepares the input of the stages from the arguments of `discover`, and raises its errors.
 
@@ -136,12 +122,12 @@ def prepare_loop(
             f"{kind.fewest} are needed"
         )
     ready = preparation.prepare_input(distinct, robot, noise, stated, settled=(*settled, *of_sides))
-    for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
+    for note in fit_notes.remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    unshown = missing_states_remarks(distinct, ready.robot)
-    at_first = (*ready.foreign, *ready.doubted, *unshown, *remarks_with_codes(ready.checked, "lost_motion"))
-    notes_so_far: Notes = (
+    unshown = shown_states.missing_states_remarks(distinct, ready.robot)
+    at_first = (*ready.foreign, *ready.doubted, *unshown, *fit_notes.remarks_with_codes(ready.checked, "lost_motion"))
+    notes_so_far: fit_notes.Notes = (
         *notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted, *unshown
     )  # fmt: skip
     output_turn = scales.output_rotation(distinct, ready.robot)
@@ -149,7 +135,7 @@ def prepare_loop(
     library = {**library, **kind.library, **channel_effects}
     library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, output_turn)
     settings = dataclasses.replace(
-        settings_for(kind, replicates, seed, prefer),
+        settings_room.settings_for(kind, replicates, seed, prefer),
         forbidden=tuple(forbidden),
         silent=tuple(c.name for c in ready.noise.silent),
     )
@@ -171,46 +157,43 @@ def settled_input(given: LoopInput, prepare: Callable[..., LoopInput]) -> LoopIn
     return prepare(runs, settled=remarks)
 
 
-def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
-    """Remark on a log that does not show the states of its equations."""
-    read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
-    plan = state_plan_or_reason(robot, read) if read else None
-    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []
-
-
-def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
+def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[fit_notes.Remark]]:
     """Runs without exact copies, their row numbers, and remarks on the copies.
 
     Equal rows may be repeated measurements, for instance from a coarse display. They count as copies only if the
     whole table consists of the same sequence of rows, repeated.
     """
-    columns = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
-    seen_columns: set[Names] = set()
+    cells = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
+    seen_rows: set[Names] = set()
     keep: list[int] = []
     copies: list[int] = []
-    if runs.sampled or {"run_id", *WHEN} & set(runs.headings):
+    if runs.sampled or {"run_id", *columns.WHEN} & set(runs.headings):
         for k in range(len(runs)):
-            row = tuple(str(column[k]) for column in columns)
-            (copies if row in seen_columns else keep).append(k)
-            seen_columns.add(row)
+            row = tuple(str(column[k]) for column in cells)
+            (copies if row in seen_rows else keep).append(k)
+            seen_rows.add(row)
     else:
-        rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
+        rows = list(zip(*(column.astype(str).tolist() for column in cells), strict=True))
         # rows after which the table repeats itself exactly, or all of its rows
         first_rows = next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
         keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
-    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
+    return (
+        runs.where(np.asarray(keep)),
+        np.asarray(keep) + 1,
+        [fit_notes.Remark("copies", rows=tuple(k + 1 for k in copies))],
+    )
 
 
 def build_candidate_space(
     runs: Runs,
     robot: Robot,
     sd: np.ndarray,
-    settings: Settings,
+    settings: settings_room.Settings,
     stated: Priors | None = None,
     library: Library = effects.BY_NAME,
-) -> CandidateSpace:
+) -> active_set.CandidateSpace:
     """Base problem of a table, with slots for the effects that its data can reveal.
 
     Tables are padded with rows of weight 0 to one of a few sizes, so that tables of similar size share compiled
@@ -229,45 +212,6 @@ def build_candidate_space(
     names = tuple(n for n in names if n not in unread)
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
-    visible = visible_effects(library, robot, kind, goes_both_ways(runs), has_partial_duty(runs))
-    space = candidate_space(bare, visible, library, settings.slots, settings.width)
+    visible = scales.visible_effects(library, robot, kind, scales.goes_both_ways(runs), scales.has_partial_duty(runs))
+    space = active_set.candidate_space(bare, visible, library, settings.slots, settings.width)
     return space.without(~real)
-
-
-def visible_effects(
-    library: Library,
-    robot: Robot,
-    kind: type[observers.Observer],
-    either_way: bool = True,
-    at_duties: bool = False,
-) -> tuple[Effect, ...]:
-    """Effects of a library that this kind of data can reveal and that the robot does not have yet.
-
-    Args:
-        either_way: True if there are forward and backward runs, see `goes_both_ways`.
-        at_duties: True if some runs have a duty below 1, see `has_partial_duty`.
-    """
-    have = {e.name for e in robot.effects}
-    return tuple(
-        effect()
-        for name, effect in library.items()
-        if name not in have
-        and kind.shows(effect)
-        and scales.effect_applies(effect, robot)
-        and (either_way or not effect.needs_reverse)
-        and (at_duties or not effect.needs_duty)
-    )
-
-
-def has_partial_duty(runs: Runs) -> bool:
-    """True if some runs have a duty below 1, so that the supply is pulsed."""
-    duties = [runs[name] for name in ("duty", *SIDES) if runs.has(name)]
-    return any((np.abs(x) < 1).any() for x in duties)
-
-
-def goes_both_ways(runs: Runs) -> bool:
-    """True if there are forward and backward runs, according to a measured speed or the command."""
-    motion_columns = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
-    columns = [runs[name] for name in (*motion_columns, runs.layout.imposed_column, "duty") if runs.has(name)]
-    finite_columns = [x[np.isfinite(x)] for x in columns]
-    return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in finite_columns if x.size)

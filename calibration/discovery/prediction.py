@@ -18,6 +18,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.inference import blocks as blocks_room
 from calibration.inference.held_out import predict_unseen
+from calibration.inference.problem import Observation, Problem
 
 #: Degrees of freedom of Student's t for the score of a reading, so that a single outlier does not decide.
 FREEDOM = 4.0
@@ -199,3 +200,82 @@ class HeldOutAlternative:
     rms_sigma: float
     by_kind: dict[str, float]
     lost: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadingsOfRows:
+    """Readings of all rows [SI], shape (rows, channels), NaN if missing.
+
+    Attributes:
+        measured, sd: measured readings and their standard deviations.
+        as_stated: simulated by the robot before any fit, at its prior means.
+        before, after: simulated by the base and by the proposed robot, fitted to all rows.
+        held_out: kind of block → readings (before, after), where each row is predicted by fits without its block.
+        blocks: kind of block → label of each row's block.
+    """
+
+    measured: np.ndarray
+    sd: np.ndarray
+    as_stated: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    held_out: dict[str, tuple[np.ndarray, np.ndarray]]
+    blocks: dict[str, Names]
+
+
+@dataclasses.dataclass(frozen=True)
+class FittedProblem:
+    """A problem with the coordinates of its fit and the active effects (None without slots)."""
+
+    problem: Problem
+    z: np.ndarray
+    active: tuple[int, ...] | None
+
+    def observation(self) -> Observation:
+        """Simulated observation at the fit."""
+        return self.problem.observe.observation_at(self.problem, self.z, self.active)
+
+
+def readings_of_rows(
+    runs: Runs,
+    sd: np.ndarray,
+    kinds: Mapping[str, Columns],
+    before: FittedProblem,
+    after: FittedProblem | None,
+    known_before: Columns | None = None,
+    known_after: Columns | None = None,
+) -> ReadingsOfRows:
+    """Simulated readings of both fits for all rows, fitted and held out for each kind of block. `after` = None: both
+    are equal.
+
+    Args:
+        kinds: blocks from `blocks.predictable_blocks`.
+        known_before, known_after: hold-out readings, if they are already known.
+    """
+    rows = len(runs)
+
+    def fitted_reading(fitted: FittedProblem) -> np.ndarray:
+        observation = fitted.observation()
+        unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
+        return np.where(unreachable, np.nan, np.asarray(observation.reading)[:rows])
+
+    def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
+        return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
+
+    values, labels = {}, {}
+    for kind, blocks_by_name in kinds.items():
+        masks = list(blocks_by_name.values())
+        first = held_out_reading(before, masks) if known_before is None else known_before[kind]
+        later = first
+        if after is not None:
+            later = held_out_reading(after, masks) if known_after is None else known_after[kind]
+        values[kind], labels[kind] = (first, later), tuple(blocks_by_name)
+    stated_readings, fitted = (
+        fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))),
+        fitted_reading(before),
+    )
+    later = fitted if after is None else fitted_reading(after)
+    return ReadingsOfRows(runs.measured(), sd[:rows], stated_readings, fitted, later, values, labels)
+
+
+#: Kind of block → hold-out predictions of each row, shape (rows, channels).

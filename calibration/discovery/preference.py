@@ -12,18 +12,16 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.data.runs import Runs
-from calibration.discovery import experiments, prediction
+from calibration.discovery import candidates, experiments, prediction, search
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.discrepancy import BaseCurve
-from calibration.discovery.loop_input import Tell
+from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import NameSupport
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, Predicted
 from calibration.discovery.result import Errors, WorseChannel
-from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import judge_names
 from calibration.inference import blocks as blocks_room
@@ -63,7 +61,7 @@ def worse_predictions(
 
 
 def compare_alternatives(
-    space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes
+    space: CandidateSpace, runs: Runs, best: candidates.Candidate, alike: Classes
 ) -> tuple[HeldOutAlternative, ...]:
     """Hold-out errors of the best fit and of fits in which one effect is replaced by an alternative. The best fit is
     first.
@@ -77,7 +75,7 @@ def compare_alternatives(
     if len(alternatives) < 2 or not kinds:
         return ()
 
-    def residuals_in_sds(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
+    def residuals_in_sds(c: candidates.Candidate, masks: list[np.ndarray]) -> np.ndarray:
         problem, z, active = space.fit_of(c.active, c.z)
         reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
@@ -121,8 +119,8 @@ def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
 
 
 def prefer_by_held_out(
-    space: CandidateSpace, runs: Runs, searched: SearchResult, alike: Classes, bases: Bases, settings: Settings
-) -> tuple[SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
+    space: CandidateSpace, runs: Runs, searched: search.SearchResult, alike: Classes, bases: Bases, settings: Settings
+) -> tuple[search.SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
     """Replaces the best fit by the alternative with the smallest hold-out error, see `_order_alternatives`.
 
     An alternative with significant residuals does not replace a best fit without them.
@@ -138,7 +136,7 @@ def prefer_by_held_out(
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
-        diagnosis = diagnose_candidate(space, leader, bases, before.test.null, settings)
+        diagnosis = search.diagnose_candidate(space, leader, bases, before.test.null, settings)
         sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
         if sound:
             led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
@@ -148,7 +146,11 @@ def prefer_by_held_out(
 
 
 def _classes_with_leader(
-    space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings
+    space: CandidateSpace,
+    best: candidates.Candidate,
+    leader: candidates.Candidate,
+    alike: Classes,
+    settings: Settings,
 ) -> Classes:
     """Alternatives of another leading effect, with that effect first in its class. Missing members are fitted."""
     members = dict(zip(best.effects, alike.members, strict=True))
@@ -163,7 +165,9 @@ def _classes_with_leader(
         for other in members[name][1:]
     ]
     missing = [w for w in missing_fits if frozenset(n for n in w if n) not in keys]
-    fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
+    fitted = candidates.fit_candidates(
+        space, [(w, candidates.start_of_fit(space, leader, w, settings)) for w in missing], settings
+    )
     return Classes(
         tuple(members[name] for name in leader.effects),
         tuple(stated_by_effect[name] for name in leader.effects),
@@ -176,15 +180,13 @@ def _classes_with_leader(
 
 
 def choose_effects(
-    runs: Runs,
+    given: LoopInput,
     screened: Screening,
     left: Diagnosis,
-    searched: SearchResult,
-    settings: Settings,
-    progress: Tell,
+    searched: search.SearchResult,
     beside: BaseCurve,
     predicted: Predicted,
-) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
+) -> tuple[tuple[candidates.Candidate, Diagnosis] | None, search.SearchResult, NameSupport]:
     """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
 
     The effects are those whose names are established, and those of the smallest set that predicts as well as any.
@@ -197,11 +199,11 @@ def choose_effects(
         predicted: cache of hold-out predictions of fits. This function adds to it.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    best, after = searched.best, searched.diagnosis
+    best, after, settings = searched.best, searched.diagnosis, given.settings
     if best is None or after is None:
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
-    kinds = blocks_room.predictable_blocks(runs, space.bare)
+    kinds = blocks_room.predictable_blocks(given.runs, space.bare)
     blocks = [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
@@ -209,13 +211,13 @@ def choose_effects(
     stood = support_of() if adequate else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
-    progress(progress_remark("held out"))
-    few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
+    given.progress(progress_remark("held out"))
+    few = prediction.smallest_predictive_set(space, given.runs, base, search.best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
         proposed = (
             judged,
-            after if judged is best else diagnose_candidate(space, judged, bases, left.test.null, settings),
+            after if judged is best else search.diagnose_candidate(space, judged, bases, left.test.null, settings),
         )
         stood = support_of(proposed=proposed)
     else:
@@ -229,13 +231,11 @@ def choose_effects(
         return None, searched, stood
     fits_of_names = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
     if not fits_of_names:
-        active = fill_slots(names, settings)
-        begins = start_of_fit(space, proposed[0], active, settings, left.scores)
-        fits_of_names = fit_candidates(space, [(active, begins)], settings)
+        active = candidates.fill_slots(names, settings)
+        begins = candidates.start_of_fit(space, proposed[0], active, settings, left.scores)
+        fits_of_names = candidates.fit_candidates(space, [(active, begins)], settings)
         searched = dataclasses.replace(searched, ladder=(*searched.ladder, *fits_of_names))
     diagnosis = next((d for c, d in (proposed, (best, after)) if c is fits_of_names[0]), None)
-    return (
-        (fits_of_names[0], diagnosis or diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)),
-        searched,
-        stood,
-    )
+    if diagnosis is None:
+        diagnosis = search.diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)
+    return (fits_of_names[0], diagnosis), searched, stood

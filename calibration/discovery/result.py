@@ -7,24 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.data import Columns, Json, Names, robot_file
-from calibration.data import posterior_file as posterior
-from calibration.data.columns import DRIVING
-from calibration.data.posterior_file import Posterior
-from calibration.data.runs import WHEN, Runs
-from calibration.data.writing import entries_of, json_value, write_json, write_table
-from calibration.described import describe, sentences
-from calibration.discovery import REFIT_FILE, formula
+from calibration import described
+from calibration.data import Json, Names, columns, posterior_file, robot_file, writing
+from calibration.data.runs import Runs
+from calibration.discovery import REFIT_FILE, formula, loop_notes, prediction
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Headline, NameSupport, RuledOut, VerdictSummary
 from calibration.discovery.outliers import OutlierCluster
-from calibration.discovery.prediction import Gain, HeldOutAlternative
 from calibration.discovery.settings import Settings
 from calibration.discovery.verdict import headline
+from calibration.inference import fit_notes
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import DependentPair, Notes, Remark, remarks_with_codes
 from calibration.inference.identifiability import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -163,12 +157,12 @@ class RejectedCandidate:
     prior_sds: dict[str, float]
     sizes: dict[str, float]
     rise_chi2: float
-    reasons: tuple[RuledOut, ...] = ()
+    reasons: tuple[loop_notes.RuledOut, ...] = ()
 
     @property
     def why(self) -> str:
         """Reasons why they are implausible, as a sentence."""
-        return describe(self)
+        return described.describe(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,27 +266,6 @@ class Evidence:
     adequate: bool
 
 
-@dataclasses.dataclass(frozen=True)
-class ReadingsOfRows:
-    """Readings of all rows [SI], shape (rows, channels), NaN if missing.
-
-    Attributes:
-        measured, sd: measured readings and their standard deviations.
-        as_stated: simulated by the robot before any fit, at its prior means.
-        before, after: simulated by the base and by the proposed robot, fitted to all rows.
-        held_out: kind of block → readings (before, after), where each row is predicted by fits without its block.
-        blocks: kind of block → label of each row's block.
-    """
-
-    measured: np.ndarray
-    sd: np.ndarray
-    as_stated: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    held_out: dict[str, tuple[np.ndarray, np.ndarray]]
-    blocks: dict[str, Names]
-
-
 Errors = dict[str, dict[str, float | int]]
 
 
@@ -365,13 +338,13 @@ class DiscoveryResult:
     """
 
     verdict: str
-    summary: VerdictSummary
+    summary: loop_notes.VerdictSummary
     robot: Robot
     refit: Robot
-    gains: tuple[tuple[Names, Gain], ...]
+    gains: tuple[tuple[Names, prediction.Gain], ...]
     written: bool
     converged: bool
-    posterior: Posterior
+    posterior: posterior_file.Posterior
     runs: Runs
     numbers: np.ndarray
     included: np.ndarray
@@ -387,7 +360,7 @@ class DiscoveryResult:
     alternatives: tuple[RejectedCandidate, ...]
     implausible: tuple[RejectedCandidate, ...]
     hidden: tuple[HiddenEffect, ...]
-    support: NameSupport | None
+    support: loop_notes.NameSupport | None
     cluster: OutlierCluster | None
     residual_clusters: tuple[ResidualCluster, ...]
     before: Evidence
@@ -397,17 +370,17 @@ class DiscoveryResult:
     base_shift: dict[str, ParameterShift]
     scores: tuple[EffectScore, ...]
     detail: Detail
-    readings_of_rows: ReadingsOfRows
+    readings_of_rows: prediction.ReadingsOfRows
     errors_as_stated: Errors
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
     held_out_unpredictable: Names
     held_out_worse: tuple[WorseChannel, ...]
-    alternatives_held_out: tuple[HeldOutAlternative, ...]
+    alternatives_held_out: tuple[prediction.HeldOutAlternative, ...]
     noise: dict[str, Json]
     settings: Settings
     replicates: int
-    remarks: Notes = ()
+    remarks: fit_notes.Notes = ()
     sensitivity: tuple[NoiseVerdict, ...] = ()
 
     @property
@@ -415,21 +388,23 @@ class DiscoveryResult:
         """The answer in a sentence or two. It begins with backlash or compliance that no effect of the library
         explains.
         """
-        lost_motion_sentences = (f"{note}." for note in sentences(remarks_with_codes(self.remarks, "lost_motion")))
-        return " ".join((*lost_motion_sentences, describe(self.headline)))
+        lost_motion_sentences = (
+            f"{note}." for note in described.sentences(fit_notes.remarks_with_codes(self.remarks, "lost_motion"))
+        )
+        return " ".join((*lost_motion_sentences, described.describe(self.headline)))
 
     @property
     def verdict_statement(self) -> str:
         """The verdict at the noise of the fit, with its evidence."""
-        return describe(self.summary)
+        return described.describe(self.summary)
 
     @property
-    def headline(self) -> Headline:
+    def headline(self) -> loop_notes.Headline:
         """The claims that hold at every noise level tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
     @property
-    def gain(self) -> Gain | None:
+    def gain(self) -> prediction.Gain | None:
         """Hold-out gain of the proposal over the refit, None if no block can be held out."""
         return self.gains[-1][1] if self.gains else None
 
@@ -441,12 +416,12 @@ class DiscoveryResult:
     @property
     def standing(self) -> str:
         """Reasons for or against the effects' names, as a sentence, "" for none."""
-        return describe(self, "standing")
+        return described.describe(self, "standing")
 
     @property
     def notes(self) -> Names:
         """Remarks as sentences."""
-        return sentences(self.remarks)
+        return described.sentences(self.remarks)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -498,7 +473,7 @@ class DiscoveryResult:
         return (*base, *(name for name, p in parameters if p.held_by_prior))
 
     @property
-    def together(self) -> tuple[DependentPair, ...]:
+    def together(self) -> tuple[fit_notes.DependentPair, ...]:
         """Pairs of parameters, of the base or of effects, that the data determine only in combination."""
         shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
@@ -507,32 +482,36 @@ class DiscoveryResult:
     def to_json(self) -> Json:
         """The whole result as JSON data, as described in docs/schemas/loop.schema.json."""
         mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
-        return json_value(
+        return writing.json_value(
             {
                 "schema": SCHEMA,
-                **entries_of(self, "statement", "verdict"),
+                **writing.entries_of(self, "statement", "verdict"),
                 "mechanism": None
                 if mechanism is None
                 else {
-                    **entries_of(mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"),
+                    **writing.entries_of(
+                        mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"
+                    ),
                     "established": not mechanism.fails,
-                    "course": "" if self.unnamed is None else describe(self.unnamed),
+                    "course": "" if self.unnamed is None else described.describe(self.unnamed),
                 },
                 "missed": [m._asdict() for m in self.summary.missed],
                 "headline": {
-                    **entries_of(self.headline, "level", "claims", "factors", "shared"),
+                    **writing.entries_of(self.headline, "level", "claims", "factors", "shared"),
                     "statement": self.statement,
                 },
                 "verdict_statement": self.verdict_statement,
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
-                **entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
+                **writing.entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
                 "effects": [_effect_json(e, self.support) for e in self.effects]
                 + ([] if self.unnamed is None else [_unnamed_json(self.unnamed)]),
-                **entries_of(self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"),
+                **writing.entries_of(
+                    self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"
+                ),
                 "needs_reverse": self.needs_reverse,
                 **self.detail.to_json(),
-                **entries_of(self, "alternatives", "implausible", "hidden", "standing", "cluster"),
+                **writing.entries_of(self, "alternatives", "implausible", "hidden", "standing", "cluster"),
                 "residual_clusters": self.residual_clusters,
                 "errors": {
                     # nothing is fitted as stated, so both are the same
@@ -544,14 +523,18 @@ class DiscoveryResult:
                     kind: {"before": before, "after": after, "blocks": self.readings_of_rows.blocks[kind]}
                     for kind, (before, after) in self.errors_held_out.items()
                 },
-                **entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
+                **writing.entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
                 "prediction": {
-                    **({"gain": None, "se": None} if self.gain is None else entries_of(self.gain, "gain=mean", "se")),
+                    **(
+                        {"gain": None, "se": None}
+                        if self.gain is None
+                        else writing.entries_of(self.gain, "gain=mean", "se")
+                    ),
                     "sets": [{"effects": names, "gain": g.mean, "se": g.se} for names, g in self.gains],
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },
-                "adequate": entries_of(self, "before=before.adequate", "after=after.adequate"),
+                "adequate": writing.entries_of(self, "before=before.adequate", "after=after.adequate"),
                 "evidence": {"before": _evidence_json(self.before), "after": _evidence_json(self.after)},
                 "chi2": {
                     "before": self.chi2[0],
@@ -559,21 +542,21 @@ class DiscoveryResult:
                     "readings": self.readings,
                     "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
                 },
-                **entries_of(self, "base_shift", "together", "scores"),
+                **writing.entries_of(self, "base_shift", "together", "scores"),
                 "bootstrap": {
                     "replicates": self.replicates,
-                    **entries_of(self.settings, "asked=replicates", "seed", "family_wise_error", "shares"),
+                    **writing.entries_of(self.settings, "asked=replicates", "seed", "family_wise_error", "shares"),
                 },
-                **entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes"),
+                **writing.entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes"),
             }
         )
 
-    def rows_table(self) -> Columns:
+    def rows_table(self) -> dict[str, np.ndarray]:
         """Table with one line for each row: conditions, readings (measured, simulated without and with the proposal,
         held out), and errors of balances if known.
         """
         readings = self.readings_of_rows
-        known_columns = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
+        known_columns = ("run_id", *columns.WHEN, "configuration", *self.runs.axes, *columns.DRIVING)
         table = {"row": self.numbers, **{k: self.runs[k] for k in known_columns if self.runs.has(k)}}
         main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
@@ -608,13 +591,19 @@ class DiscoveryResult:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "result.json", self.to_json())
-        write_table(folder / "rows.csv", self.rows_table(), tables)
-        held_sentence = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([describe(self, "header", robot_name), *held_sentence])
+        writing.write_json(folder / "result.json", self.to_json())
+        writing.write_table(folder / "rows.csv", self.rows_table(), tables)
+        held_sentence = (
+            [described.describe(fit_notes.Remark("held_by_prior", names=self.held_by_prior))]
+            if self.held_by_prior
+            else []
+        )
+        note = "\n".join([described.describe(self, "header", robot_name), *held_sentence])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
-        robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))
-        posterior.write_posterior(self.posterior, folder / posterior.FILE)
+        robot_file.write_robot(
+            self.refit, folder / REFIT_FILE, note=described.describe(self, "refit header", robot_name)
+        )
+        posterior_file.write_posterior(self.posterior, folder / posterior_file.FILE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -627,21 +616,21 @@ class NoiseVerdict:
 
     factor: float
     verdict: str
-    summary: VerdictSummary
+    summary: loop_notes.VerdictSummary
     classes: tuple[Names, ...]
     adequate_after: bool
 
     @property
     def statement(self) -> str:
         """The verdict as a sentence."""
-        return describe(self.summary)
+        return described.describe(self.summary)
 
     def to_json(self) -> Json:
         """Entry of result.json."""
-        return entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
+        return writing.entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
 
 
-def _effect_json(e: FoundEffect, support: NameSupport | None) -> Json:
+def _effect_json(e: FoundEffect, support: loop_notes.NameSupport | None) -> Json:
     test = None if support is None else support.test_of(e.name)
     return {
         "name": e.name,
@@ -651,13 +640,13 @@ def _effect_json(e: FoundEffect, support: NameSupport | None) -> Json:
         "rests_on_row": None if test is None else test.rests_on,
         "root": None if test is None else test.root,
         "root_needed": None if test is None else test.needed,
-        **entries_of(
+        **writing.entries_of(
             e, "families", "balance", "unit", "equation", "source", "parameters", "p_value", "score", "share"
         ),
         "accuracy_of_form": None
         if test is None or not test.shows_form
         else {"over": test.over, "share": test.spread},
-        **entries_of(e, "members", "stated_values=stated"),
+        **writing.entries_of(e, "members", "stated_values=stated"),
     }
 
 
@@ -665,13 +654,15 @@ def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
     return {
         "name": "unnamed",
         "class": [],
-        **entries_of(d, "families", "balance", "channel", "balances_alike", "variable", "variables_alike", "window"),
+        **writing.entries_of(
+            d, "families", "balance", "channel", "balances_alike", "variable", "variables_alike", "window"
+        ),
         "unit": d.unit,
         "equation": None,
         "parameters": {},
-        **entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
-        "curve": entries_of(d, "at", "value", "sd", "unit"),
-        "course": describe(d),
+        **writing.entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
+        "curve": writing.entries_of(d, "at", "value", "sd", "unit"),
+        "course": described.describe(d),
         "proposal": d.proposal,
     }
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from calibration.data.runs import Runs
 from calibration.discovery.loop_notes import NameTest
-from calibration.discovery.result import DiscoveryResult, ParameterShift, ReadingsOfRows
+from calibration.discovery.prediction import ReadingsOfRows
+from calibration.discovery.result import DiscoveryResult, ParameterShift
 from calibration.discovery.verdict import FAR, VerdictNoise
 from calibration.inference import noise as noise_room
 from calibration.inference import priors, series_noise

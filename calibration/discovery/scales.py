@@ -1,4 +1,6 @@
-"""Scale of the library's priors: they are stated for the nominal robot and are scaled to the size of a rig.
+"""Library of a rig: the effects that its data can reveal, and the scale of their priors.
+
+Priors are stated for the nominal robot and are scaled to the size of a rig.
 
 A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and negligible in one of 1 kW. The share of a term in
 its balance carries over from rig to rig. So the prior sd of an amplitude is scaled. A term of one sd then has the
@@ -21,9 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data.columns import SIDES
 from calibration.data.effect_file import Library
 from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
+from calibration.inference import observers
 from calibration.inference.operating import travel_of_rows
 from mmrjax.effects import Effect
 from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
@@ -232,3 +236,46 @@ def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
 
     term, total = jax.vmap(share)(signals)
     return _rms_size(term) / _rms_size(total)
+
+
+#: Share of the largest speed or voltage above which a value is not noise about rest [-].
+EITHER_WAY = 0.05
+
+
+def visible_effects(
+    library: Library,
+    robot: Robot,
+    kind: type[observers.Observer],
+    either_way: bool = True,
+    at_duties: bool = False,
+) -> tuple[Effect, ...]:
+    """Effects of a library that this kind of data can reveal and that the robot does not have yet.
+
+    Args:
+        either_way: True if there are forward and backward runs, see `goes_both_ways`.
+        at_duties: True if some runs have a duty below 1, see `has_partial_duty`.
+    """
+    have = {e.name for e in robot.effects}
+    return tuple(
+        effect()
+        for name, effect in library.items()
+        if name not in have
+        and kind.shows(effect)
+        and effect_applies(effect, robot)
+        and (either_way or not effect.needs_reverse)
+        and (at_duties or not effect.needs_duty)
+    )
+
+
+def has_partial_duty(runs: Runs) -> bool:
+    """True if some runs have a duty below 1, so that the supply is pulsed."""
+    duties = [runs[name] for name in ("duty", *SIDES) if runs.has(name)]
+    return any((np.abs(x) < 1).any() for x in duties)
+
+
+def goes_both_ways(runs: Runs) -> bool:
+    """True if there are forward and backward runs, according to a measured speed or the command."""
+    motion_columns = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
+    columns = [runs[name] for name in (*motion_columns, runs.layout.imposed_column, "duty") if runs.has(name)]
+    finite_columns = [x[np.isfinite(x)] for x in columns]
+    return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in finite_columns if x.size)

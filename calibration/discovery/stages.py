@@ -7,21 +7,23 @@ import functools
 
 import numpy as np
 
-from calibration.discovery import classes, findings, outliers, preference, search, verdict
+from calibration.discovery import (
+    candidates,
+    classes,
+    discrepancy,
+    findings,
+    loop_notes,
+    outliers,
+    prediction,
+    preference,
+    search,
+    verdict,
+)
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.assembly import residuals_by_channel
-from calibration.discovery.candidates import BaseFit, Candidate, fit_base
-from calibration.discovery.classes import Classes
-from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy, location_columns
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_input import LoopInput
-from calibration.discovery.loop_notes import Mechanism, MissedChannel, NameSupport
 from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
-from calibration.discovery.outliers import Screening
-from calibration.discovery.prediction import HeldOutAlternative, Predicted
-from calibration.discovery.search import SearchResult, screen_by_weak_form
 from calibration.discovery.settings import HELD_OUT
-from calibration.discovery.verdict import LoopStages, VerdictNoise
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
@@ -34,17 +36,19 @@ SCREENINGS = 4
 LIKELY = 4.0
 
 
-def fit_base_and_noise(given: LoopInput, begin: Candidate | None) -> tuple[Screening, VerdictNoise]:
+def fit_base_and_noise(
+    given: LoopInput, begin: candidates.Candidate | None
+) -> tuple[outliers.Screening, verdict.VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
     known_stages, noise = given.known, given.noise
     screened = _fit_base(given, noise, None if known_stages is None else known_stages.screened.base, begin)
     base, free = screened.base, screened.base.space.free
-    residuals = residuals_by_channel(
+    residuals = candidates.residuals_by_channel(
         base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free]
     )
     skip = screened.cluster is not None or not base.space.bare.observe.reads
     factors = {} if skip else common_factors(residuals)
-    sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
+    sds = verdict.VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
         given.progress(progress_remark("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
@@ -52,7 +56,9 @@ def fit_base_and_noise(given: LoopInput, begin: Candidate | None) -> tuple[Scree
     return screened, sds
 
 
-def _fit_base(given: LoopInput, noise: Noise, before: BaseFit | None, begin: Candidate | None) -> Screening:
+def _fit_base(
+    given: LoopInput, noise: Noise, before: candidates.BaseFit | None, begin: candidates.Candidate | None
+) -> outliers.Screening:
     """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
     For logs, the equations in weak form give the start of the fit, and rank the library unless effects would only
@@ -64,7 +70,7 @@ def _fit_base(given: LoopInput, noise: Noise, before: BaseFit | None, begin: Can
     if before is None:
         if begin is not None:  # as near as a simulated fit, and its effects are ranked
             near = dataclasses.replace(begin, simulated=True)
-        elif (ranking := screen_by_weak_form(space, settings)) is not None:
+        elif (ranking := search.screen_by_weak_form(space, settings)) is not None:
             make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, settings)
             if not given.shows_unmodelled_backlash:
                 given.ranked.append(given.keep("ranking", make))
@@ -73,12 +79,14 @@ def _fit_base(given: LoopInput, noise: Noise, before: BaseFit | None, begin: Can
             given.later.append(given.others.enter_context(outliers.compile_ahead(space, given.runs, settings)))
     if given.equations is None or not space.bare.observe.reads:  # linear readings have a fit
         given.progress(progress_remark("base"))
-    return outliers.screen_outliers(fit_base(space, settings, given.runs.source, near), given.runs, settings)
+    return outliers.screen_outliers(
+        candidates.fit_base(space, settings, given.runs.source, near), given.runs, settings
+    )
 
 
 def search_until_clean(
-    given: LoopInput, screened: Screening, sds: VerdictNoise
-) -> tuple[Screening, Diagnosis, SearchResult | None]:
+    given: LoopInput, screened: outliers.Screening, sds: verdict.VerdictNoise
+) -> tuple[outliers.Screening, Diagnosis, search.SearchResult | None]:
     """Searches for effects, again whenever new outliers appear. No search if the base fits, or if the log shows
     backlash that the robot lacks.
     """
@@ -105,7 +113,9 @@ def search_until_clean(
     return screened, diagnosis, searched
 
 
-def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tuple[Screening, Diagnosis]:
+def _test_base(
+    given: LoopInput, sds: verdict.VerdictNoise, screened: outliers.Screening
+) -> tuple[outliers.Screening, Diagnosis]:
     """Tests the base fit by bootstrap."""
     known_stages, weight = given.known, screened.base.space.weight
     null = (
@@ -120,8 +130,8 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
 
 
 def _search_effects(
-    given: LoopInput, screened: Screening, left: Diagnosis
-) -> tuple[Screening, Diagnosis, SearchResult]:
+    given: LoopInput, screened: outliers.Screening, left: Diagnosis
+) -> tuple[outliers.Screening, Diagnosis, search.SearchResult]:
     """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search.search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
@@ -129,8 +139,12 @@ def _search_effects(
 
 
 def end_without_search(
-    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult | None
-) -> LoopStages | None:
+    given: LoopInput,
+    screened: outliers.Screening,
+    left: Diagnosis,
+    sds: verdict.VerdictNoise,
+    searched: search.SearchResult | None,
+) -> verdict.LoopStages | None:
     """Verdict on a base without a search for effects: nothing is missing, or the model does not describe the runs."""
     if searched is not None:
         return None
@@ -138,37 +152,35 @@ def end_without_search(
     # A rigid base that leaves only noise refutes a backlash.
     loose = given.shows_unmodelled_backlash and left.test.rejected
     word = "undescribed" if missed or loose else "none"
-    return LoopStages(word, screened, left, sds, missed=missed, unused=verdict.unused_inputs(given.runs))
+    return verdict.LoopStages(word, screened, left, sds, missed=missed, unused=verdict.unused_inputs(given.runs))
 
 
 def confirm_search(
-    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult
-) -> SearchResult:
+    given: LoopInput,
+    screened: outliers.Screening,
+    left: Diagnosis,
+    sds: verdict.VerdictNoise,
+    searched: search.SearchResult,
+) -> search.SearchResult:
     """The search with the set of effects that a simulation confirms, for equations of a log."""
     return searched if given.confirm is None else given.confirm(screened, left, searched, sds.noise)
 
 
-def choose_effects(
-    given: LoopInput, screened: Screening, left: Diagnosis, searched: SearchResult
-) -> tuple[BaseCurve, Predicted, tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
-    """Curve of the base's discrepancy, and the effects to add, see `preference.choose_effects`."""
-    beside, predicted = BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases), Predicted()
-    chosen = preference.choose_effects(
-        given.runs, screened, left, searched, given.settings, given.progress, beside, predicted
-    )
-    return beside, predicted, *chosen
+def curve_of_base(given: LoopInput, screened: outliers.Screening, left: Diagnosis) -> discrepancy.BaseCurve:
+    """Smooth curve of the base's discrepancy, which is fitted when it is needed."""
+    return discrepancy.BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases)
 
 
 def check_described(
     given: LoopInput,
-    screened: Screening,
+    screened: outliers.Screening,
     left: Diagnosis,
-    sds: VerdictNoise,
-    searched: SearchResult,
-    chosen: tuple[Candidate, Diagnosis] | None,
-    beside: BaseCurve,
-    predicted: Predicted,
-) -> tuple[MissedChannel, ...] | LoopStages:
+    sds: verdict.VerdictNoise,
+    searched: search.SearchResult,
+    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    beside: discrepancy.BaseCurve,
+    predicted: prediction.Predicted,
+) -> tuple[loop_notes.MissedChannel, ...] | verdict.LoopStages:
     """Channels that the refit misses but effects describe. Ends the loop if no set of effects describes the runs."""
     runs, space = given.runs, screened.base.space
     missed = verdict.missed_channels(space, runs, sds.noise, left.linear)
@@ -182,21 +194,21 @@ def check_described(
         if leaves := verdict.remaining_errors(space, runs, missed, refit, with_effects):
             return leaves
     unused = verdict.unused_inputs(runs)
-    return LoopStages(
+    return verdict.LoopStages(
         "undescribed", screened, left, sds, searched, beside=beside, predicted=predicted, missed=missed, unused=unused
     )
 
 
 def trace_mechanism(
     given: LoopInput,
-    screened: Screening,
+    screened: outliers.Screening,
     left: Diagnosis,
-    searched: SearchResult,
-    chosen: tuple[Candidate, Diagnosis] | None,
-    standing: NameSupport,
-    beside: BaseCurve,
-    predicted: Predicted,
-) -> Mechanism | None:
+    searched: search.SearchResult,
+    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    standing: loop_notes.NameSupport,
+    beside: discrepancy.BaseCurve,
+    predicted: prediction.Predicted,
+) -> loop_notes.Mechanism | None:
     """Equation and driving variable of the discrepancy, with ammeter errors that explain the data as well. None if
     the name of an effect is established.
     """
@@ -211,24 +223,26 @@ def trace_mechanism(
     if found is None:
         return None
     columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
-    columns = columns if found.effects else location_columns(linear, screened.bases, _location(given, beside))
+    columns = (
+        columns if found.effects else discrepancy.location_columns(linear, screened.bases, _location(given, beside))
+    )
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
     also = classes.ammeter_families(space, *fit, columns, found.families[0], settings)
     families = tuple(dict.fromkeys((*found.families, *also)))
     return dataclasses.replace(found, families=families, ammeter=classes.errors_of_ammeters(space, families))
 
 
-def _location(given: LoopInput, beside: BaseCurve) -> DiscrepancyLocation:
+def _location(given: LoopInput, beside: discrepancy.BaseCurve) -> DiscrepancyLocation:
     return dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))
 
 
 def find_alternatives(
     given: LoopInput,
-    screened: Screening,
+    screened: outliers.Screening,
     left: Diagnosis,
-    searched: SearchResult,
-    chosen: tuple[Candidate, Diagnosis] | None,
-) -> tuple[SearchResult, Classes | None]:
+    searched: search.SearchResult,
+    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+) -> tuple[search.SearchResult, classes.Classes | None]:
     """The search with the chosen effects, and the alternatives to each of them. None without effects."""
     if chosen is None:
         return searched, None
@@ -242,14 +256,19 @@ def find_alternatives(
 
 def reach_verdict(
     given: LoopInput,
-    screened: Screening,
-    searched: SearchResult,
-    alike: Classes | None,
-    standing: NameSupport,
-    beside: BaseCurve,
-    mechanism: Mechanism | None,
+    screened: outliers.Screening,
+    searched: search.SearchResult,
+    alike: classes.Classes | None,
+    standing: loop_notes.NameSupport,
+    beside: discrepancy.BaseCurve,
+    mechanism: loop_notes.Mechanism | None,
 ) -> tuple[
-    str, SearchResult, Classes | None, NameSupport, DiscrepancyLocation | None, tuple[HeldOutAlternative, ...]
+    str,
+    search.SearchResult,
+    classes.Classes | None,
+    loop_notes.NameSupport,
+    DiscrepancyLocation | None,
+    tuple[prediction.HeldOutAlternative, ...],
 ]:
     """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects."""
     best, after, space, settings = searched.best, searched.diagnosis, screened.base.space, given.settings
@@ -257,7 +276,7 @@ def reach_verdict(
     if alike is None or best is None or after is None or not any(named):
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
         return level, searched, alike, standing, _location(given, beside), ()
-    compared: tuple[HeldOutAlternative, ...] = ()
+    compared: tuple[prediction.HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         given.progress(progress_remark("held out"))
         searched, alike, compared = preference.prefer_by_held_out(
@@ -266,5 +285,9 @@ def reach_verdict(
         after = searched.diagnosis or after
         standing = standing.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
     alone = all(one for one, name in zip(alike.alone, named, strict=True) if name)
-    remains = locate_discrepancy(after, screened.bases, space.included) if after.test.rejected_with_margin else None
+    remains = (
+        discrepancy.locate_discrepancy(after, screened.bases, space.included)
+        if after.test.rejected_with_margin
+        else None
+    )
     return "named" if alone else "class", searched, alike, standing, remains, compared

@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.runs import Runs
+from calibration.discovery import loop_notes
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
@@ -17,15 +18,6 @@ from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.log_simulation import LogSimulation
-from calibration.discovery.loop_notes import (
-    AlternativeValue,
-    Headline,
-    Mechanism,
-    MissedChannel,
-    MissingEffect,
-    NameSupport,
-    VerdictSummary,
-)
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, HeldOutScore, Predicted
 from calibration.discovery.search import SearchResult
@@ -96,12 +88,12 @@ class LoopStages:
     searched: SearchResult | None = None
     alike: Classes | None = None
     where: DiscrepancyLocation | None = None
-    standing: NameSupport | None = None
+    standing: loop_notes.NameSupport | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
     beside: BaseCurve | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
-    mechanism: Mechanism | None = None
-    missed: tuple[MissedChannel, ...] = ()
+    mechanism: loop_notes.Mechanism | None = None
+    missed: tuple[loop_notes.MissedChannel, ...] = ()
     unused: Names = ()
     run: LogSimulation | None = None
     settled: bool = False
@@ -147,7 +139,7 @@ class LoopStages:
         return self.searched.diagnosis
 
 
-def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
+def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> loop_notes.VerdictSummary:
     """Data of the statement of a verdict. `numbers`: row numbers as used in messages."""
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
@@ -155,7 +147,7 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
     base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
-    return VerdictSummary(
+    return loop_notes.VerdictSummary(
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
@@ -173,14 +165,18 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
     )
 
 
-def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[MissingEffect, ...]:
+def missing_effects(
+    space: CandidateSpace, alike: Classes, support: loop_notes.NameSupport | None
+) -> tuple[loop_notes.MissingEffect, ...]:
     """Effects that the search added to the model, each with its alternatives and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
-        MissingEffect(
+        loop_notes.MissingEffect(
             names,
             tuple(
-                AlternativeValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index])
+                loop_notes.AlternativeValue(
+                    s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index]
+                )
                 for s in shifts
             ),
             families,
@@ -191,7 +187,9 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
     )
 
 
-def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
+def headline(
+    said: loop_notes.VerdictSummary, others: Sequence[tuple[float, loop_notes.VerdictSummary]] = ()
+) -> loop_notes.Headline:
     """The most detailed claims that the verdicts at all noise levels share.
 
     Args:
@@ -200,9 +198,9 @@ def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]
     sentences = [said, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
     if len({_verdict_without_claim(s) for s in sentences}) > 1:
-        return Headline("open", (), factors)
+        return loop_notes.Headline("open", (), factors)
     if _verdict_without_claim(said):
-        return Headline(said.verdict, (), factors)
+        return loop_notes.Headline(said.verdict, (), factors)
     laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in sentences])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(
@@ -212,20 +210,20 @@ def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]
             next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
         ]
         families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
-        return Headline("named" if alone else "class", laws, factors, (), families, values)
+        return loop_notes.Headline("named" if alone else "class", laws, factors, (), families, values)
     mechanisms, shared = _shared_claims([_claimed_families(s) for s in sentences])
     if mechanisms:
-        return Headline("mechanism", mechanisms, factors, shared)
+        return loop_notes.Headline("mechanism", mechanisms, factors, shared)
     places, shared = _shared_claims([_claimed_equations(s) for s in sentences])
-    return Headline("place", places, factors, shared)
+    return loop_notes.Headline("place", places, factors, shared)
 
 
-def _verdict_without_claim(said: VerdictSummary) -> str:
+def _verdict_without_claim(said: loop_notes.VerdictSummary) -> str:
     """Verdict if it claims no missing effect (`none` or `undescribed`), otherwise empty."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
-def _claimed_families(said: VerdictSummary) -> list[Names]:
+def _claimed_families(said: loop_notes.VerdictSummary) -> list[Names]:
     """Families of each established law or mechanism."""
     families = [m.families for m in said.missing if m.established]
     return (
@@ -235,7 +233,7 @@ def _claimed_families(said: VerdictSummary) -> list[Names]:
     )
 
 
-def _claimed_equations(said: VerdictSummary) -> list[Names]:
+def _claimed_equations(said: loop_notes.VerdictSummary) -> list[Names]:
     """Equations with a discrepancy, in words, without their variable."""
     families = _claimed_families(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
@@ -270,7 +268,7 @@ REMOVED = 0.5
 
 def missed_channels(
     space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization
-) -> tuple[MissedChannel, ...]:
+) -> tuple[loop_notes.MissedChannel, ...]:
     """Channels with a refit error above `UNDESCRIBED` of their measured rms, or with an estimated noise above it.
 
     If the stated noise of a channel is that large, residuals up to `EXPLAINED` times the noise are accepted.
@@ -289,15 +287,19 @@ def missed_channels(
         noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured_values**2, 0))
     noisy = np.where(has_stated_sd, 0.0, noisy)
     return tuple(
-        MissedChannel(c.name, float(share[k]), float(noisy[k]))
+        loop_notes.MissedChannel(c.name, float(share[k]), float(noisy[k]))
         for k, c in enumerate(runs.channels)
         if large[k] or noisy[k] > UNDESCRIBED
     )
 
 
 def remaining_errors(
-    space: CandidateSpace, runs: Runs, missed: Sequence[MissedChannel], refit: HeldOutScore, found: HeldOutScore
-) -> tuple[MissedChannel, ...]:
+    space: CandidateSpace,
+    runs: Runs,
+    missed: Sequence[loop_notes.MissedChannel],
+    refit: HeldOutScore,
+    found: HeldOutScore,
+) -> tuple[loop_notes.MissedChannel, ...]:
     """Hold-out errors of the missed channels after effects were added.
 
     None if the effects do not describe the runs either. This is so if more than `UNDESCRIBED` of a channel's rms

@@ -10,24 +10,11 @@ from calibration.data import Columns
 from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference.identifiability import Z95, Identifiability, ProfileLikelihoods
+from calibration.inference import identifiability, result, simulation_errors
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from calibration.inference.problem import Problem
-from calibration.inference.result import (
-    BlockErrors,
-    ChannelErrors,
-    ChannelNoise,
-    ChannelReadings,
-    ChiSquare,
-    Errors,
-    Estimate,
-    HeldOutErrors,
-    PriorSummary,
-    SteadyEstimate,
-)
 from calibration.inference.scans import Scan
-from calibration.inference.simulation_errors import channel_errors, sized_error
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -43,12 +30,12 @@ def parameter_estimates(
     posed: Problem,
     base: Robot,
     z: np.ndarray,
-    about: Identifiability,
-    profile: ProfileLikelihoods | None,
+    about: identifiability.Identifiability,
+    profile: identifiability.ProfileLikelihoods | None,
     beside: np.ndarray | None,
     sources: dict[str, str],
     scans: Mapping[int, Scan],
-) -> dict[str, Estimate]:
+) -> dict[str, result.Estimate]:
     """Estimate of each free parameter, by name.
 
     Args:
@@ -63,8 +50,8 @@ def parameter_estimates(
     point, sd = np.asarray(z), np.asarray(about.sd)
     value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
     stated = coordinates.stated
-    linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
-    wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
+    linear = np.stack([coordinates.value(point + side * identifiability.Z95 * sd) for side in (-1, 1)], 1)
+    wide = np.stack([coordinates.value(np.full_like(point, side * identifiability.Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), params.parameters_by_name(base)
     estimates = {}
@@ -77,7 +64,7 @@ def parameter_estimates(
             is_open = scans[k].open()
             ends = [np.where(np.arange(len(z)) == k, x, point) for x in scans[k].interval()]
             interval = np.array([coordinates.value(end)[k] for end in ends])
-        estimates[name] = Estimate(
+        estimates[name] = result.Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),
             interval=_float_pair(interval),
@@ -85,7 +72,7 @@ def parameter_estimates(
             interval_open=is_open,
             unit=coordinates.units[k],
             meaning=fields[name].spec.meaning,
-            prior=PriorSummary(
+            prior=result.PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
                 float(stated[k]),
                 _float_pair(wide[k]),
@@ -99,7 +86,7 @@ def parameter_estimates(
             profiled=profile is not None,
             with_steady=None
             if beside is None or other is None
-            else SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+            else result.SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
         )
     return estimates
 
@@ -108,11 +95,13 @@ def _float_pair(ends: np.ndarray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
+def channel_noise(
+    posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
+) -> dict[str, result.ChannelNoise]:
     """Source and size of the noise of each channel."""
     share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
     return {
-        name: ChannelNoise(
+        name: result.ChannelNoise(
             known.source[k],
             100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
             100 * float(shares[k]) if known.estimated[k] else None,
@@ -123,17 +112,17 @@ def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np
 
 def errors_by_channel(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
-) -> Errors:
+) -> result.Errors:
     """Errors of each channel. Arguments have shape (rows, channels)."""
-    return _channel_errors(shown, simulated, measured, sd, sized_error(simulated, measured))
+    return _channel_errors(shown, simulated, measured, sd, simulation_errors.sized_error(simulated, measured))
 
 
 def _channel_errors(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
-) -> Errors:
-    errors = channel_errors(shown, simulated, measured, sd, percent)
+) -> result.Errors:
+    errors = simulation_errors.channel_errors(shown, simulated, measured, sd, percent)
     return {
-        name: ChannelErrors(
+        name: result.ChannelErrors(
             int(e["rows"]), *(float(e[x]) for x in ("rms_percent", "max_percent", "rms_sigma", "rms"))
         )
         for name, e in errors.items()
@@ -142,20 +131,23 @@ def _channel_errors(
 
 def hold_out_errors(
     posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
-) -> HeldOutErrors:
+) -> result.HeldOutErrors:
     """Hold-out errors of all rows together and of each block."""
-    percent, unreachable = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
+    percent, unreachable = (
+        simulation_errors.sized_error(held.reading, measured),
+        posed.observe.unreachable(held.status),
+    )
     blocks = {}
     for k, label in enumerate(held.labels):
         is_in_block = held.block == k
         values_of_block = [np.where(is_in_block[:, None], x, np.nan) for x in (held.reading, percent)]
-        blocks[label] = BlockErrors(
+        blocks[label] = result.BlockErrors(
             _channel_errors(posed.channels, values_of_block[0], measured, sd, values_of_block[1]),
             _row_numbers(is_in_block & unreachable),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
-    return HeldOutErrors(
+    return result.HeldOutErrors(
         _channel_errors(posed.channels, held.reading, measured, sd, percent),
         _row_numbers(unreachable),
         blocks,
@@ -174,25 +166,25 @@ def readings_by_channel(
     sd: np.ndarray,
     before: np.ndarray,
     after: np.ndarray,
-) -> dict[str, ChannelReadings]:
+) -> dict[str, result.ChannelReadings]:
     """Measured and simulated readings of each channel. Arguments have shape (rows, channels), NaN for missing
     readings.
     """
-    percent, sigma = sized_error(after, measured), (after - measured) / sd
+    percent, sigma = simulation_errors.sized_error(after, measured), (after - measured) / sd
     return {
-        name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
+        name: result.ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
         for k, name in enumerate(channels.channel_names(shown))
     }
 
 
 def chi_square(
-    after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
-) -> ChiSquare:
+    after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: identifiability.Identifiability, known: Noise
+) -> result.ChiSquare:
     """χ² of the finite readings, and the degrees of freedom that the fit leaves."""
     finite = np.isfinite(measured)
     misfit = np.where(finite, (after - measured) / sd, 0.0)
     freedom = float(finite.sum() - about.leverage.sum())
-    return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
+    return result.ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
 
 
 def condition_columns(observe: type[Observer], runs: Runs) -> Columns:

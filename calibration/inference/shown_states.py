@@ -20,6 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from calibration.data import Columns
+from calibration.data.runs import Runs
+from calibration.inference.fit_notes import Remark
 from calibration.inference.problem import Problem
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
@@ -571,3 +573,10 @@ def _travel_directions(
         offset = abs(per) * (np.full(len(shown), noise) if plan.angle else sd[:, plan.motion])
     limit = np.maximum(REST * np.abs(speed).max(initial=0.0), REST_SD * offset)
     return np.where(np.abs(speed) > limit, np.sign(speed), 0.0), speed
+
+
+def missing_states_remarks(runs: Runs, robot: Robot) -> list[Remark]:
+    """Remark on a log that does not show the states of its equations."""
+    read = {k: c for k, c in enumerate(runs.channels) if runs.sampled and np.isfinite(runs.measured()[:, k]).any()}
+    plan = state_plan_or_reason(robot, read) if read else None
+    return [Remark("unshown", source=runs.source, why=plan.value)] if isinstance(plan, MissingStates) else []

@@ -34,7 +34,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from calibration.data import Columns
-from calibration.inference.linearization import PROBED, ScoredEffect, balance_probe, effect_terms, map_over_shapes
+from calibration.inference import linearization
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
 from calibration.inference.shown_states import (
@@ -47,7 +47,7 @@ from calibration.inference.shown_states import (
     state_plan,
     with_condition,
 )
-from mmrjax.compile.compiling import SELDOM, compiled
+from mmrjax.compile import compiling
 from mmrjax.compile.programs import return_memory
 from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
@@ -258,7 +258,7 @@ def equation_terms(
     return jnp.stack([jnp.asarray(x, float) for x in f]), jnp.stack([jnp.asarray(x, float) for x in y]), signals
 
 
-@functools.partial(compiled, options=SELDOM)
+@functools.partial(compiling.compiled, options=compiling.SELDOM)
 def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Array) -> LogPoints:
     """Points whose state readings are replaced by states without noise, from the equations at coordinates z.
 
@@ -300,15 +300,17 @@ def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Ar
     return dataclasses.replace(rows, shown=readings, rate=rate)
 
 
-@functools.partial(compiled, options=SELDOM)
+@functools.partial(compiling.compiled, options=compiling.SELDOM)
 def _terms_with_derivatives(
-    problem: Problem, plan: StatePlan, rows: LogPoints, z: Array, effects: tuple[ScoredEffect, ...]
+    problem: Problem, plan: StatePlan, rows: LogPoints, z: Array, effects: tuple[linearization.ScoredEffect, ...]
 ) -> EquationTerms:
     """Terms at each point for coordinates z, with derivatives with respect to base parameters, readings and
     effects.
     """
-    entering = tuple(dict.fromkeys((*PROBED, *(e.effect.balance for e in effects if e.effect.balance != "sensor"))))
-    probes = tuple(balance_probe(b) for b in entering)
+    entering = tuple(
+        dict.fromkeys((*linearization.PROBED, *(e.effect.balance for e in effects if e.effect.balance != "sensor")))
+    )
+    probes = tuple(linearization.balance_probe(b) for b in entering)
     size, names = z.size, channels.channel_names(problem.channels)
 
     def terms_of_point(row: LogPoints) -> tuple[Any, tuple[Any, Signals]]:
@@ -335,7 +337,10 @@ def _terms_with_derivatives(
     def entering_terms(signals: Signals, angle: Array, memory: list[Array]) -> Array:
         read = dataclasses.replace(signals, angle=angle)
         each = zip(effects, memory, strict=True)
-        terms = [effect_terms(base, read if e.effect.balance == "sensor" else signals, (e,), [m]) for e, m in each]
+        terms = [
+            linearization.effect_terms(base, read if e.effect.balance == "sensor" else signals, (e,), [m])
+            for e, m in each
+        ]
         return jnp.concatenate([jnp.zeros(0), *terms])
 
     entered = jax.vmap(entering_terms)(signals, angle, memory)
@@ -363,7 +368,7 @@ def _terms_with_derivatives(
         values[0],
         values[1],
         both(lambda s, _: s[:, :, :size]),
-        both(lambda s, _: s[:, :, size : size + len(PROBED)]),
+        both(lambda s, _: s[:, :, size : size + len(linearization.PROBED)]),
         both(lambda s, _: s[:, :, size + len(probes) :]),
         both(of_effects),
         jax.tree.map(lambda x: jnp.broadcast_to(x, rows.time.shape), signals),
@@ -371,25 +376,25 @@ def _terms_with_derivatives(
 
 
 def memory_by_point(
-    robot: Robot, rows: LogPoints, signals: Signals, effects: tuple[ScoredEffect, ...]
+    robot: Robot, rows: LogPoints, signals: Signals, effects: tuple[linearization.ScoredEffect, ...]
 ) -> list[Array]:
     """Memory of each effect at each point of the log and of the effect's grid, shape (points, grid)."""
     count = rows.since.shape[0]
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
 
-    def of_effect(scored: ScoredEffect) -> Array:
+    def of_effect(scored: linearization.ScoredEffect) -> Array:
         def rate(effect: Effect, at: Array, signals: Signals) -> Array:
             with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: at})
             return jnp.asarray(effect.rate(robot, with_memory), float)
 
         def begun(angle: Array) -> Array:
-            return map_over_shapes(
+            return linearization.map_over_shapes(
                 scored, lambda e, _: jnp.asarray(e.initial(robot, angle), float), jnp.zeros(len(scored.at))
             )
 
         def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
-            law = lambda m: map_over_shapes(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
+            law = lambda m: linearization.map_over_shapes(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun(angle))
             return memory, memory
@@ -402,7 +407,7 @@ def memory_by_point(
 # --- a delay --------------------------------------------------------------------------------------------------
 
 
-@functools.partial(compiled, options=SELDOM)
+@functools.partial(compiling.compiled, options=compiling.SELDOM)
 def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z: Array) -> Array:
     """Terms f and y and their derivatives with respect to z, shape (2, points, equations, 1 + coordinates)."""
 
@@ -542,7 +547,7 @@ class WeakFormFit:
     read: tuple[Any, Any]
 
 
-def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakFormFit | None:
+def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, ...] = ()) -> WeakFormFit | None:
     """Fits the base parameters of a log to its equations in weak form.
 
     None if the log does not show the states, or has too few windows.

@@ -30,7 +30,7 @@ from sweeps.config_campaign import SIZE
 from sweeps.console import progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import scale
-from sweeps.points.climbs import NEAR, SLOW, SOUGHT, climb_refusal
+from sweeps.points.tasks import NEAR, SLOW, SOUGHT, climb_refusal
 from sweeps.report import climb_report
 from sweeps.report.climb_report import Along, ClimbResult
 from sweeps.store import finish_run_folder, open_folder, print_report

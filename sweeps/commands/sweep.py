@@ -5,17 +5,23 @@ from __future__ import annotations
 import dataclasses
 import errno
 import math
+import os
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calibration.data import Json, profiles
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
-from mmrjax.model.signals import STATUSES
+from mmrjax.fidelities import outputs
+from mmrjax.fidelities.variation import STATUS
+from mmrjax.model import channels, quantities
+from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import config_campaign
 from sweeps.config import Sweep
 from sweeps.config_campaign import Campaign, StoreOptions
@@ -264,10 +270,10 @@ def finish_sweep(
         )
         return DONE
     if options.export:
-        from sweeps.points import export
+        pass
 
         for kind in options.export:
-            print_message(str(export.export_runs(kind, store.path, store.layout)))
+            print_message(str(export_runs(kind, store.path, store.layout)))
     counts = points_by_status(done.values())
     if not is_complete:
         print_table(endings_table(counts, "points", job.task.model))
@@ -304,3 +310,98 @@ def points_by_status(done: Iterable[Done]) -> dict[str, int]:
     """Number of points with each status, zeros included."""
     total = np.sum([d.statuses for d in done], axis=0, dtype=int)
     return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))
+
+
+#: Columns of conditions, as in tables of runs and options, and their unit in the unit of the store. Other quantities
+#: keep their names.
+COLUMNS = {c.field: (c.column, 1.0) for c in quantities.SET if c.in_tables and c.field} | {
+    "motor_speed": ("motor_speed_rpm", quantities.RPM),
+    "motor_current": ("motor_current_A", 1.0),
+    "discharge": ("discharge_mAh", COULOMB_PER_MAH),
+}
+
+
+def export_runs(kind: str, folder: Path, layout: StoreLayout) -> Path:
+    """Writes `runs.csv` or `runs.parquet` into a finished run folder. Returns the path.
+
+    One row for each point, in order. Numbers that are not finite become empty cells.
+    """
+    path = folder / f"runs.{kind}"
+    temporary = path.with_name(path.name + ".writing")
+    try:
+        _WRITERS[kind](temporary, chunk_tables(folder / STORE, layout))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def chunk_tables(store: Path, layout: StoreLayout) -> Iterator[Any]:
+    """Yields the points of each chunk as an Arrow table."""
+    import pyarrow as pa
+    import zarr
+
+    group = zarr.open_group(store, mode="r")
+    design, blocks = layout.design, layout.blocks
+    columns = {row.name: row.column for row in outputs.output_table(channels.EVERY)}
+    for chunk in range(len(blocks)):
+        box = blocks.box(chunk)
+        shape = tuple(b.stop - b.start for b in box)
+        tables: dict[str, Any] = {}
+        for k, (name, values) in enumerate(design.axes.items()):
+            along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
+            flat = np.broadcast_to(along, shape).ravel()
+            words = layout.labels.get(name)
+            column, unit = COLUMNS.get(name, (name, 1.0))
+            tables[column] = (
+                pa.array(flat / unit)
+                if words is None
+                else pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(words))
+            )
+        for name in design.samples.names if design.samples is not None else ():
+            sampled: Any = group[name]
+            column, unit = COLUMNS.get(name, (name, 1.0))
+            tables[column] = pa.array(np.broadcast_to(sampled[box[-1]], shape).ravel() / unit)
+        for name, (dtype, _) in layout.variables.items():
+            array: Any = group[name]
+            flat = array[box].ravel()
+            if name == STATUS:
+                tables[STATUS] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(STATUSES))
+            elif np.dtype(dtype).kind != "f":
+                names = [";".join(f for k, f in enumerate(FLAGS) if bits >> k & 1) for bits in range(1 << len(FLAGS))]
+                tables[name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
+            else:
+                tables[columns.get(name, name)] = pa.array(flat, from_pandas=True)
+        yield pa.table(tables)
+
+
+def _csv(path: Path, parts: Iterator[Any]) -> None:
+    import pyarrow as pa
+    from pyarrow import csv
+
+    writer = None
+    for part in parts:
+        words = [pa.types.is_dictionary(f.type) for f in part.schema]
+        part = part.cast(
+            pa.schema([f.with_type(pa.string()) if w else f for f, w in zip(part.schema, words, strict=True)])
+        )
+        if writer is None:
+            writer = csv.CSVWriter(path, part.schema, write_options=csv.WriteOptions(quoting_style="needed"))
+        writer.write_table(part)
+    if writer is not None:
+        writer.close()
+
+
+def _parquet(path: Path, parts: Iterator[Any]) -> None:
+    from pyarrow import parquet
+
+    writer = None
+    for part in parts:
+        if writer is None:
+            writer = parquet.ParquetWriter(path, part.schema)
+        writer.write_table(part)
+    if writer is not None:
+        writer.close()
+
+
+_WRITERS = {"csv": _csv, "parquet": _parquet}

@@ -29,7 +29,7 @@ from sweeps.pages.figure_style import (
     axis_label,
     new_figure,
 )
-from sweeps.points.climbs import SIZE
+from sweeps.points.tasks import SIZE
 from sweeps.points.zarr_store import StoreLayout
 from sweeps.report.run_tables import UNITS, imposed_column, reading_text
 

@@ -32,9 +32,8 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
 from mmrjax.model.robot import Robot
 from sweeps.points.axes import SweepPlan
-from sweeps.points.climbs import VERDICT
 from sweeps.points.sampled_design import ROW, Blocks
-from sweeps.points.tasks import Task
+from sweeps.points.tasks import VERDICT, Task
 
 POINTS = "points"
 #: Chunks with more points per device are padded to a multiple of this, so that designs of all sizes share few

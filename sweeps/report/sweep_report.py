@@ -18,7 +18,7 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import signals
 from sweeps import capabilities
 from sweeps.pages import words
-from sweeps.points.climbs import LARGEST, SIZE, VERDICT
+from sweeps.points.tasks import LARGEST, SIZE, VERDICT
 from sweeps.points.zarr_store import STORE, StoreLayout
 from sweeps.report import catalogue, run_tables
 from sweeps.report.climb_report import VERDICTS

@@ -1099,7 +1099,7 @@ def _near_rest(runs: Runs, robot: Robot, rows: np.ndarray, share: float) -> np.n
     """
     channels = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
     rates = [k for k, channel in enumerate(channels) if not runs.channels[channel].settled]
-    speeds, time = runs.measured()[rows][:, channels], runs["time_s"][rows]
+    speeds, time = runs.where(rows).measured()[:, channels], runs["time_s"][rows]
     speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
