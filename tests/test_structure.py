@@ -763,7 +763,7 @@ MORE_NAMES = {
     "sweeps/commands/rig_check.py": 48,
     "sweeps/commands/sensitivity.py": 36,
     "sweeps/commands/simulate.py": 37,
-    "sweeps/commands/sweep.py": 44,
+    "sweeps/commands/sweep.py": 49,
     "sweeps/commands/turn.py": 28,
     "sweeps/inputs.py": 39,
     # Reports, stores and exports show every part of a result.
@@ -779,6 +779,7 @@ MORE_NAMES = {
     "sweeps/report/mission_report.py": 30,
     "sweeps/report/runs_report.py": 30,
     "sweeps/report/sweep_report.py": 27,
+    "sweeps/points/tasks.py": 33,
 }
 
 

@@ -27,7 +27,6 @@ from calibration.discovery.standing import judge_names
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import progress_remark
-from calibration.inference.held_out import predict_unseen
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
 TOLD = 0.01
@@ -36,20 +35,24 @@ TOLD = 0.01
 # --- before and after -----------------------------------------------------------------------------------
 
 
+def errors_on_common_rows(
+    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
+) -> tuple[Errors, Errors]:
+    """Errors of two sets of readings, over the readings that both fits predict."""
+    in_both = np.isfinite(before) & np.isfinite(after)
+    return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
+
+
 def worse_predictions(
-    readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
+    errors: Mapping[str, tuple[Errors, Errors]],
 ) -> tuple[WorseChannel, ...]:
-    """Channels whose hold-out error rises with the effects, for each kind of block. Only rows that both fits predict
-    count.
+    """Channels whose hold-out error rises with the effects, for each kind of block.
 
     Args:
-        readings: kind of block → hold-out readings without and with the effects [SI], NaN for no prediction.
-        errors: function that returns the errors of readings, by channel.
+        errors: kind of block → hold-out errors without and with the effects, see `errors_on_common_rows`.
     """
     worse = []
-    for kind, (before, after) in readings.items():
-        in_both = np.isfinite(before) & np.isfinite(after)
-        was, now = (errors(np.where(in_both, x, np.nan)) for x in (before, after))
+    for kind, (was, now) in errors.items():
         for channel, e in now.items():
             old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
             if new > (1 + TOLD) * old:
@@ -74,16 +77,8 @@ def compare_alternatives(
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     if len(alternatives) < 2 or not kinds:
         return ()
-
-    def residuals_in_sds(c: candidates.Candidate, masks: list[np.ndarray]) -> np.ndarray:
-        problem, z, active = space.fit_of(c.active, c.z)
-        reading = predict_unseen(problem, z, masks, active).reading
-        return np.where(counts, (reading - measured) / sd, np.nan)
-
-    errors = [
-        {kind: residuals_in_sds(c, list(blocks_by_name.values())) for kind, blocks_by_name in kinds.items()}
-        for c in alternatives
-    ]
+    fits = [prediction.FittedProblem(*space.fit_of(c.active, c.z)).held_out(kinds) for c in alternatives]
+    errors = [{kind: np.where(counts, (x - measured) / sd, np.nan) for kind, x in fit.items()} for fit in fits]
     held_out = {
         kind: counts & np.any(list(blocks_by_name.values()), 0)[:, None] for kind, blocks_by_name in kinds.items()
     }
