@@ -12,16 +12,19 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.data.runs import Runs
-from calibration.discovery import candidates, experiments, prediction, search
+from calibration.discovery import candidates, prediction, search
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.experiments import alternatives_of_class
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import NameSupport
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, Predicted
 from calibration.discovery.result import Errors, WorseChannel
+from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import judge_names
 from calibration.inference import blocks as blocks_room
@@ -64,14 +67,14 @@ def worse_predictions(
 
 
 def compare_alternatives(
-    space: CandidateSpace, runs: Runs, best: candidates.Candidate, alike: Classes
+    space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes
 ) -> tuple[HeldOutAlternative, ...]:
     """Hold-out errors of the best fit and of fits in which one effect is replaced by an alternative. The best fit is
     first.
 
     Implausible alternatives are omitted. Empty if no alternative remains, or if there are no blocks.
     """
-    alternatives = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
+    alternatives = [c for c in alternatives_of_class(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     kinds = blocks_room.predictable_blocks(runs, space.bare)
@@ -114,8 +117,8 @@ def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
 
 
 def prefer_by_held_out(
-    space: CandidateSpace, runs: Runs, searched: search.SearchResult, alike: Classes, bases: Bases, settings: Settings
-) -> tuple[search.SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
+    space: CandidateSpace, runs: Runs, searched: SearchResult, alike: Classes, bases: Bases, settings: Settings
+) -> tuple[SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
     """Replaces the best fit by the alternative with the smallest hold-out error, see `_order_alternatives`.
 
     An alternative with significant residuals does not replace a best fit without them.
@@ -126,7 +129,7 @@ def prefer_by_held_out(
     table = compare_alternatives(space, runs, best, alike)
     if not table:
         return searched, alike, ()
-    fitted = {c.key: c for c in experiments.alternatives_of_class(best, alike, stated=False).values()}
+    fitted = {c.key: c for c in alternatives_of_class(best, alike, stated=False).values()}
     for k in _order_alternatives(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
@@ -142,8 +145,8 @@ def prefer_by_held_out(
 
 def _classes_with_leader(
     space: CandidateSpace,
-    best: candidates.Candidate,
-    leader: candidates.Candidate,
+    best: Candidate,
+    leader: Candidate,
     alike: Classes,
     settings: Settings,
 ) -> Classes:
@@ -178,10 +181,10 @@ def choose_effects(
     given: LoopInput,
     screened: Screening,
     left: Diagnosis,
-    searched: search.SearchResult,
+    searched: SearchResult,
     beside: BaseCurve,
     predicted: Predicted,
-) -> tuple[tuple[candidates.Candidate, Diagnosis] | None, search.SearchResult, NameSupport]:
+) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
     """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
 
     The effects are those whose names are established, and those of the smallest set that predicts as well as any.
