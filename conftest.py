@@ -4,6 +4,7 @@
 import contextlib
 import ctypes
 import dataclasses
+import functools
 import gc
 import os
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 os.environ["MMRJAX_PROGRAMS"] = ""  # what tests put in the place of a function is traced, not read
 from sweeps import compilation_cache
 
+compilation_cache.exposure_reason = functools.cache(compilation_cache.exposure_reason)  # of thousands of files
 compilation_cache.keep_programs()  # one for all workers, and for the next time
 
 import jax
@@ -23,6 +25,7 @@ jax.config.update("jax_traceback_in_locations_limit", 0)  # no lines of source i
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import typer.main
 
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
@@ -31,6 +34,7 @@ from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from sweeps import cli, console
 
+typer.main.get_command = functools.cache(typer.main.get_command)  # the commands are the same in all tests
 console.FIRST = 1e6  # that a command works depends on the time it takes: tests of what is said don't hear it
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the

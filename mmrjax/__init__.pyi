@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from mmrjax.model.signals import STATUSES as STATUSES
     from mmrjax.model.signals import State as State
     from sweeps import sweep as sweep
-    from sweeps.compilation_cache import keep_programs as keep_programs
     from sweeps.commands.export_drive import export as export
+    from sweeps.compilation_cache import keep_programs as keep_programs
 
 __version__: str
 OLDER_EMITTERS: str

@@ -115,24 +115,6 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
         stated_word(name, robot.configurations, where, f"got {name}; the robot has no such configuration")
 
 
-def check_surface(robot: Robot, names: Collection[str], surface: str | None) -> None:
-    """Rejects a surface whose adhesion is neither in Table 5 nor in a configuration of the robot.
-
-    Args:
-        names: names of the configurations that are simulated.
-
-    Raises:
-        BadConfiguration: the message has the known surfaces.
-    """
-    is_allowed = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
-    if not is_allowed and not all(
-        table.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
-    ):
-        raise BadConfiguration(
-            f"--surface: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"
-        )
-
-
 def read_runs(
     source: str,
     robot: Robot,
@@ -211,7 +193,12 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}
-        check_surface(robot, (name,), cell_values.get("surface"))
+        surface = cell_values.get("surface")
+        is_known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
+        if not is_known and table.configuration_on_surface(name, str(surface)) not in robot.configurations:
+            raise BadConfiguration(
+                f"--surface: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"
+            )
     run = records.single_run({**cell_values, "configuration": name}, layout)
     if misplaced := misplaced_levers(run, robot):
         _, column, why = misplaced

@@ -3,21 +3,16 @@
 Mutations of valid files are drawn from a seeded generator. One that is still a valid input may be accepted (0).
 """
 
-import ast
 import contextlib
-import json
 import os
 import re
 import shutil
 import signal
 import time
-import tomllib
 from importlib import resources
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import xarray as xr
 from test_stages import OWN
 from worlds import rigs
 
@@ -26,10 +21,8 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
-from mmrjax.errors import printable
 from mmrjax.model import paper_robots
 from sweeps import cli
-from sweeps.points import scale
 
 pytestmark = pytest.mark.slow
 
@@ -291,127 +284,3 @@ def test_senseless_values_of_options_are_answered_in_a_sentence(asked, command):
             wrong, _ = asked(*command, option, text, "--out", "out")
             failures += [wrong] * bool(wrong)
     assert not failures, "\n".join(failures)
-
-
-# --- names ------------------------------------------------------------------------------------------------------------
-
-LETTERS = ("\"", "'", "\\", "\\N{x}", '"""+str(__import__("os").system("touch executed"))+"""', "\n", "\t", "\r", "{", "}",
-           "{{7*7}}", "%s", "-->", "--", "]]>", "<script>", "=1+1", "+", "@", "-", "*", ";", "$(touch executed)", "`", "|",
-           "\x1b[31m", "\x07", "\x7f", "\x9b", "\u202e", "\u2028", "\ufeff", "é", "𝟙", " ", "#", "?", "::", ",")  # fmt: skip
-EXPORTS = ("jax", "mjlab", "table", "mujoco", "onnx", "randomization")
-
-
-@pytest.mark.parametrize("to", EXPORTS)
-def test_names_of_files_are_never_obeyed_by_an_export(ended, tmp_path, to):
-    rng = np.random.default_rng([60, EXPORTS.index(to)])
-    for k in range(4):
-        words = ["".join(rng.choice(LETTERS, 4)) for _ in range(2)]
-        robot, table = tmp_path / f"r{words[0]}.toml", tmp_path / f"t{words[1]}.csv"
-        shutil.copy(tmp_path / "rig.toml", robot)
-        shutil.copy(tmp_path / "table.csv", table)
-        _, out, err, wrong = ended(
-            "export", f"./{robot.name}", "--to", to, "--data", f"./{table.name}", "--out", f"out{k}"
-        )
-        assert not wrong and not (tmp_path / "executed").exists(), (words, wrong, err)
-        assert set(out + err) == set(printable(out + err)), words
-        for path in (tmp_path / f"out{k}").rglob("*"):
-            if path.suffix in (".csv", ".html", ".md", ".xml", ".h", ".py"):
-                text = path.read_text("utf-8")
-                assert set(text) == set(printable(text)), (words, path)
-            if path.suffix in (".toml", ".json", ".xml", ".py"):
-                READ[path.suffix](path.read_text("utf-8"))
-
-
-#: Readers of languages in which an export has names.
-READ = {".toml": tomllib.loads, ".json": json.loads, ".xml": ElementTree.fromstring, ".py": ast.parse}
-
-
-# --- files of another kind ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", DOORS)
-@pytest.mark.parametrize("kind", ["a folder", "missing", "a pipe", "another kind of file", "a link to itself"])
-def test_files_of_another_kind_are_answered_in_a_sentence(asked, tmp_path, name, kind):
-    door = [word if word != "FILE" else name for word in DOORS[name]]
-    (tmp_path / name).unlink()
-    if kind == "a folder":
-        (tmp_path / name).mkdir()
-    elif kind == "a pipe":
-        os.mkfifo(tmp_path / name)
-    elif kind == "a link to itself":
-        (tmp_path / name).symlink_to(name)
-    elif kind == "another kind of file":
-        shutil.copy(tmp_path / "plan.toml" if name != "plan.toml" else tmp_path / "runs.csv", tmp_path / name)
-    wrong, code = asked(*door, *end(door))
-    assert not wrong and code in CODES, wrong
-
-
-# --- folders ----------------------------------------------------------------------------------------------------------
-
-SWEEP = ["sweep", "plan.toml", "--outputs", "speed,flags", "--chunk", "12", "--out", "out"]
-TABLE = ["sweep", "--slopes", "0:9:1", "--voltages", "24", "--configurations", "6T2A", "--chunk", "10", "--no-report",
-         "--out", "out"]  # fmt: skip
-
-
-def harmed(file, rng):
-    """Damage a file: cut, emptied, a bit turned, or removed."""
-    content = bytearray(file.read_bytes())
-    how = int(rng.integers(4))
-    if how == 3 or not content:
-        file.unlink()
-        return
-    if how == 2:
-        content[rng.integers(len(content))] ^= 1 << rng.integers(8)
-    file.write_bytes((content[: rng.integers(len(content))], b"", content)[how])
-
-
-def stopped(monkeypatch, after):
-    """Interrupt a sweep after so many chunks. Returns a function that heals it."""
-    honest, count = scale.Compiled.__call__, iter(range(10**6))
-
-    def interrupted(*arguments):
-        if next(count) >= after:
-            time.sleep(0.3)  # so that those before are written
-            raise KeyboardInterrupt
-        return honest(*arguments)
-
-    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
-    return lambda: monkeypatch.setattr(scale.Compiled, "__call__", honest)
-
-
-def numbers(folder):
-    """Every number that a sweep left, by file."""
-    table = folder / "runs.csv"
-    if table.is_file():
-        return table.read_text()
-    with xr.open_zarr(folder / "results.zarr") as data:
-        return {name: values.values.tolist() for name, values in data.load().items()}
-
-
-@pytest.fixture(scope="module")
-def whole():
-    """Numbers of a sweep that nothing disturbed, by its command."""
-    return {}
-
-
-@pytest.mark.parametrize("command", [SWEEP, TABLE], ids=["a store", "a table"])
-@pytest.mark.parametrize("seed", range(6))
-def test_a_damaged_interrupted_sweep_never_gives_other_numbers(ended, tmp_path, monkeypatch, whole, command, seed):
-    key = command[1]
-    if key not in whole:
-        assert ended(*command)[0] == 0
-        whole[key] = numbers(tmp_path / "out")
-        shutil.rmtree(tmp_path / "out")
-    heal = stopped(monkeypatch, 3)
-    assert ended(*command)[0] == 130
-    heal()
-    rng = np.random.default_rng([59, seed])
-    files = sorted(p for p in (tmp_path / "out.partial").rglob("*") if p.is_file())
-    for k in rng.choice(len(files), 2, replace=False):
-        harmed(files[k], rng)
-    code, _, err, wrong = ended(*command)
-    assert not wrong, (wrong, err)
-    if code == 0:
-        assert numbers(tmp_path / "out") == whole[key]
-    else:
-        assert "out.partial" in err and code in CODES

@@ -14,12 +14,9 @@ from synthetic import FEW, SETTLED, known, parts, small, table
 from worlds import settled, tables
 
 from calibration.data.runs import read_runs as read_runs
-from calibration.discovery import loop_input, outliers, scales
-from calibration.discovery.candidates import fit_base
-from calibration.discovery.outliers import screen_outliers
+from calibration.discovery import scales
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
-from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference import bases, noise
+from calibration.inference import bases
 from calibration.inference.held_out import hold_out_blocks
 from calibration.inference.linearization import PROBED, amplitude_of, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import SettledRuns
@@ -84,23 +81,6 @@ def test_clean_table_lacks_nothing(clean):
     assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
     null = clean.left.test.null
     assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
-
-
-@pytest.fixture(scope="module")
-def outside():
-    """A law that no effect of the library is like, through the stages of the loop."""
-    runs = table(tables.narrow(["supply_hunting"], 12.0, 2))
-    return parts(runs, SETTLED.trace(runs))
-
-
-@pytest.mark.slow
-def test_effect_outside_the_library_gets_no_name(outside):
-    found = outside.traced
-    where = found.where
-    assert found.verdict in WITHOUT_NAME and found.members == () and found.left.test.rejected
-    assert found.searched is not None and not found.standing.stands and found.standing.why
-    assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.alike)
-    assert where.variable in bases.VARIABLES and found.families == (where.family,)
 
 
 def test_two_effects_are_both_found(looks):
@@ -342,13 +322,3 @@ def test_null_of_one_column_is_normal(clean):
     # χ² of readings and priors less the coordinates that were fitted
     freedom = 3 * len(clean.runs)
     assert abs(np.mean(null.chi2) - freedom) < 4 * np.sqrt(2 * freedom / len(null.chi2))
-
-
-@pytest.mark.slow
-def test_bootstrap_of_the_measured_runs_settles(robot):
-    """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
-    runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
-    sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
-    space = loop_input.build_candidate_space(runs, robot, sd, settings, {}, SETTLED.library)
-    screened = screen_outliers(fit_base(space, settings, "measured"), runs, settings)
-    assert len(outliers.diagnose_base_by_bootstrap(screened, settings).test.null.single) >= 0.98 * settings.replicates

@@ -130,17 +130,21 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
 
 @pytest.mark.slow
 def test_wave_without_a_name_is_in_the_result(oval):
+    """By its place alone: a log is traced on readings that are linear about one fit, to which no curve is added."""
     found = ANALYST.result(oval.traced, oval.runs)
-    where = locate_discrepancy(oval.left, oval.bases, oval.space.included)
-    assert found.verdict in WITHOUT_NAME and found.effects == () and found.after.adequate
-    assert (found.unnamed.balance, found.unnamed.variable) == (where.balance, where.variable)
-    assert found.unnamed.defect is None and found.unnamed.score > 0.5 * oval.label["sigmas"] ** 2
+    where, location = found.summary.where, locate_discrepancy(oval.left, oval.bases, oval.space.included)
+    assert found.verdict in WITHOUT_NAME and found.effects == () and found.unnamed is None
+    assert (where.balance, where.variable) == (location.balance, location.variable)
+    assert where.explained > 0.5 * oval.label["sigmas"] ** 2
 
 
 @pytest.mark.slow
 def test_wave_without_a_name_can_be_added_to_the_robot(oval):
-    variable = "order 2 of the driving shaft"
-    curve = fit_discrepancy(oval.space, oval.base, oval.left.linear, "track", variable)
+    """To the simulated fit."""
+    run, scored = oval.traced.run, oval.space.library.scored
+    posed, z = run.space.bare, jnp.asarray(run.base.z[: run.space.free])
+    before = posed.observe.linearise(posed, z, posed.data, scored)
+    curve = fit_discrepancy(run.space, run.base, before, "track", "order 2 of the driving shaft")
     assert (
         curve.converged and curve.effect == "wave_track" and isinstance(curve.robot.effects[0], UNNAMED["wave_track"])
     )
@@ -151,8 +155,8 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     expected = oval.label["amplitude"] * np.exp(1j * oval.label["shapes"]["phase"])
     assert abs(got - expected) < 0.3 * abs(expected) and float(wave.order_shaft) == 2.0
     assert "sin(2 θ_k" in curve.proposal.formula
-    told = curve.problem, jnp.asarray(curve.z), oval.space.library.scored, oval.bases
-    exact, (linear, _, strongest) = diagnose_fit(*told), diagnose_fit(*told, near=oval.left.linear)
+    told = curve.problem, jnp.asarray(curve.z), scored, oval.bases
+    exact, (linear, _, strongest) = diagnose_fit(*told), diagnose_fit(*told, near=before)
     assert_allclose(linear.residual, exact[0].residual, atol=1e-6)
     for kind in ("single", "curve", "chi2"):  # by signatures of the fit without the curve
         assert abs(getattr(strongest, kind) - getattr(exact[2], kind)) < 0.3

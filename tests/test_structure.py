@@ -772,6 +772,7 @@ MORE_NAMES = {
     "sweeps/paper/report.py": 33,
     "sweeps/points/axes.py": 28,
     "sweeps/points/run.py": 37,
+    "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
     "sweeps/report/climb_report.py": 26,
     "sweeps/report/export_report.py": 27,

@@ -134,10 +134,10 @@ FOUND = {
 def test_command_finds_what_a_second_implementation_planted(tmp_path, mmrjax, case):
     table, robot = planted.write(tmp_path, case)
     told = ("--robot", str(robot), "--noise", planted.NOISE, "--replicates", "250")
-    _, out, _ = ends(mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run")), code=0)
+    ends(mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run")), code=0)
     found = read_json(tmp_path / "run/result.json")
     if FOUND[case] is None:
-        assert found["verdict"] == "none" and "nothing" in out.lower()
+        assert found["verdict"] == "none"
         return
     members = {name for effect in found["effects"] for name in effect["class"]}
     assert found["verdict"] in ("named", "class") and FOUND[case] in members

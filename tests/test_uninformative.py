@@ -153,7 +153,9 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
     assert (found is None) == varies
     if not varies:
         assert (found.rows, found.column, found.unused) == (12, "motor_speed_rpm", ("wind_V",))
-        with pytest.raises(BadData, match=r"t\.csv: these 12 runs differ only by noise\. wind_V varies and is"):
+        with pytest.raises(
+            BadData, match=r"t\.csv: these 12 runs differ only by noise\. wind_V varies from row to row"
+        ):
             loop_input.prepare_loop(
                 runs, robot, noise="motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm", replicates=192
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
@@ -55,17 +56,7 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
             f"{name}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
             f"{' and '.join(SIDES)} instead"
         )
-    if twin := next((c for c in (*SIDES, *DUTY) if c in columns), None):
-        raise BadData(
-            f"{name}: column {twin} in addition to {voltage_columns[0]}, which already gives the command of both "
-            "sides; keep one"
-        )
-    if len(voltage_columns) == 1:
-        (other,) = {*VOLTS} - {*voltage_columns}
-        raise BadData(
-            f"{name}: column {other} is missing although {voltage_columns[0]} is present; give the command of both "
-            "sides"
-        )
+    check_commands_of_sides(name, columns, VOLTS, (*SIDES, *DUTY))
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
     exceeds_supply = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
@@ -79,6 +70,29 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
     origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
     columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}
     return (f"{name}: {' and '.join(VOLTS)} are read as {' and '.join(SIDES)}, shares of {origin}",)
+
+
+def check_commands_of_sides(name: str, columns: Columns, pair: Iterable[str], whole: Iterable[str]) -> None:
+    """Rejects the command of one side alone, or of both sides twice.
+
+    Args:
+        pair: columns with the command of each side.
+        whole: other columns that give the command of both.
+
+    Raises:
+        BadData: one column of the pair is missing, or another gives the command too.
+    """
+    stated = [c for c in pair if c in columns]
+    if extra := next((c for c in whole if stated and c in columns), None):
+        raise BadData(
+            f"{name}: column {extra} in addition to {stated[0]}, which already gives the command of both sides; keep "
+            "one"
+        )
+    if len(stated) == 1:
+        (other,) = {*pair} - {*stated}
+        raise BadData(
+            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+        )
 
 
 def check_turns(runs: Runs) -> None:
@@ -294,15 +308,16 @@ def _check_time_order(runs: Runs) -> None:
         run_rows = np.flatnonzero(run == name)
         rows_of_falls = np.flatnonzero(np.diff(time[run_rows]) < 0)
         if 0 < rows_of_falls.size <= max(SELDOM * len(run_rows), 1):
-            row, old_time, new_time = (
-                run_rows[rows_of_falls[0] + 1] + 1,
-                time[run_rows[rows_of_falls[0]]],
-                time[run_rows[rows_of_falls[0] + 1]],
-            )
-            raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {old_time:g} to {new_time:g} s; "
-                "give each recording its own run_id, or sort the rows"
-            )
+            raise time_goes_back(runs, *run_rows[rows_of_falls[0] :][:2])
+
+
+def time_goes_back(runs: Runs, before: int, row: int) -> BadData:
+    """Error of a run whose time falls from one row to the next, both counted from 0."""
+    time = runs["time_s"]
+    return BadData(
+        f"{runs.source} row {row + 1}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each "
+        "recording its own run_id, or sort the rows"
+    )
 
 
 def _median_of_neighbours(step: np.ndarray) -> np.ndarray:

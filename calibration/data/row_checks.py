@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Columns, Names, configuration_tables
+from calibration.data import Columns, Names, configuration_tables, contradictions
 from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
@@ -150,7 +150,7 @@ def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iter
             "output_torque"
         ),
     )
-    _check_sides(name, columns, layout)
+    contradictions.check_commands_of_sides(name, columns, layout.sides, ("duty", "mode"))
     if "total_mass_kg" in columns:
         payload = columns["payload_kg"]
         yield "total_mass_kg", columns["total_mass_kg"] <= payload, lambda row: too_light(payload[row])
@@ -175,18 +175,16 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
             is_equal |= np.isnan(values_after) & np.isnan(values_before)
         again = again[is_equal]
     is_distinct[again] = False
-    row_words = (
-        f"row {again[0] + 1} is"
-        if again.size == 1
-        else f"{again.size} rows, the first row {again[0] + 1}, are"
-        if again.size
-        else ""
+    if not again.size:
+        return is_distinct, ()
+    return is_distinct, (
+        f"{name}: {_rows_are(again)} a repetition of the row before, with the same time. Repetitions are left out "
+        "and not counted in row numbers",
     )
-    note = (
-        f"{name}: {row_words} a repetition of the row before, with the same time. Repetitions are left out and not "
-        "counted in row numbers"
-    )
-    return is_distinct, (note,) if again.size else ()
+
+
+def _rows_are(rows: np.ndarray) -> str:
+    return f"row {rows[0] + 1} is" if rows.size == 1 else f"{rows.size} rows, the first row {rows[0] + 1}, are"
 
 
 def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
@@ -241,21 +239,6 @@ def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout)
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
     for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items():
         columns.setdefault(column, np.full(rows, value))
-
-
-def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
-    side_columns = [c for c in layout.sides if c in columns]
-    if len(side_columns) == 1:
-        (other,) = set(layout.sides) - set(side_columns)
-        raise BadData(
-            f"{name}: column {other} is missing although {side_columns[0]} is present; give the command of both sides"
-        )
-    if side_columns and set(columns) & {"duty", "mode"}:
-        extra = min(set(columns) & {"duty", "mode"})
-        raise BadData(
-            f"{name}: column {extra} in addition to {side_columns[0]}, which already gives the command of both "
-            "sides; keep one"
-        )
 
 
 def too_light(payload: float) -> str:
@@ -399,10 +382,9 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
             f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
             f"command{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
-    row_words = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
     return size != 0, (
-        f"{name}: {row_words} left out, since nothing drives the motors ({zero or column} is 0). Row numbers do not "
-        "count them"
+        f"{name}: {_rows_are(idle)} left out, since nothing drives the motors ({zero or column} is 0). Row numbers "
+        "do not count them"
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.clock import applied_drive, differs_from_row_before
 from calibration.data.columns import LOAD, SPEED
-from calibration.data.contradictions import GAP
+from calibration.data.contradictions import GAP, time_goes_back
 from calibration.data.inferred_facts import common_step
 from calibration.data.input_errors import BadData
 from calibration.data.row_checks import inertia_at_motor
@@ -304,16 +304,11 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
         steps = np.diff(time[rows])
         if (steps <= 0).any():
             k = int(np.argmax(steps <= 0))
-            row, was, now = int(rows[k + 1]) + 1, time[rows[k]], time[rows[k + 1]]
-            if now == was:
-                raise BadData(
-                    f"{runs.source} row {row}, time_s: {now:g} s is repeated; give each sample its own time, with "
-                    "more digits if available, or remove one of them"
-                )
+            if steps[k] < 0:
+                raise time_goes_back(runs, *rows[k : k + 2])
             raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} "
-                "s; give each "
-                "recording its own run_id, or sort the rows"
+                f"{runs.source} row {rows[k + 1] + 1}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
+                "own time, with more digits if available, or remove one of them"
             )
     if max(map(len, rows_by_run)) < FEWEST:
         raise BadData(

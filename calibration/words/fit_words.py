@@ -24,14 +24,6 @@ def feedforward_statement(found: Feedforward) -> str:
     return ", ".join(constants_words) + "."
 
 
-def _limit(level: float, current: float | None) -> str:
-    peak = "" if current is None else f" The current reaches {current:.3g} A."
-    return (
-        f"A current limit acts: above {level:.2g} V of accelerating voltage the acceleration no longer "
-        f"increases.{peak} Those windows are left out. Lower the dynamic test's voltage, or raise the limit."
-    )
-
-
 #: Ratio of a velocity in a wrong unit to the rate of the position → its unit.
 MEANT = dict(
     zip(
@@ -42,21 +34,6 @@ MEANT = dict(
         strict=True,
     )
 )  # fmt: skip
-
-
-def _unit(ratio: float, near: float) -> str:
-    told = f"it is probably {MEANT[near]}" if near else "check gear ratio and wheel size in the conversion"
-    return (
-        f"The velocity is {ratio:.4g} times the rate of the position: {told}. The constants use the position's unit."
-    )
-
-
-def _undetermined(share: float, missing: Sequence[str]) -> str:
-    lack = f" ({', '.join(missing)} missing)" if missing else ""
-    return (
-        f"kA is not determined: its 95 % interval is ± {100 * share:.0f} %{lack}. No feedback gains are given. "
-        "Run dynamic tests with more acceleration and a faster log."
-    )
 
 
 if TYPE_CHECKING:
@@ -78,23 +55,8 @@ FAR = {
 PRIORS = {"product": "the prior of its product with the guide share"}
 
 
-def sentence_on_wrong_noise(channel: str, factor: float, source: str) -> str:
-    """Ratio of residuals to their sds."""
-    if not channel:
-        return f"in every channel, the residuals are {factor:.2g} times the {source} noise. Check the noise"
-    return (
-        f"the residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise. "
-        "Check the noise"
-    )
-
-
-def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
-    """Channels whose noise was estimated."""
-    share_words = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
-    return (
-        f"no noise was given, so it is estimated from the misfit: {share_words}. It includes model error, so it "
-        "cannot test the model"
-    )
+def _error_share(channel: str, share: float) -> str:
+    return f"{share:.0%} of the squared error of {channels.find_channel(channel).label}"
 
 
 def determined_combination(two: fit_notes.DependentPair) -> str:
@@ -109,12 +71,6 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
     if found.others:
         return f"only with {', '.join(found.others)}"
     return "no" if found.held else "yes"
-
-
-def sentence_on_combinations(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
-    """Parameters that are not determined separately, with what is."""
-    pair_words = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
-    return f"these runs determine only combinations: {', '.join(pair_words)}"
 
 
 def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
@@ -144,18 +100,6 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
     if open:
         parts.append(f"{open} did not converge")
     return ", ".join(parts)
-
-
-def unsettled_search(names: Names) -> str:
-    """A search that ended before it converged."""
-    determined = f"These data do not determine {', '.join(names)}" if names else "These data determine all parameters"
-    return (
-        "the search ended before it converged. Its parameters are the best found, and their intervals are "
-        f"unreliable. {determined}"
-    )
-
-
-# --- a search by population -----------------------------------------------------------------------------
 
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
@@ -328,7 +272,11 @@ SAID: dict[str, str | Callable[..., str]] = {
         "Velocity and position have opposite signs, so that of the velocity is changed here. Invert one in the "
         "robot's code."
     ),
-    "feedforward_unit": _unit,
+    "feedforward_unit": lambda ratio, near: (
+        f"The velocity is {ratio:.4g} times the rate of the position: "
+        + (f"it is probably {MEANT[near]}" if near else "check gear ratio and wheel size in the conversion")
+        + ". The constants use the position's unit."
+    ),
     "feedforward_delay": lambda delay: (
         f"The motion follows the voltage {1000 * delay:.0f} ms late, which the fit includes."
     ),
@@ -336,7 +284,11 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"The velocity lags the position by {1000 * lag:.0f} ms because it is filtered, so the position is "
         "fitted. Shorten the velocity filter before you use kP."
     ),
-    "feedforward_limit": _limit,
+    "feedforward_limit": lambda level, current: (
+        f"A current limit acts: above {level:.2g} V of accelerating voltage the acceleration no longer increases."
+        + ("" if current is None else f" The current reaches {current:.3g} A.")
+        + " Those windows are left out. Lower the dynamic test's voltage, or raise the limit."
+    ),
     "feedforward_skid": lambda level: (
         f"The wheels slip: above {level:.2g} V of accelerating voltage the velocity rises faster. Those windows "
         "are left out. Lower the dynamic test's voltage."
@@ -350,34 +302,46 @@ SAID: dict[str, str | Callable[..., str]] = {
         "large. Use setVoltage, or a fresh battery."
     ),
     "feedforward_missing": "Tests are missing: {tests}.",
-    "feedforward_no_kA": _undetermined,
+    "feedforward_no_kA": lambda share, missing: (
+        f"kA is not determined: its 95 % interval is ± {100 * share:.0f} %"
+        + (f" ({', '.join(missing)} missing)" if missing else "")
+        + ". No feedback gains are given. Run dynamic tests with more acceleration and a faster log."
+    ),
     "feedforward_gains_delayed": lambda delay, slow, prompt: (
         f"A delay of {1000 * delay:.0f} ms reduces the velocity kP from {prompt:.3g} to {slow:.3g}."
     ),
     "held_by_prior": f"these runs do not determine {{names}} (posterior sd above {HELD:g} times the prior sd)",
-    "only_together": sentence_on_combinations,
+    "only_together": lambda pairs: (
+        "these runs determine only combinations: "
+        + ", ".join(f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs)
+    ),
     "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
-    "noise_off": sentence_on_wrong_noise,
+    "noise_off": lambda channel, factor, source: (
+        f"the residuals of {channels.find_channel(channel).label if channel else 'every channel'} are {factor:.2g} "
+        f"times the {source} noise. Check the noise"
+    ),
     "not_profiled": "intervals come from the linearized model, which makes them too symmetric (--profiles)",
     "no_covariance": "the posterior has no finite covariance. Use the values, but not the intervals",
     "no_grip": "every run slides, so only priors determine static friction and slip below its limit",
-    "estimated_noise": estimated_noise,
+    "estimated_noise": lambda percent: (
+        "no noise was given, so it is estimated from the misfit: "
+        + ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
+        + ". It includes model error, so it cannot test the model"
+    ),
     "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
-        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample "
-        f"after each step of the command ({rows} of {total} rows). Without them, the rms error falls to "
-        f"{100 * (1 - share) ** 0.5:.0f} %. Readings and command may be offset in time. To fit this, set [rig] "
-        'delay = "0 ± 0.02" [s]'
+        f"{_error_share(channel, share)} lies in the first sample after each step of the command ({rows} of {total} "
+        f"rows). Without them, the rms error falls to {100 * (1 - share) ** 0.5:.0f} %. Readings and command may be "
+        'offset in time. To fit this, set [rig] delay = "0 ± 0.02" [s]'
     ),
     "freed_delay": lambda channel, share: (
-        f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in "
-        "the first sample after each step of the command, so rig.delay is fitted. To leave it out, set [rig] "
-        "delay = '0 ± 0'"
+        f"without a delay, {_error_share(channel, share)} lies in the first sample after each step of the command, "
+        "so rig.delay is fitted. To leave it out, set [rig] delay = '0 ± 0'"
     ),
     "shifted": lambda channel, share, shift: (
-        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is explained by readings "
-        f"{abs(1e3 * shift):.2g} ms {'late' if shift > 0 else 'early'}. To fit this delay, set [rig] delay = "
+        f"{_error_share(channel, share)} is explained by readings {abs(1e3 * shift):.2g} ms "
+        f"{'late' if shift > 0 else 'early'}. To fit this delay, set [rig] delay = "
         f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s]'
     ),
     "product_alone": lambda friction, share, free: (
@@ -395,7 +359,10 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "block_not_converged": "the search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
-    "unsettled": unsettled_search,
+    "unsettled": lambda names: (
+        "the search ended before it converged. Its parameters are the best found, and their intervals are "
+        f"unreliable. These data {'do not determine ' + ', '.join(names) if names else 'determine all parameters'}"
+    ),
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
     "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Closer conditions would show which is right",
     "generations": search_generations,

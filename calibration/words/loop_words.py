@@ -30,7 +30,6 @@ if TYPE_CHECKING:
         Errors,
         FoundEffect,
         NoiseVerdict,
-        ParameterEstimate,
         UnnamedDiscrepancy,
         WorseChannel,
     )
@@ -631,10 +630,7 @@ def moved_parameter(name: str, value: float, stated: float, unit: str, shift: fl
 
 def effect_amplitude(e: FoundEffect) -> str:
     """Amplitude of an effect: `-0.0154 ± 0.00014`, with its unit where it has one."""
-    return _estimate(e.parameters["amplitude"])
-
-
-def _estimate(found: ParameterEstimate) -> str:
+    found = e.parameters["amplitude"]
     return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
 
 
@@ -716,13 +712,11 @@ def copied_rows(rows: tuple[int, ...]) -> str:
     return f"rows {', '.join(map(str, rows))} are exact copies of earlier ones and count once"
 
 
-def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
-    """Rows that do not count."""
-    reasons = {
-        "unusable": "are not used, because the fit slides or fails there",
-        "outliers": "are outliers that no effect explains, and are left out",
-    }
-    return f"rows {', '.join(map(str, rows))} {reasons[why]}"
+#: Reasons why rows do not count.
+UNUSED = {
+    "unusable": "are not used, because the fit slides or fails there",
+    "outliers": "are outliers that no effect explains, and are left out",
+}
 
 
 def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
@@ -765,23 +759,6 @@ def sentence_on_single_run(
     )
 
 
-def sentence_on_different_run(test: loop_notes.NameTest) -> str:
-    """Sentence on a run of a log that is just different, with the effect that explains less."""
-    different = _changed_constant(test.changed, test.row)
-    explained = f"explains {test.root_changed:.1f} σ, {test.effect} {test.root:.1f} σ"
-    return f"{different} {explained}. Check what was different in that run, or repeat it"
-
-
-def unwritten_reason(curve: bool, gain: float, se: float) -> str:
-    """Reason why identified effects are not in the written robot."""
-    subject = "the curve" if curve else "what was found"
-    how = "no better than" if curve and gain > 0 else "worse than"
-    return (
-        f"{subject} predicts held-out runs {how} the refit (log likelihood {gain:+.2f} ± {se:.2f} per reading), "
-        "so robot.toml is the refit"
-    )
-
-
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "assumed_noise": "the noise of {channels} is not given, so {usual} is assumed. Set yours with --noise",
@@ -791,7 +768,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         "the {word} noise weights some readings too much. State it with --noise"
     ),
     "copies": copied_rows,
-    "kept_out": sentence_on_unused_rows,
+    "kept_out": lambda rows, why: f"rows {', '.join(map(str, rows))} {UNUSED[why]}",
     "phases_differ": (
         "the phase of the wave differs between runs, so robot.toml has the mean. The wave explains {free:.0f} "
         "σ² with a phase for each run, {held:.0f} σ² with one. Start every run at the same shaft angle"
@@ -809,10 +786,17 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "too_few_replicates": "{settled} bootstrap tables are too few for some evidence. Use --replicates 500",
     "rests_on": sentence_on_single_run,
-    "run_differs": sentence_on_different_run,
+    "run_differs": lambda test: (
+        f"{_changed_constant(test.changed, test.row)} explains {test.root_changed:.1f} σ, {test.effect} "
+        f"{test.root:.1f} σ. Check what was different in that run, or repeat it"
+    ),
     "contradicted": (
         "a simulation explains {gained:.0%} of the misfit, not {promised:.0%} as the equations do, so the claim "
         "is one level lower"
     ),
-    "unwritten": unwritten_reason,
+    "unwritten": lambda curve, gain, se: (
+        f"{'the curve' if curve else 'what was found'} predicts held-out runs "
+        f"{'no better' if curve and gain > 0 else 'worse'} than the refit (log likelihood {gain:+.2f} ± {se:.2f} per "
+        "reading), so robot.toml is the refit"
+    ),
 }

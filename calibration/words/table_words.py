@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from calibration.data import Names
 from calibration.data.input_errors import rows_text
@@ -57,22 +57,20 @@ def differing_repeats(
         f"apart{f' (and {more} more such pairs)' * bool(more)}"
     )
     if unused:
-        many = len(unused) > 1
         name = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
-        return (
-            f"{reading}. {', '.join(unused)} {'vary' if many else 'varies'} between these rows and "
-            f"{'are' if many else 'is'} not used. Therefore {name}, or, for a load, give each level its own "
-            "configuration"
-        )
+        return f"{reading}. {_unused(unused)}. So {name}, or, for a load, give each level its own configuration"
     wrong = f"{reading}. Remove the wrong row"
     return f"{wrong}, or find what changed between these rows and has no column" if more else wrong
 
 
+def _unused(names: Sequence[str]) -> str:
+    vary, are = ("vary", "are") if len(names) > 1 else ("varies", "is")
+    return f"{', '.join(names)} {vary} from row to row and {are} not used"
+
+
 def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
     """Columns that vary and have no role, and what each may be."""
-    names = [name for name, _ in columns]
-    vary, are = ("vary", "are") if len(names) > 1 else ("varies", "is")
-    sentences_unused = [f"{source}: {', '.join(names)} {vary} from row to row and {are} not used"]
+    sentences_unused = [f"{source}: {_unused([name for name, _ in columns])}"]
     for name, near in columns:
         if near:
             sentences_unused.append(f'If {name} is {near}, set [columns] {near} = "{name}" in the robot\'s file')
@@ -81,12 +79,7 @@ def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
 
 def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> str:
     """Runs of one condition."""
-    vary, are, them, if_conditions = (
-        ("vary", "are", "them", "they are conditions")
-        if len(unused) > 1
-        else ("varies", "is", "it", "it is a condition")
-    )
-    name = f"{', '.join(unused)} {vary} and {are} not used. Name {them} under [columns] if {if_conditions}, or "
+    name = f"{_unused(unused)}. Name conditions under [columns], or "
     record = f"{'r' if unused else 'R'}ecord runs at several values of {column} or at several loads"
     return f"{source}: these {rows} runs differ only by noise. {name * bool(unused)}{record}"
 
@@ -99,15 +92,6 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     if tied:
         return f"{sentence}. If it is computed, remove it: the noise of {other} would count twice"
     return f"{sentence}, so it is computed. Measure it, or remove it from the channels"
-
-
-def sentence_on_short_histories(runs: Names, lasts: float, share: float) -> str:
-    """Histories that end before the robot is under way."""
-    at_speed = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
-    return (
-        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}, before the speed is steady, "
-        "so only priors determine the resistance to travel. Record longer"
-    )
 
 
 def _runs(names: Names, one: str, several: str) -> str:
@@ -180,7 +164,11 @@ SAID: dict[str, str | Callable[..., str]] = {
         )
         + " at the output) in the load's table of the robot file"
     ),
-    "ends_early": sentence_on_short_histories,
+    "ends_early": lambda runs, lasts, share: (
+        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest"
+        f"{'' if math.isnan(share) else f', at {share:.0%} of the speed of steady travel'}, before the speed is "
+        "steady, so only priors determine the resistance to travel. Record longer"
+    ),
     "never_grips": lambda runs, share: (
         f"{_runs(runs, 'slides', 'slide')} to the end, at {share:.0%} of the speed of the tracks or wheels. Such "
         "runs do not measure static friction"

@@ -76,7 +76,12 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     for column in source.stated:
         if column in beside.stated:
             raise BadConfiguration(f"{OPTIONS[column]}: {source.source} contains {column} too; keep one of the two")
-    _check_battery_charge(robot, config)
+    capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
+    if config.battery and config.discharge_mAh >= capacity:
+        raise BadConfiguration(
+            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
+            "mission"
+        )
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
         if beside.runs is not None and runs.has(column):
@@ -130,15 +135,6 @@ def _conditions_of_runs(
     tracks = robot.configurations.tracked[np.asarray(conditions.configuration)]
     lateral = [lateral_ratio(str(s), t) for s, t in zip(runs[profiles.SURFACE], tracks, strict=True)]
     return dataclasses.replace(conditions, adhesion_lateral=jax.numpy.asarray(lateral))
-
-
-def _check_battery_charge(robot: Robot, config: configuration.Simulate) -> None:
-    capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
-    if config.battery and config.discharge_mAh >= capacity:
-        raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
-            "mission"
-        )
 
 
 def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:

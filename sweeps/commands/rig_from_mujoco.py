@@ -11,11 +11,19 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.input_files import VALUE, check_memory, file_bytes, first_bytes
 from calibration.data.named_arrays import cell_number
-from mmrjax.errors import list_some
-from sweeps.commands.rig_numbers import Found, JointNumbers, StatedNumber, hanging_torque_and_angle, is_round
+from sweeps.commands.rig_numbers import (
+    LEVEL,
+    Found,
+    JointNumbers,
+    StatedNumber,
+    choose_joint,
+    equal_wheels,
+    hanging_torque_and_angle,
+    is_round,
+)
 from sweeps.export import mujoco
 
 #: Largest model file that is read [bytes].
@@ -32,8 +40,6 @@ SIZES = {
 }  # fmt: skip
 #: Most copies of an element, most elements including copies, and largest product of the sizes of an element.
 MOST_COPIES, MOST_ELEMENTS, MOST_CELLS = 2_000, 50_000, 2**24
-#: Largest vertical component of a wheel axis, and largest relative difference between radii of equal wheels.
-LEVEL, EQUAL = 0.1, 0.01
 
 
 def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
@@ -147,18 +153,9 @@ class _MujocoModel:
     def _chosen(self, joint: str | None) -> int:
         model, hinge = self.model, int(self.library.mjtJoint.mjJNT_HINGE)
         hinges = [k for k in range(model.njnt) if model.jnt_type[k] == hinge and self.joints[k]]
-        driven = [k for k in hinges if k in self.actuators] or hinges
-        if joint is None:
-            if len(driven) != 1:
-                finding = f"has {list_some(self.joints[k] for k in driven)}" if driven else "has no named hinge"
-                raise BadConfiguration(f"--joint: missing, and {self.file} {finding}; expected the name of one joint")
-            return driven[0]
         hinge_names = [self.joints[k] for k in hinges]
-        if joint not in self.joints:
-            raise BadConfiguration(
-                f"--joint: got {joint}; {self.file} has no such joint; "
-                f"{allowed_words(joint, hinge_names) if hinge_names else 'the file has no named hinge'}"
-            )
+        driven = [self.joints[k] for k in hinges if k in self.actuators]
+        joint = choose_joint(joint, self.joints, hinge_names, driven, self.file, "named hinge")
         if joint not in hinge_names:
             raise BadConfiguration(f"--joint: got {joint}, a slide or free joint; expected a hinge")
         return self.joints.index(joint)
@@ -188,7 +185,7 @@ class _MujocoModel:
         return JointNumbers(
             self.file, self.joints[joint], rolls,
             mass=(float(model.body_subtreemass[root]), "mass of its body tree"),
-            sides=self._sides(joint, radius) if rolls else None, radius=radius,
+            sides=self._sides(joint, radius[0]) if rolls and radius is not None else None, radius=radius,
             inertia=(inertia, f"{joint_words}, inertia that turns with it, without armature"),
             ratio=(gear, f"{joint_words}, gear of its actuator") if gear > 1 or drive else None,
             friction=value_and_source(model.dof_frictionloss[dof], "frictionloss"),
@@ -231,18 +228,12 @@ class _MujocoModel:
                 radii.append((collides, radius, " ".join(filter(None, ("geom", geom_name, f"({shape})")))))
         return max(radii)[1:] if radii else None
 
-    def _sides(self, joint: int, radius: Found | None) -> Found | None:
-        """Number of driven wheels with the same radius and a parallel axis, including this one."""
-        if radius is None:
-            return None
-        equal, driven = [], joint in self.actuators
-        for k, name in enumerate(self.joints):
-            if self.model.jnt_type[k] != self.model.jnt_type[joint] or (k in self.actuators) != driven:
-                continue
-            other, along = self._radius(k), abs(float(self.data.xaxis[k] @ self.data.xaxis[joint]))
-            if other is not None and abs(other[0] / radius[0] - 1) <= EQUAL and along > 1 - EQUAL:
-                equal.append(name or "one without a name")
-        return len(equal), f"equal wheels: {', '.join(equal)}"
+    def _sides(self, joint: int, radius: float) -> Found:
+        """Number of driven wheels like that of a joint, including its own."""
+        kinds, driven = self.model.jnt_type, joint in self.actuators
+        alike = [k for k in range(len(kinds)) if kinds[k] == kinds[joint] and (k in self.actuators) == driven]
+        axes = self.data.xaxis
+        return equal_wheels(radius, axes[joint], ((self.joints[k], self._radius(k), axes[k]) for k in alike))
 
 
 def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, StatedNumber]:

@@ -8,23 +8,27 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
+from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax.errors import list_some
 from mmrjax.model.signals import GRAVITY
-from sweeps.commands.rig_numbers import Found, JointNumbers, hanging_torque_and_angle, is_round
+from sweeps.commands.rig_numbers import (
+    LEVEL,
+    Found,
+    JointNumbers,
+    choose_joint,
+    equal_wheels,
+    hanging_torque_and_angle,
+    is_round,
+)
 
 #: Joint types that turn.
 TURNS = ("revolute", "continuous")
 #: Name of a fixed root link.
 FIXED_ROOT = "world"
-#: Largest vertical component of a wheel axis.
-LEVEL = 0.1
 #: Names of a transmission's reduction in ROS 1 and ROS 2.
 REDUCTIONS = ("mechanicalReduction", "mechanical_reduction")
 #: Smallest inertia of rotating parts [kg·m²]. Smaller values are rounding errors of rotations.
 LEAST_INERTIA = 1e-12
-#: Largest relative difference between radii of equal wheels.
-EQUAL = 0.01
 
 #: Rotation, shape (3, 3), and position [m], shape (3,).
 Pose = tuple[np.ndarray, np.ndarray]
@@ -86,21 +90,13 @@ class _UrdfRobot:
             BadConfiguration: the joint is unknown, fixed, or slides.
         """
         turning = [name for name, element in self.joints.items() if element.get("type") in TURNS]
-        candidates = [name for name in turning if self._driven(name)] or turning
-        if joint is None:
-            if len(candidates) != 1:
-                finding = f"has {list_some(candidates)}" if candidates else "has no joint that turns"
-                raise BadConfiguration(f"--joint: missing, and {self.file} {finding}; expected the name of one joint")
-            return candidates[0]
-        if joint not in self.joints:
-            raise BadConfiguration(
-                f"--joint: got {joint}; {self.file} has no such joint; {allowed_words(joint, turning)}"
-            )
+        driven = [name for name in turning if self._driven(name)]
+        joint = choose_joint(joint, self.joints, turning, driven, self.file, "joint that turns")
         if joint not in turning:
             kind = self.joints[joint].get("type") or "without a type"
             advice = "; for a carriage: mmrjax rig new --kind linear" if kind == "prismatic" else ""
             raise BadConfiguration(f"--joint: got {joint}, which is {kind}; expected one that turns: "
-                                   f"{list_some(candidates) or 'the file has none'}{advice}")  # fmt: skip
+                                   f"{list_some(driven or turning) or 'the file has none'}{advice}")  # fmt: skip
         return joint
 
     def numbers(self, joint: str) -> JointNumbers:
@@ -128,10 +124,11 @@ class _UrdfRobot:
         weight = None if rolls else _hanging_weight(to_root[0].T @ [0.0, 0.0, -GRAVITY], axis, moment)
         return JointNumbers(
             self.file, joint, rolls,
-            mass=self._mass(), sides=self._sides(joint, radius) if rolls else None, radius=radius,
+            mass=self._mass(), 
+            sides=self._sides(joint, radius[0]) if rolls and radius is not None else None, radius=radius,
             inertia=(inertia, f"{named}, <inertia> about the axis"), ratio=self._ratio(joint),
             friction=self._dynamics(element, "friction"), damping=self._dynamics(element, "damping"),
-            armature=self._armature(joint),
+            armature=self._dynamics(element, "armature"),
             weight=None if weight is None else (weight[0], f"{named}, <mass> and its lever"),
             angle=None if weight is None else (weight[1], f"{named}, hanging position"),
         )  # fmt: skip
@@ -235,17 +232,14 @@ class _UrdfRobot:
                 return max(radii)
         return None
 
-    def _sides(self, joint: str, radius: Found | None) -> Found | None:
-        """Number of driven wheels with the same radius and a parallel axis, including this one."""
-        axis = self._to_root(joint)[0][0] @ self._axis(joint)
-        equal = []
-        for name, element in self.joints.items():
-            if element.get("type") not in TURNS or self._driven(name) != self._driven(joint) or radius is None:
-                continue
-            other, other_axis = self._radius(name), self._to_root(name)[0][0] @ self._axis(name)
-            if other is not None and abs(other[0] / radius[0] - 1) <= EQUAL and abs(axis @ other_axis) > 1 - EQUAL:
-                equal.append(name)
-        return len(equal), f"equal wheels: {', '.join(equal)}"
+    def _sides(self, joint: str, radius: float) -> Found:
+        """Number of driven wheels like that of a joint, including its own."""
+        axes = {
+            name: self._to_root(name)[0][0] @ self._axis(name)
+            for name, element in self.joints.items()
+            if element.get("type") in TURNS and self._driven(name) == self._driven(joint)
+        }
+        return equal_wheels(radius, axes[joint], ((name, self._radius(name), axis) for name, axis in axes.items()))
 
     def _transmissions(self, joint: str) -> Iterator[Element]:
         for element in self.root.iter("transmission"):
@@ -278,15 +272,9 @@ class _UrdfRobot:
         return None
 
     def _dynamics(self, joint: Element, key: str) -> Found | None:
-        unit = {"friction": "N·m"}.get(key, "N·m·s")
+        unit = {"friction": "N·m", "damping": "N·m·s", "armature": "kg·m²"}[key]
         place_words = f"joint {joint.get('name')}, <dynamics {key}>"
         value = self._number(joint.find("dynamics"), key, place_words, unit, 0.0)
-        return (value, place_words) if value else None
-
-    def _armature(self, joint: str) -> Found | None:
-        """Inertia of the rotor at the joint: attribute `armature` of `<dynamics>`."""
-        place_words = f"joint {joint}, <dynamics armature>"
-        value = self._number(self.joints[joint].find("dynamics"), "armature", place_words, "kg·m²", 0.0)
         return (value, place_words) if value else None
 
     # --- cells

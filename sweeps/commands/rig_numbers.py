@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib import resources
 
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words, parse_number, three_digits
 from calibration.data.stated import HEADER
+from mmrjax.errors import list_some
 
 #: Number, and the element of the model that states it.
 Found = tuple[float, str]
@@ -19,6 +20,8 @@ Found = tuple[float, str]
 #: Kinds of rig on the ground, and kinds for a joint that turns.
 VEHICLES = ("wheeled", "tracked")
 TURNING = (*VEHICLES, "bench", "dyno", "pendulum", "servo")
+#: Largest vertical component of a wheel axis, and largest relative difference between radii of equal wheels.
+LEVEL, EQUAL = 0.1, 0.01
 #: Smallest gravity torque that counts as an arm [N·m].
 LEAST_WEIGHT = 1e-9
 #: Largest distance between wheel centre and joint axis, as a share of the radius, and largest sine between the axes.
@@ -139,6 +142,44 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict
             source = f'{freed[name].source}; a value of 0 stays fixed, "0.0 ± 0.01" is fitted'
             freed[name] = dataclasses.replace(freed[name], source=source)
     return freed
+
+
+def choose_joint(
+    joint: str | None, names: Collection[str], turning: Sequence[str], driven: Collection[str], file: str, kind: str
+) -> str:
+    """Name of a joint of a model: the stated one, or the only driven one.
+
+    Args:
+        names, turning, driven: names of all joints, of those that turn, and of driven ones.
+        kind: joints that turn, in words.
+
+    Raises:
+        BadConfiguration: the joint does not exist, or none is stated and there is not exactly one.
+    """
+    candidates = [name for name in turning if name in driven] or turning
+    if joint is None:
+        if len(candidates) != 1:
+            finding = f"has {list_some(candidates)}" if candidates else f"has no {kind}"
+            raise BadConfiguration(f"--joint: missing, and {file} {finding}; expected the name of one joint")
+        return candidates[0]
+    if joint not in names:
+        hint = allowed_words(joint, turning) if turning else f"the file has no {kind}"
+        raise BadConfiguration(f"--joint: got {joint}; {file} has no such joint; {hint}")
+    return joint
+
+
+def equal_wheels(radius: float, axis: np.ndarray, joints: Iterable[tuple[str, Found | None, np.ndarray]]) -> Found:
+    """Number of joints with a wheel of the same radius and a parallel axis, and their names.
+
+    Args:
+        joints: name, radius of the wheel, if any, and axis of each, shape (3,).
+    """
+    equal = [
+        name or "one without a name"
+        for name, other, along in joints
+        if other is not None and abs(other[0] / radius - 1) <= EQUAL and abs(axis @ along) > 1 - EQUAL
+    ]
+    return len(equal), f"equal wheels: {', '.join(equal)}"
 
 
 def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:

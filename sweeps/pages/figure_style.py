@@ -114,7 +114,13 @@ def figure_as_svg(fig: Figure) -> str:
     if (engine := fig.get_layout_engine()) is not None:
         fig.set_dpi(72)  # of SVG
         engine.execute(fig)
-        _hide_crowded_numbers(fig)
+        # numbers of a map that overlap are hidden: they are also in a table
+        for axes in fig.axes:
+            numbers = [number for number in axes.texts if re.fullmatch(r"[-−+.\d ]+%?", number.get_text())]
+            pairs = itertools.combinations([Text.get_window_extent(number) for number in numbers], 2)
+            if axes.images and any(a.overlaps(b) and min(a.y1, b.y1) - max(a.y0, b.y0) > 2 for a, b in pairs):
+                for number in numbers:
+                    number.set_visible(False)
         fig.set_layout_engine(None)  # otherwise savefig would draw everything once more for the layout
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -122,16 +128,6 @@ def figure_as_svg(fig: Figure) -> str:
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text)
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S)
     return text.replace("'DejaVu Sans'", "'DejaVu Sans', Verdana")
-
-
-def _hide_crowded_numbers(fig: Figure) -> None:
-    """Hides the numbers of maps on which some of them overlap. They are also in a table."""
-    for axes in fig.axes:
-        numbers = [text for text in axes.texts if re.fullmatch(r"[-−+.\d ]+%?", text.get_text())]
-        pairs = itertools.combinations([Text.get_window_extent(text) for text in numbers], 2)
-        if axes.images and any(a.overlaps(b) and min(a.y1, b.y1) - max(a.y0, b.y0) > 2 for a, b in pairs):
-            for text in numbers:
-                text.set_visible(False)
 
 
 def _luminance(channels: np.ndarray) -> float:

@@ -108,7 +108,15 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
     if own_rows is not None:
         errors = variant_errors(_variants(name, rows), own_rows)
         answer = error_answer(errors)
-        blocks += [_error_table(errors), *_sliding(robot, own_rows)]
+        heads = [Column(word, "%", "{:.1f}", c.label) for c in data.channels_of_paper() for word in ("rms", "worst")]
+        error_rows = [
+            (
+                e["variant"] * (e["group"] == "all"), e["group"], f"{e['rows']} of {e['of']}",
+                *(cell for c in e["cells"] for cell in (error_cell(c["rms_percent"]), c["max_percent"])),
+            )
+            for e in errors
+        ]  # fmt: skip
+        blocks += [catalogue.table("paper.errors", error_rows, *heads), *_sliding(robot, own_rows)]
 
     def sections() -> Iterator[Section]:
         if own_rows is not None:
@@ -167,18 +175,6 @@ def error_answer(every: list[Json]) -> str:
         f"rms error against {raised['rows']} of {raised['of']} measured rows: {own_error}{few}. "
         f"The paper's own simulation: {paper_error}."
     )
-
-
-def _error_table(errors: list[Json]) -> Block:
-    heads = [Column(word, "%", "{:.1f}", c.label) for c in data.channels_of_paper() for word in ("rms", "worst")]
-    rows = [
-        (
-            e["variant"] * (e["group"] == "all"), e["group"], f"{e['rows']} of {e['of']}",
-            *(cell for c in e["cells"] for cell in (error_cell(c["rms_percent"]), c["max_percent"])),
-        )
-        for e in errors
-    ]  # fmt: skip
-    return catalogue.table("paper.errors", rows, *heads)
 
 
 def _sliding(robot: Robot, rows: data.PaperRows) -> Iterator[Block]:

@@ -135,6 +135,13 @@ def comparison_document(found: Comparison) -> Document:
     band = " Band: ±2 standard deviations of the readings." * known_sd
     errors = catalogue.figure("comparison.errors", *table, found.over, more=band)
     status = found.table["status"]
+    rows = []
+    groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one equals the total
+    for group, by_channel in groups.items():
+        for channel in found.channels:
+            e = by_channel[channel.name]
+            rms = None if is_missing(e["rms"]) else f"{e['rms']:.{channel.resolution}f} {channel.unit}"
+            rows.append((group, channel.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
     return Document(
         f"{found.robot_name} against {found.source}",
         comparison_answer(found),
@@ -150,7 +157,7 @@ def comparison_document(found: Comparison) -> Document:
                 for name, count in Counter(map(str, status)).items()
                 if name not in words.SETTLED
             ),
-            _errors_table(found),
+            catalogue.table("comparison.errors", rows),
             catalogue.note("comparison.errors-note"),
             *remarks(found.notes),
         ),
@@ -209,17 +216,6 @@ def _second_robot(found: Comparison) -> str:
         if rms_pair[c.name][0]
     ]
     return f"This robot and {found.against} on the same {count_noun(shared, 'row')}: {', '.join(parts)}."
-
-
-def _errors_table(found: Comparison) -> Table:
-    rows = []
-    groups = dict(list(found.summary.items())[: None if len(found.summary) > 2 else 1])  # one equals the total
-    for group, by_channel in groups.items():
-        for c in found.channels:
-            e = by_channel[c.name]
-            rms = None if is_missing(e["rms"]) else f"{e['rms']:.{c.resolution}f} {c.unit}"
-            rows.append((group, c.label, e["rows"], rms, e["rms_percent"], e["max_percent"], e["r2"]))
-    return catalogue.table("comparison.errors", rows)
 
 
 def _rows(found: Comparison) -> Table:

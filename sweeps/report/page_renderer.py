@@ -69,7 +69,13 @@ class FigureAlbum:
                 return
             text = figure_as_svg(figure)
         write_text(self.folder / f"{name}.svg", printable(text))
-        self.pictures[name] = Markup(_inline_svg(text, name, "scale" if has_colour_scale(figure) else ""))
+        # An SVG document as an element of a page, with the class `looks` and unique ids
+        looks = "scale" if has_colour_scale(figure) else ""
+        element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", text[text.index("<svg") :])
+        element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
+        used_ids = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
+        element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used_ids else "", element)
+        self.pictures[name] = Markup(re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element))
 
     def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
         """Draws readings over time, as a static figure with the data of an interactive one."""
@@ -78,15 +84,6 @@ class FigureAlbum:
         self.pictures[name] += Markup(
             f'<script type="application/json" data-overlay="{name}">{overlay.to_json()}</script>'
         )
-
-
-def _inline_svg(svg: str, name: str, looks: str) -> str:
-    """An SVG document as an element of a page, with the class `looks` and unique ids."""
-    element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
-    element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
-    used_ids = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
-    element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used_ids else "", element)
-    return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
 
 
 def robot_section(file: RobotFile) -> Json:
@@ -146,7 +143,18 @@ def render_page(folder: Path, album: FigureAlbum, **known: Any) -> Path:
     template = environment.get_template("document.html.j2")
     page = template.render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
-    page = _add_contents(page)
+    # Adds links to the headings before the first heading
+    links = []
+
+    def with_id(found: re.Match[str]) -> str:
+        text = re.sub("<.*?>", "", found[2])
+        name = found[1] or "section-" + re.sub(r"\W+", "-", text.lower()).strip("-")
+        links.append(f'<a href="#{name}">{text}</a>')
+        return f'<h2 id="{name}">{found[2]}</h2>'
+
+    page = _HEADING.sub(with_id, page)
+    begin = page.index("<h2")
+    page = f'{page[:begin]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[begin:]}'
     path = Path(folder) / "report.html"
     write_text(path, printable(page))
     return path
@@ -163,21 +171,6 @@ def _files_of_folder(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
 
 
 _HEADING = re.compile(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", re.S)
-
-
-def _add_contents(page: str) -> str:
-    """Adds links to the headings before the first heading."""
-    links = []
-
-    def with_id(found: re.Match[str]) -> str:
-        text = re.sub("<.*?>", "", found[2])
-        name = found[1] or "section-" + re.sub(r"\W+", "-", text.lower()).strip("-")
-        links.append(f'<a href="#{name}">{text}</a>')
-        return f'<h2 id="{name}">{found[2]}</h2>'
-
-    page = _HEADING.sub(with_id, page)
-    begin = page.index("<h2")
-    return f'{page[:begin]}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[begin:]}'
 
 
 def marked_html(text: str) -> Markup:

@@ -84,9 +84,13 @@ def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
     return signals_of_arrays(name, {path: (v.shape, v.dtype, values_in_memory(v)) for path, v in arrays.items()})
 
 
-def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:
+def _check_depth(name: str, at: str, depth: int) -> None:
     if depth > DEEPEST:
         raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
+
+
+def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:
+    _check_depth(name, at, depth)
     if isinstance(value, Mapping):
         value = _unfold_pandas_dict(value)
         if isinstance(value, list):
@@ -176,8 +180,7 @@ def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None
 
 
 def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:
-    if depth > DEEPEST:
-        raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
+    _check_depth(name, at, depth)
     for key, value in record.items():
         key_path = f"{at}.{key}" if at else str(key)
         if isinstance(value, Mapping):

@@ -152,11 +152,16 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
                 formats[topic] = [(kind, int(count or 1)) for kind, count in _FIELD.findall(fields)]
             byte = next_message
     if byte != size:
-        raise BadData(
-            f"{name}: ends within a message, at byte {byte} of {size}, as if it was cut off; copy it again, or "
-            f"keep the complete messages: head -c {byte} {name}"
-        )
+        raise _cut_off(name, "message", byte, size)
     return formats
+
+
+def _cut_off(name: str, unit: str, byte: int, size: int) -> BadData:
+    """Error of a file that ends within a message or a record."""
+    return BadData(
+        f"{name}: ends within a {unit}, at byte {byte} of {size}, as if it was cut off; copy it again, or keep the "
+        f"complete {unit}s: head -c {byte} {name}"
+    )
 
 
 def _field_count(topic: str, formats: dict[str, list[tuple[str, int]]], sizes: dict[str, int]) -> int:
@@ -235,10 +240,7 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
             begin += length
         entry, size, stamp = fields
         if begin + size > len(content):
-            raise BadData(
-                f"{name}: ends within a record, at byte {record_start} of {len(content)}, as if it was cut off; "
-                f"copy it again, or keep the complete records: head -c {record_start} {name}"
-            )
+            raise _cut_off(name, "record", record_start, len(content))
         payload, record_start = content[begin : begin + size], begin + size
         if entry == 0 and payload[:1] == bytes([START]):
             number, (title, kind) = int.from_bytes(payload[1:5], "little"), _name_and_type(payload[5:])
