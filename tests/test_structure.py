@@ -780,7 +780,6 @@ MORE_NAMES = {
     "sweeps/report/mission_report.py": 30,
     "sweeps/report/runs_report.py": 30,
     "sweeps/report/sweep_report.py": 27,
-    "sweeps/points/tasks.py": 33,
 }
 
 
