@@ -763,7 +763,7 @@ MORE_NAMES = {
     "sweeps/commands/rig_check.py": 48,
     "sweeps/commands/sensitivity.py": 36,
     "sweeps/commands/simulate.py": 37,
-    "sweeps/commands/sweep.py": 44,
+    "sweeps/commands/sweep.py": 49,
     "sweeps/commands/turn.py": 28,
     "sweeps/inputs.py": 39,
     # Reports, stores and exports show every part of a result.
@@ -772,6 +772,7 @@ MORE_NAMES = {
     "sweeps/paper/report.py": 33,
     "sweeps/points/axes.py": 28,
     "sweeps/points/run.py": 37,
+    "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
     "sweeps/report/climb_report.py": 26,
     "sweeps/report/export_report.py": 27,

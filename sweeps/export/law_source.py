@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from types import ModuleType
@@ -138,24 +138,6 @@ class LawConstant:
         return "" if self.low is None else f"{self.low:.4g} to {self.high:.4g} ({self.kind})"
 
 
-@dataclasses.dataclass(frozen=True)
-class _ArrayLibrary:
-    """Names that differ between array libraries."""
-
-    dialect: Dialect
-    imports: str
-    positive: Callable[[str], str]
-    clipped: Callable[[str, str], str]
-
-
-_JAX = _ArrayLibrary(
-    JAX, "import jax.numpy as jnp", lambda x: f"jnp.maximum({x}, 0.0)", lambda x, b: f"jnp.clip({x}, -{b}, {b})"
-)
-_TORCH = _ArrayLibrary(
-    TORCH, "import torch", lambda x: f"torch.clamp({x}, min=0.0)", lambda x, b: f"torch.clamp({x}, -{b}, {b})"
-)
-
-
 def function_arguments(symbol: Symbol) -> list[str]:
     """Arguments of the function of an expression, in addition to its parameters."""
     symbol_names = names_in(symbol)
@@ -221,196 +203,12 @@ def functions_text(joint: DriveJoint, dialect: Dialect) -> str:
     return "\n\n\n".join(texts)
 
 
-def step_lines(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
-    """Lines of one step of the law, from `state`, `command`, `joint_position`, `joint_velocity` and `dt`."""
-    circuit = joint.of("supply") + joint.of("electrical")
-    gear, track = joint.of("gearbox"), joint.of("track")
-    later = {p.name: f'memory["{p.name}"]' for p in joint.remembering}
-    inertia = _inertia_lines(joint) if joint.accelerates else []
-    rigid = not joint.loose
-    rotor, wheel = " - rotor" * (joint.accelerates and rigid), " - wheel" * joint.accelerates
-    lines = [
-        "p, angle, wheel_speed = params, joint_position, "
-        + ('state["rotor_speed"]  # of the motor\'s side' if joint.loose else "joint_velocity"),
-        *(["voltage = command"] if joint.controller is None else _controller_code(joint, library)),
-        'motor_speed = p["gearbox.ratio"] * wheel_speed',
-        f"way = {call_text(joint.of('way')[0])}",
-        "# Current of the winding: L dI/dt = U - E - U_R - ..., one implicit Euler step, linear in the current.",
-        'current = state["current"]',
-        f"left = voltage - {call_text(joint.of('back')[0])} - ({_sum_text(circuit)})",
-        f"slope = {library.positive(_sum_text(circuit, '_slope'))}",
-        f"current = current + dt * left / ({_sum_text(joint.of('inductance'))} + dt * slope)",
-    ]
-    if joint.limit is not None:
-        lines.append(
-            f"current = {library.clipped('current', 'p[' + chr(34) + 'driver.current_limit' + chr(34) + ']')}"
-        )
-    lines.append('memory = {"current": current}')
-    lines += [f'memory["{name}"] = {name}' for name in joint.controller_states]
-    if joint.remembering:
-        lines.append("# Memories: one implicit Euler step each.")
-    lines += [
-        f'memory["{p.name}"] = state["{p.name}"] + dt * {call_text(p, "_rate")} / (1.0 - dt * '
-        f"{call_text(p, '_rate_slope')})"
-        for p in joint.remembering
-        if all(a not in ("load", "pull") for a in function_arguments(p.rate or p.value))
-    ]
-    lines += [
-        f"lost = {_sum_text(circuit, '', later)}",
-        "# Torques from the winding to the wheel.",
-        f"made = {call_text(joint.of('torque')[0])}",
-        *(() if joint.loose else inertia),
-        f"at_shaft = made - ({_sum_text(joint.of('motor'), '', later)}){rotor}",
-        f"load = at_shaft - {call_text(joint.of('idle')[0])}",
-    ]
-    if joint.loose:
-        lines += [*_joint_torque_lines(joint, library, _sum_text(gear, "", later)), *inertia]
-    else:
-        lines.append(f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load')
-        lines += _fixed_point_lines("load", "through", gear, later)
-    lines += [
-        *_fixed_point_lines("pull", f"load{wheel}", track, later),
-        'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
-        f'        "lost_winding": lost * current, "lost_motor": (made - at_shaft{rotor}) * motor_speed,',
-        f'        "lost_gearbox": {"at_shaft * motor_speed - load * wheel_speed" if rigid else "lost_gearbox"},',
-        f'        "lost_output": (load{wheel} - pull) * wheel_speed}}',
-        f"return pull{' + wheel' * joint.accelerates}{f' + {ARMATURE} * acceleration' * bool(rotor)}, memory, info",
-    ]
-    return lines
-
-
-_PENDING = 'state["pending"]'
-
-
-def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
-    """Lines of the controller: the voltage for a goal, and the states after the step."""
-    imposed, controller, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
-    assert controller is not None
-    shown = {"goal_angle": "angle", "goal_speed": "joint_velocity", "goal_current": 'state["current"]'}[imposed]
-    last = (
-        '- p["controller.kd"] * joint_velocity'
-        if imposed == "goal_angle"
-        else '+ p["controller.feed_forward"] * command'
-    )
-    limit = 'p["controller.limit"]'
-    if rate := controller.rate:
-        return [
-            f"# Controller: acts every {1 / rate:g} s, in the nearest step, and holds its share of the supply.",
-            f"error = command - {shown}",
-            f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
-            f"demanded = {library.clipped('wanted', limit)}",
-            f'due, limited = state["clock"] < 0.5 * dt, ({prefix}.abs(demanded) >= {limit}) & (demanded * error > 0)',
-            f'integral = state["integral"] + {prefix}.where(due & ~limited, error, 0.0 * error) / {rate!r}',
-            f'duty = {prefix}.where(due, {_PENDING if controller.samples_late else "demanded"}, state["duty"])',
-            *([f"pending = {prefix}.where(due, demanded, {_PENDING})"] if controller.samples_late else []),
-            f'clock = {prefix}.where(due, state["clock"] + {1 / rate!r}, state["clock"]) - dt',
-            f'voltage = p["{SUPPLY}"] * duty',
-        ]
-    return [
-        "# Controller: share of the supply's voltage. At its limit, it integrates no error that drives it further.",
-        f"error = command - {shown}",
-        f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
-        f"demanded = {library.clipped('wanted', limit)}",
-        f'integral = state["integral"] + dt * {prefix}.where(({prefix}.abs(demanded) >= {limit}) & '
-        f"(demanded * error > 0), 0.0 * error, error)",
-        *(
-            [
-                'duty = state["duty"] + (demanded - state["duty"]) * dt / (p["controller.lag"] + dt)',
-                f'voltage = p["{SUPPLY}"] * duty',
-            ]
-            if controller.lags
-            else [f'voltage = p["{SUPPLY}"] * demanded']
-        ),
-    ]
-
-
-def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) -> list[str]:
-    """Lines of the torque between motor and load (`Shaft.torque_joint`), one implicit Euler step of the motor's side.
-
-    Args:
-        lost: text of the losses by gearbox effects.
-    """
-    value = lambda name: f"p[{quoted(f'{joint.configuration}.{name}')}]"  # noqa: E731
-    if joint.load.stiffness > 0:
-        elastic = [f"stiffness, damping = {value('stiffness')}, {value('damping')}"]
-    else:
-        elastic = [
-            f"reduced = inertia * {value('inertia')} / (inertia + {value('inertia')})",
-            f"stiffness, damping = {FLANK_STIFFNESS!r} * reduced, {FLANK_DAMPING!r} * reduced  # of flanks",
-        ]
-    lines = [
-        "# Motor and load are two bodies: the torque that flanks or an elastic joint carry between them.",
-        f"inertia = {TURNING}",
-        *elastic,
-        "closing = wheel_speed - joint_velocity",
-        'gap = state["gap"] + dt * closing  # which opened or closed it within the last step',
-        "later = gap + dt * closing",
-    ]
-    carried = (
-        "stiffness * beyond + damping * closing"
-        if joint.load.backlash > 0
-        else "stiffness * later + damping * closing"
-    )
-    if joint.load.backlash > 0:
-        prefix = library.dialect.prefix
-        lines += [
-            f"half = 0.5 * {value('backlash')}",
-            f"beyond = later - {library.clipped('later', 'half')}",
-            # As in the model, damping starts over a tenth of the backlash, and flanks never pull.
-            f"share = {library.clipped(f'{prefix}.abs(beyond) / (0.2 * half + 1e-4)', '1.0')}",
-            f"stiffness, damping = {prefix}.where(beyond != 0, stiffness, 0.0 * stiffness), share * damping",
-        ]
-        carried = f"{prefix}.where(beyond > 0, {library.positive(carried)}, -{library.positive(f'-({carried})')})"
-    ratio, idle = 'p["gearbox.ratio"]', call_text(joint.of("idle")[0])
-    return [
-        *lines,
-        f"drive = {ratio} * load",
-        f"load = {carried}",
-        f"passed = {call_text(joint.of('efficiency')[0])}",
-        f"lost_gear = {lost}",
-        f"lost_gearbox = ({ratio} * {idle} + (1.0 / passed - 1.0) * load + lost_gear) * wheel_speed",
-        "give = (dt * stiffness + damping) / passed",
-        "turning = dt * (drive - load / passed - lost_gear) / (inertia + dt * give)",
-        "load = load + passed * give * turning",
-        'memory["gap"], memory["rotor_speed"] = gap, wheel_speed + turning',
-        "wheel_speed = joint_velocity",
-        f"way = {call_text(joint.of('way')[0])}",
-    ]
-
-
-def _inertia_lines(joint: DriveJoint) -> list[str]:
-    """Lines for the torques that accelerate rotor and wheel. The joint contains their inertia, but losses by torque
-    do not.
-
-    As in the model, the gearbox transmits the torque that remains after the rotor. Its sign is the direction of
-    power.
-    """
-    wheel = [f"p[{quoted(f'{joint.configuration}.inertia')}]", *map(call_text, joint.of("inertia"))]
-    return [
-        "# Torques that accelerate rotor and wheel, by the acceleration of the last step.",
-        'acceleration = (wheel_speed - state["speed"]) / dt',
-        'memory["speed"] = wheel_speed',
-        *(() if joint.loose else ['rotor = p["motor.inertia"] * p["gearbox.ratio"] * acceleration']),
-        f"wheel = ({' + '.join(wheel)}) * acceleration",
-    ]
-
-
 #: Inertia of the rotor at the output: J i² η or J i² / η, depending on the direction of power. With their mean as the
 #: joint's armature, the remaining torque lags by a step and is stable at any load.
-TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
-ARMATURE = f'{TURNING} * 0.5 * (p["gearbox.efficiency_load"] + 1.0 / p["gearbox.efficiency_load"])'
-
-
-def _fixed_point_lines(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
-    """Lines that find x with x + losses(x) = given."""
-    if not any(p.by for p in parts):
-        return [f"{name} = {given} - ({_sum_text(parts, '', later)})" if parts else f"{name} = {given}"]
-    residual_text = f"({name} + {_sum_text(parts, '', later)} - ({given}))"
-    return [
-        f"{name} = {given}",
-        f"for _ in range({TORQUE_STEPS}):  # a loss that depends on the torque itself",
-        f"    {name} = {name} - {residual_text} / (1.0 + {_sum_text(parts, '_slope', later)})",
-    ]
+ARMATURE = (
+    'p["motor.inertia"] * p["gearbox.ratio"] ** 2 * 0.5 * '
+    '(p["gearbox.efficiency_load"] + 1.0 / p["gearbox.efficiency_load"])'
+)
 
 
 def constants_text(constants: Sequence[LawConstant]) -> str:
@@ -423,74 +221,34 @@ def constants_text(constants: Sequence[LawConstant]) -> str:
     return "\n".join([*lines, "}"])
 
 
-_DOCUMENT = '''"""One step of the drive: torque at the joint, state after the step, and what happens inside.
-
-    Args:
-        params: `PARAMS`, or with other numbers; each may be an array of the joint's shape.
-        state: from `initial_state` or the step before.
-        command: {command}.
-        joint_position: [rad]; joint_velocity: [rad/s], of the wheel or output shaft.
-        dt: length of the step [s].
-
-    Returns:
-        Torque that acts on the joint [N·m], friction included; the state; a dictionary with current [A], voltage [V],
-        motor_speed [rad/s], power taken [W] and power lost in winding, motor, gearbox and at the output [W]. Without
-        its armature: give the joint `armature(params)`.
-    """'''
-
-
 def jax_source(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = ()) -> str:
     """Source of the law in JAX."""
-    return _module_text(joint, constants, _JAX, notes)
+    return _module_text(joint, constants, JAX, notes, "import jax.numpy as jnp")
 
 
 def torch_source(
-    joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = (), imports: str = _TORCH.imports
+    joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = (), imports: str = "import torch"
 ) -> str:
     """Source of the law in PyTorch."""
-    return _module_text(joint, constants, dataclasses.replace(_TORCH, imports=imports), notes)
+    return _module_text(joint, constants, TORCH, notes, imports)
 
 
 def _module_text(
-    joint: DriveJoint, constants: Sequence[LawConstant], library: _ArrayLibrary, notes: Sequence[str]
+    joint: DriveJoint, constants: Sequence[LawConstant], dialect: Dialect, notes: Sequence[str], imports: str
 ) -> str:
-    states = ", ".join(f'"{n}": zero' for n in joint.states)
-    moving = (
-        "" if not joint.accelerates else ", and the joint's speed one step before [rad/s]: set it if the joint moves"
-    )
-    if joint.loose:
-        moving = (
-            ", gap between motor and load [rad] and speed of the motor's side [rad/s]: set this if the joint moves"
-        )
+    """The template `actuator.txt` with the parts of a joint's law."""
     goals = {"goal_angle": "angle [rad]", "goal_speed": "speed [rad/s]", "goal_current": "current [A]"}
-    goal = goals.get(joint.robot.rig.imposed)
-    volts = "voltage at the driver's output [V]: its duty times the voltage of the supply"
-    document = _DOCUMENT.replace("{command}", f"goal of the controller: {goal}" if goal else volts)
-    rotor = '0.0 * p["motor.inertia"]' if joint.loose else ARMATURE
-    armature_words = (
-        "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² (η + 1/η) / 2"
-    )
-    added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
-    body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
-    zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
-    shape_arguments = "shape=()" if library.dialect is JAX else "shape=(), device=None"
     title = f"Actuator of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     wrapped_notes = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
-    header = _docstring(f"{title}\n\n{wrapped_notes}\n")
-    return (
-        f"{header}\n\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
-        f"{functions_text(joint, library.dialect)}\n\n\n"
-        f"def armature(params):\n"
-        f'    """{armature_words}, for the joint\'s own armature [kg·m²]."""\n'
-        f"    p = params\n"
-        f"    return {rotor}{added}\n\n\n"
-        f"def initial_state({shape_arguments}):\n"
-        f'    """State at rest: current [A], memories of effects{moving}."""\n'
-        f"    zero = {zero}\n"
-        f"    return {{{states}}}\n\n\n"
-        f"def actuator(params, state, command, joint_position, joint_velocity, dt):\n"
-        f"    {document}\n{body}\n"
-    )
+    early = [p for p in joint.remembering if not {"load", "pull"} & {*function_arguments(p.rate or p.value)}]
+    return filled_template(
+        "actuator.txt", joint=joint, jax=dialect is JAX, header=_docstring(f"{title}\n\n{wrapped_notes}\n"),
+        imports=imports, constants=constants_text(constants), functions=functions_text(joint, dialect),
+        controller=joint.controller, imposed=joint.robot.rig.imposed, goal=goals.get(joint.robot.rig.imposed),
+        call=call_text, total=_sum_text, own=lambda name: f"p[{quoted(f'{joint.configuration}.{name}')}]",
+        later={p.name: f'memory["{p.name}"]' for p in joint.remembering}, remembering_early=early,
+        armature=ARMATURE, torque_steps=TORQUE_STEPS, flank_stiffness=FLANK_STIFFNESS, flank_damping=FLANK_DAMPING,
+    )  # fmt: skip
 
 
 def module_from_source(source: str) -> ModuleType:
