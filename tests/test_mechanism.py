@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
+from calibration.discovery import candidates
 from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import errors_of_ammeters
@@ -68,9 +69,11 @@ def found(monkeypatch):
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
     monkeypatch.setattr(room, "cached_hold_out_score", lambda *_: score)
     monkeypatch.setattr(room.prediction, "score_predictions", lambda *_: score)
-    monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
+    monkeypatch.setattr(room, "simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
+    monkeypatch.setattr(room, "_curves_without_blocks", lambda *_: ((), None))
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
+    monkeypatch.setattr(room, "_with_ammeter_families", lambda beside, found, settings: found)
     monkeypatch.setattr(room, "_linear_gain_of_curve", lambda *_: Gain(1.0, 0.1))
     differs = [(None, "", 0.0)]
     monkeypatch.setattr(room, "changed_run", lambda *_: differs[0])
@@ -82,10 +85,10 @@ def found(monkeypatch):
         space.bare.observe.long = space.bare.observe.over_time = long
         space.bare.observe.reads, differs[0] = reads, run
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
-        beside = SimpleNamespace(where=where, curve=drawn)
-        return room.find_mechanism(
-            space, None, fitted(explains=0.0), left, ladder, (), beside, {}, settings_for(SettledRuns)
-        )  # fmt: skip
+        beside = SimpleNamespace(
+            where=where, curve=drawn, space=space, base=fitted(explains=0.0), left=left, bases=()
+        )
+        return room.find_mechanism(beside, None, ladder, {}, settings_for(SettledRuns))
 
     return of
 
@@ -109,8 +112,11 @@ def test_two_laws_of_one_mechanism_are_one(found):
 def test_share_of_the_excess_is_no_more_than_all_where_noise_is_stated_too_large():
     bare = SimpleNamespace(observe=SimpleNamespace(noise_misfit=lambda off, counts: counts.sum()))
     space, base = SimpleNamespace(weight=np.ones((ROWS, 1)), bare=bare), fitted(explains=0.0)
-    assert room.share_of_excess(room.excess_misfit(space, base), 985.0) == pytest.approx(0.5)
-    assert room.share_of_excess(room.excess_misfit(space, dataclasses.replace(base, cost=ROWS / 2)), 20.0) == 1.0
+    assert candidates.share_of_excess(candidates.excess_misfit(space, base), 985.0) == pytest.approx(0.5)
+    assert (
+        candidates.share_of_excess(candidates.excess_misfit(space, dataclasses.replace(base, cost=ROWS / 2)), 20.0)
+        == 1.0
+    )
 
 
 def test_mechanisms_that_explain_as_much_are_both_listed(found):
@@ -213,12 +219,10 @@ def test_equations_that_act_alike_are_listed(found):
 def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     speed = np.array([1.0, 2.0, 3.0, 4.0, 2.5, 5.0])
     linear = SimpleNamespace(curve_variable=lambda place, variable: (speed, 1.0))
-    beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear))
     space = SimpleNamespace(included=np.ones(6, bool))
+    beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear), space=space)
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]
-    np.testing.assert_array_equal(
-        room._within_seen_range(space, beside, masks), [False, True, True, False, True, False]
-    )
+    np.testing.assert_array_equal(room._within_seen_range(beside, masks), [False, True, True, False, True, False])
 
 
 def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(monkeypatch):
@@ -243,8 +247,8 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     monkeypatch.setattr(room.blocks_room, "parts_of_runs", lambda _: {"half": np.arange(rows) % 4 < 2})
     data = SimpleNamespace(sd=np.full((rows, 1), 0.5))
     space = SimpleNamespace(weight=np.ones((rows, 1)), included=np.ones(rows, bool), bare=SimpleNamespace(data=data))
-    beside = SimpleNamespace(left=SimpleNamespace(linear=linear), where=SPEED, bases=())
-    got = room._linear_gain_of_curve(space, range(rows), beside)
+    beside = SimpleNamespace(left=SimpleNamespace(linear=linear), where=SPEED, bases=(), space=space)
+    got = room._linear_gain_of_curve(beside, range(rows), {})
 
     def errors(design, out):
         kept = np.append(~out, np.ones(len(design) - rows, bool))
@@ -265,4 +269,4 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     wave = SimpleNamespace(
         **vars(beside) | {"where": dataclasses.replace(SPEED, variable="order 2 of the driving shaft")}
     )
-    assert list(room._linear_gain_of_curve(space, range(rows), wave).errors) == ["part"]
+    assert list(room._linear_gain_of_curve(wave, range(rows), {}).errors) == ["part"]

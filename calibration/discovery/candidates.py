@@ -353,3 +353,34 @@ def residuals_by_channel(
     return Residuals(
         type(space.bare.observe), runs, reading[:rows], whitened, counts, jacobian, z[: jacobian.shape[1]]
     )
+
+
+def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
+    """χ² of the base fit, including priors, minus its expectation from noise (`Observer.noise_misfit`) [σ²]."""
+    counts = np.asarray(space.weight > 0)
+    return 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened_residuals(space, base), counts)
+
+
+def share_of_excess(excess: float, explained: float) -> float:
+    """Share of the excess misfit that is explained, at most 1 [-].
+
+    If the stated noise is too large, the excess is smaller than the decrease of χ².
+
+    Args:
+        excess: excess misfit, see `excess_misfit` [σ²].
+        explained: decrease of χ² [σ²].
+    """
+    return float(explained / max(excess, explained, 1e-300))
+
+
+def simulated_reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
+    """Readings of a candidate [SI], shape (rows, channels)."""
+    problem, z, active = space.fit_of(candidate.active, candidate.z)
+    return np.asarray(problem.observe.observation_at(problem, z, active).reading)
+
+
+def _whitened_residuals(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
+    """Residuals of a candidate divided by their sds, 0 for excluded readings, shape (rows, channels)."""
+    data = space.equipped.data
+    off = (simulated_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
+    return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)

@@ -188,13 +188,12 @@ def find_classes(
     jacobian, residual = map(np.asarray, (after.linear.jacobian, after.linear.residual))
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
-        within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
         family = space.library[name].family()
         for s, other, active in requests:
             rival = fits[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
             akin = space.library[other].family() == family
-            limit = within[settings.form_family if akin else settings.form]
+            limit = settings.tolerance(gain, akin)
             limit = max(limit, settings.same_parallel) if parallel else limit
             if s == slot and (rival.nearly if akin else rival.plausible) and 2 * (rival.cost - best.cost) <= limit:
                 same.append(other)
@@ -204,7 +203,7 @@ def find_classes(
         ammeter.append(ammeter_families(space, *rest, column, family, settings))
         linear = left.linear if len(best.effects) == 1 else None
         shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
-        stated_shifts.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
+        stated_shifts.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
     families = ((*families_of_members(space, same), *also) for same, also in zip(members, ammeter, strict=True))
     return Classes(
         tuple(members), tuple(stated_shifts), tuple(tuple(dict.fromkeys(f)) for f in families), (*ladder, *fitted)
@@ -248,7 +247,7 @@ def ammeter_families(
         return ()
     explained = explained_function(jacobian, residual)
     most = explained(columns)[0]
-    least = most - max(settings.same, settings.form**2 * most)
+    least = most - settings.tolerance(most)
     driver = family.partition(" that ")[2].replace("with load", "with current")
     return tuple(
         f"{place_in_words(name)} that {driver}"

@@ -1,4 +1,7 @@
-"""The closed loop as a list of stages, see `STAGES`. Each is a pure function of the results of earlier stages."""
+"""The closed loop: its stages in order, see `STAGES`.
+
+A stage computes its results from the input and from earlier results. It may also report, and compile ahead.
+"""
 
 from __future__ import annotations
 
@@ -163,7 +166,7 @@ class Stage(NamedTuple):
 def trace_verdict(given: loop_input.LoopInput, ahead: bool = False) -> verdict.LoopStages:
     """Runs the stages of the loop up to the verdict, in the order of `STAGES`.
 
-    With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
+    With `ahead`, other cores compile the programs of later stages during the fit of the base.
 
     If results with other sds are `known` for the same included rows, their bootstrap replicates are reused. In
     units of the sds, the statistics hardly depend on the sds. Logs keep their linear readings.
@@ -197,8 +200,8 @@ def trace_known_readings(given: loop_input.LoopInput) -> verdict.LoopStages | No
 
 
 def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate | None:
-    """Stages of the windows of a log with a long run. The start of its simulated fit if the windows find nothing,
-    which readings may still do. None if they do not show the states, or not this start.
+    """Stages of the windows of a log with a long run. If they find nothing, the start of a simulated fit, because the
+    readings may still find something. None if a log has no windows, or if they give no start.
     """
     if (windows := log_stages.windows_of_log(given)) is None:
         return None
@@ -216,7 +219,7 @@ def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate
 def trace_settled_runs(
     given: loop_input.LoopInput, begin: Candidate | None, screened: Screening
 ) -> verdict.LoopStages | None:
-    """Stages of the settled runs of a log that no fit describes. None for others, and if these are too few."""
+    """Stages of the settled runs of a log that no fit describes. None for other logs, and with too few such runs."""
     base = screened.base
     if given.shows_unmodelled_backlash or not base.space.bare.observe.long:
         return None
@@ -255,7 +258,7 @@ STAGES = (
           preference.choose_effects, ("chosen", "searched", "standing")),
     Stage("described", ("screened", "left", "sds", "searched", "chosen", "beside", "predicted"),
           stages.check_described, ("missed",)),
-    Stage("mechanism", ("screened", "left", "searched", "chosen", "standing", "beside", "predicted"),
+    Stage("mechanism", ("searched", "chosen", "standing", "beside", "predicted"),
           stages.trace_mechanism, ("mechanism",)),
     Stage("alternatives", ("screened", "left", "searched", "chosen"),
           stages.find_alternatives, ("searched", "alike")),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Names
-from calibration.discovery import adequacy, classes, mechanism, projection, result, search
+from calibration.discovery import adequacy, candidates, classes, projection, result, search
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import BaseCurve
@@ -48,7 +48,7 @@ def found_effects(
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
     others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, settings, found.ladder)
     gains = [2 * (c.cost - best.cost) for c in others]
-    null, excess = np.asarray(test.null.single), mechanism.excess_misfit(space, base)
+    null, excess = np.asarray(test.null.single), candidates.excess_misfit(space, base)
     effects = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
@@ -66,7 +66,7 @@ def found_effects(
                 parameters=_effect_parameters(space, best, slot, settings),
                 p_value=search.single_p_value(gains[slot], null),
                 score=float(gains[slot]),
-                share=mechanism.share_of_excess(excess, float(gains[slot])),
+                share=candidates.share_of_excess(excess, float(gains[slot])),
             )
         )
     return tuple(effects)

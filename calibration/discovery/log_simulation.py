@@ -25,7 +25,7 @@ from mmrjax.model import channels
 #: Most Gauss-Newton steps of a simulated model from its regression.
 STEPS = 5
 #: Share of what the windows promised that a simulation has to gain for the claim to stay.
-HALF = 0.5
+CONFIRMED = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class LogSimulation:
     @property
     def contradicts(self) -> bool:
         """True if the simulation gains too little of what the windows promised."""
-        return not self.gained >= HALF * self.promised
+        return not self.gained >= CONFIRMED * self.promised
 
     def diagnosis(self, fit: Candidate, windows: Diagnosis) -> Diagnosis:
         """Diagnosis with the residuals of a simulated fit, and scores of the windows.

@@ -12,11 +12,11 @@ import numpy as np
 
 from calibration.discovery import active_set, verdict
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate
+from calibration.discovery.candidates import Candidate, excess_misfit
 from calibration.discovery.log_simulation import refine_by_simulation, simulate_models
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import MissedChannel
-from calibration.discovery.mechanism import excess_misfit, find_mechanism
+from calibration.discovery.mechanism import find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
 from calibration.discovery.settings import Settings, settings_for
@@ -29,18 +29,12 @@ from calibration.inference.observers.windows import Windows, problem_of_windows
 from calibration.inference.priors import DELAY
 from calibration.inference.weak_form import fit_weak_form
 
-#: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
+#: Steps of the longest run from which windows decide the verdict of a log. A simulated fit would take minutes.
 LONG = 4000
-
-
 #: Difference of a delay from whole rows up to which a simulation begins at these [rows].
 NEAREST = 0.25
-
-
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
-
-
 #: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
 RIVALS = 3
 
@@ -61,7 +55,8 @@ def windows_of_log(given: LoopInput) -> LoopInput | None:
         return None
     bare = space.bare
     motions = [c.settled for c in bare.channels if c.zero_at_rest]
-    # With every row of an angle alone, the class of EMPS is tentative, and a pendulum leaves twice its noise.
+    # A log of an angle alone keeps its thinned rows. With all of them, the class of EMPS is only tentative, and a
+    # pendulum leaves twice its noise.
     if given.runs.log is not None and (any(motions) or not motions):
         sd = np.broadcast_to(np.median(sd, 0), runs.measured().shape)
         bare, numbers = observers.pose_problem(runs, bare.base, bare.coordinates, sd), np.arange(1, len(runs) + 1)
@@ -192,7 +187,7 @@ def best_simulated_size(
 ) -> SearchResult:  # fmt: skip
     """The search in the windows of a log with the largest set that lowers the misfit of a simulation.
 
-    Windows of many rows have the power for a second effect, whose simulation may leave more than that of the first.
+    Windows of many rows can show a second effect. In a simulation, two effects may still fit worse than one.
 
     Args: as for `smallest_confirmed`, of the windows. The noise of the simulated log is that of `space`.
     """
@@ -221,8 +216,8 @@ def _chosen_fit(traced: LoopStages) -> Candidate:
 def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
     """The fit of a log's windows with a delay of whole rows, if that is near.
 
-    A held quantity jumps at its rows. So a fast current jumps too as a function of the delay, and steps from one side
-    do not lead to the other.
+    A quantity that is held between rows jumps at each of them. So a fast current jumps when the delay crosses a row,
+    and the steps of a fit do not lead across.
     """
     coordinates, steps = given.space.coordinates.base, np.diff(given.runs.whole["time_s"])
     if DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
@@ -235,17 +230,14 @@ def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
     return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
 
 
-def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
+def _lower_if_contradicted(table: LoopInput, traced: LoopStages) -> LoopStages:
     """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
-    run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
+    run, searched, beside = traced.run, traced.searched, traced.beside
     if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
         return traced
     if traced.verdict == "mechanism" and traced.mechanism is not None:  # a curve is not simulated
         return dataclasses.replace(traced, verdict="place") if traced.mechanism.effects else traced
-    mechanism = find_mechanism(
-        screened.base.space, windows.runs, screened.base.candidate, left, searched.ladder, screened.bases, beside,
-        traced.predicted, windows.settings,
-    )  # fmt: skip
+    mechanism = find_mechanism(beside, table.runs, searched.ladder, traced.predicted, table.settings)
     level = "place" if mechanism is None or mechanism.fails else "mechanism"
     return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
 

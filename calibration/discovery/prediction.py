@@ -147,6 +147,18 @@ def score_predictions(space: CandidateSpace, runs: Runs, reading: Columns) -> He
     return score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
 
 
+def cached_hold_out_score(
+    space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted
+) -> HeldOutScore:
+    """Hold-out scores of a candidate. Its predictions come from `predicted` or are added to it."""
+    prediction_before = predicted.get(candidate_key(candidate))
+    if prediction_before is not None:
+        return score_predictions(space, runs, prediction_before)
+    score = score_candidate(space, runs, candidate)
+    predicted[candidate_key(candidate)] = score.reading
+    return score
+
+
 def smallest_predictive_set(
     space: CandidateSpace,
     runs: Runs,

@@ -102,6 +102,15 @@ class Settings:
         """Largest number of rows that may be excluded."""
         return max(int(self.outlier_share * rows), min(self.outlier_few, rows // 5))
 
+    def tolerance(self, explained: float, akin: bool = False) -> float:
+        """Decrease of χ² that an alternative may lack and still explain the data as well [σ²].
+
+        Args:
+            explained: decrease of χ² by the best explanation [σ²].
+            akin: True if both are of one family.
+        """
+        return max(self.same, (self.form_family if akin else self.form) ** 2 * explained)
+
     @property
     def family_wise_error(self) -> float:
         """Error of the test for a missing effect."""

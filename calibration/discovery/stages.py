@@ -23,7 +23,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_input import LoopInput
-from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
+from calibration.discovery.mechanism import find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import HELD_OUT
@@ -34,9 +34,7 @@ from calibration.inference.noise_factor import common_factors, noise_remarks
 
 #: Number of times that rows are screened for isolated outliers, with the effects found.
 SCREENINGS = 4
-
-
-#: Root of a score from which an effect is probably missing, before the bootstrap's result [σ].
+#: Largest root of a score above which programs of later stages are compiled before the bootstrap decides [σ].
 LIKELY = 4.0
 
 
@@ -116,7 +114,7 @@ def search_until_clean(
 
 
 def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tuple[Screening, Diagnosis]:
-    """Tests the base fit by bootstrap."""
+    """Tests the base fit by bootstrap. If an effect is probably missing, also compiles programs of later stages."""
     known_stages, weight = given.known, screened.base.space.weight
     null = (
         None
@@ -149,7 +147,7 @@ def end_without_search(
     if searched is not None:
         return None
     missed = verdict.missed_channels(screened.base.space, given.runs, sds.noise, left.linear)
-    # A rigid base that leaves only noise refutes a backlash.
+    # If the rigid model leaves only noise, there is no backlash.
     loose = given.shows_unmodelled_backlash and left.test.rejected
     word = "undescribed" if missed or loose else "none"
     return verdict.LoopStages(word, screened, left, sds, missed=missed, unused=verdict.unused_inputs(given.runs))
@@ -187,10 +185,10 @@ def check_described(
     if not missed:
         return ()
     given.progress(progress_remark("held out"))
-    refit = cached_hold_out_score(space, runs, screened.base.candidate, predicted)
+    refit = prediction.cached_hold_out_score(space, runs, screened.base.candidate, predicted)
     sets = (chosen[0] if chosen else None, searched.best, *search.best_of_each_size(searched))
     for fit in {c.key: c for c in sets if c}.values():
-        with_effects = cached_hold_out_score(space, runs, fit, predicted)
+        with_effects = prediction.cached_hold_out_score(space, runs, fit, predicted)
         if leaves := verdict.remaining_errors(space, runs, missed, refit, with_effects):
             return leaves
     unused = verdict.unused_inputs(runs)
@@ -209,27 +207,12 @@ def trace_mechanism(
     beside: BaseCurve,
     predicted: prediction.Predicted,
 ) -> loop_notes.Mechanism | None:
-    """Equation and driving variable of the discrepancy, with ammeter errors that explain the data as well. None if
-    the name of an effect is established.
-    """
+    """Equation and driving variable of the discrepancy. None if the name of an effect is established."""
     if chosen is not None and any(map(standing.established, chosen[0].effects)):
         return None
     given.progress(progress_remark("mechanism"))
-    space, linear, settings = screened.base.space, left.linear, given.settings
     ladder = [*searched.ladder, *([] if chosen is None else chosen[:1])]
-    found = find_mechanism(
-        space, given.runs, screened.base.candidate, left, ladder, screened.bases, beside, predicted, settings
-    )
-    if found is None:
-        return None
-    columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
-    columns = (
-        columns if found.effects else discrepancy.location_columns(linear, screened.bases, _location(given, beside))
-    )
-    fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    also = classes.ammeter_families(space, *fit, columns, found.families[0], settings)
-    families = tuple(dict.fromkeys((*found.families, *also)))
-    return dataclasses.replace(found, families=families, ammeter=classes.errors_of_ammeters(space, families))
+    return find_mechanism(beside, given.runs, ladder, predicted, given.settings)
 
 
 def _location(given: LoopInput, beside: BaseCurve) -> DiscrepancyLocation:

@@ -154,10 +154,13 @@ def _compare_with_curves(
 
 
 def _curve_evidence(
-    space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
+    space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str], equation: str = ""
 ) -> list[tuple[float, PlacedCurve]]:
     """Evidence of each smooth curve and wave: of one variable in any place, of two variables in the places of
     `crowded`.
+
+    Args:
+        equation: only curves in its places. Empty: in all.
     """
     included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
     known_curves = [
@@ -167,7 +170,7 @@ def _curve_evidence(
     ]
     curves = []
     for place, variable in offered:
-        if variable in known_curves:
+        if variable in known_curves and (not equation or equation_of_place(place) == equation):
             curve = smooth.fit_smooth_curve(linear, place, variable, included)
             curves.append((curve.evidence, PlacedCurve(place, (variable,))))
     project = Projection(linear)
@@ -419,9 +422,7 @@ def evidence_over_curves(
     cost = sum(
         _cost_of_effect(space, best, best.active.index(name), settings) + 2 * math.log(offered) for name in effects
     )
-    same_equation = [
-        e for e, over in _curve_evidence(space, linear, bases, set()) if equation_of_place(over.place) == equation
-    ]
+    same_equation = [evidence for evidence, _ in _curve_evidence(space, linear, bases, set(), equation)]
     return (
         2 * (without.cost - best.cost)
         - cost
@@ -530,7 +531,7 @@ def _recurrence(
             continue
         roots = _score_roots(j, e, kept_signatures)
         most = np.max(roots) ** 2
-        chosen_effects.append(np.max(roots[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
+        chosen_effects.append(np.max(roots[akin]) ** 2 >= most - settings.tolerance(most))
     return float(np.mean(chosen_effects)) if chosen_effects else 1.0
 
 
