@@ -189,7 +189,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     if controller := joint.controller:
         fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki), controller.rate))
     if joint.limit is not None:
-        fates.append(EffectFate("current limit of the driver", HELD, "forcerange"))
+        fates.append(EffectFate("current limit of the driver", HELD, "saturation"))
     return [*fates, *fates_outside_joint(joint)]
 
 
