@@ -117,12 +117,7 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         prediction.candidate_key(SimpleNamespace(active=(), z=np.ones(2))) not in predicted
     )  # another fit of the same effects
 
-    @dataclasses.dataclass
-    class Fit:
-        problem: SimpleNamespace
-        z: np.ndarray
-        active: None = None
-
+    class Fit(prediction.FittedProblem):
         def observation(self):
             return SimpleNamespace(status=np.zeros(12), reading=np.zeros((12, 2)))
 
@@ -138,7 +133,7 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         coordinates=NONE_FREE,
         observe=SimpleNamespace(blocks=("slope",), unreachable=lambda status: status > 0),
     )
-    before, after = (Fit(problem, c.z) for c in candidates)
+    before, after = (Fit(problem, c.z, None) for c in candidates)
     known = predicted[prediction.candidate_key(candidates[0])]
     kinds = predictable_blocks(runs, problem)
     found = prediction.readings_of_rows(runs, np.ones((12, 2)), kinds, before, after, known)

@@ -32,17 +32,23 @@ def held_out(before, after, kind="voltage"):
     return {kind: tuple(np.full((10, len(NAMES)), x) for x in (before, after))}
 
 
+def worse(readings):
+    """Channels of readings whose errors rise."""
+    pairs = {kind: preference.errors_on_common_rows(*x, errors) for kind, x in readings.items()}
+    return preference.worse_predictions(pairs)
+
+
 def test_an_error_that_rises_is_listed_and_said():
     readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1] = 4.72
-    found = preference.worse_predictions(readings, errors)
+    found = worse(readings)
     assert found == (WorseChannel("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
 
 
 def test_an_error_that_falls_or_stays_is_not_said():
     readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1], readings["voltage"][1][:, 2] = 4.0, 4.3 * 1.005
-    assert preference.worse_predictions(readings, errors) == ()
+    assert worse(readings) == ()
 
 
 def test_errors_are_of_the_rows_that_both_predict():
@@ -50,9 +56,9 @@ def test_errors_are_of_the_rows_that_both_predict():
     readings = held_out(4.0, 4.0)
     before, after = readings["voltage"]
     before[:2], after[:2] = np.nan, 40.0
-    assert preference.worse_predictions(readings, errors) == ()
+    assert worse(readings) == ()
     after[2:, 0] = 5.0
-    assert [(w.rows, w.before, w.after) for w in preference.worse_predictions(readings, errors)] == [(8, 4.0, 5.0)]
+    assert [(w.rows, w.before, w.after) for w in worse(readings)] == [(8, 4.0, 5.0)]
 
 
 # --- among alternatives ---------------------------------------------------------------------------------

@@ -344,7 +344,7 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
     monkeypatch.setattr("calibration.discovery.standing.bases_room.family_names", lambda _: families)
     error = rng.standard_normal((readings, 1))
     monkeypatch.setattr(
-        "calibration.discovery.score_tests.family_columns", lambda _, __, k: np.c_[error, 2 * error][:, : 2 * k]
+        "calibration.discovery.standing.family_columns", lambda _, __, k: np.c_[error, 2 * error][:, : 2 * k]
     )
     jacobian, residual = augment_with_columns(toy.linear, rng.standard_normal((readings, 2)))
     residual[:readings] += 9.0 * error[:, 0] * np.repeat(np.isin(np.arange(toy.rows), runs[2]), 3)

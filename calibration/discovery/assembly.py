@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 
 import numpy as np
 
@@ -85,6 +84,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         simulated = np.where(included[:, None], simulated, np.nan)
         return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
+    errors_held_out = {k: preference.errors_on_common_rows(*x, error) for k, x in row_readings.held_out.items()}
     ladder = () if traced.searched is None else (traced.alike or traced.searched).ladder
     cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
@@ -142,12 +142,10 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         detail=observe.detail(screened.bases, included, shown, ends),
         readings_of_rows=row_readings,
         errors_as_stated=error(row_readings.as_stated),
-        errors=errors_on_common_rows(row_readings.before, row_readings.after, error),
-        errors_held_out={
-            k: errors_on_common_rows(*error_pair, error) for k, error_pair in row_readings.held_out.items()
-        },
+        errors=preference.errors_on_common_rows(row_readings.before, row_readings.after, error),
+        errors_held_out=errors_held_out,
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
-        held_out_worse=preference.worse_predictions(row_readings.held_out, error),
+        held_out_worse=preference.worse_predictions(errors_held_out),
         alternatives_held_out=compared,
         noise={
             name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
@@ -174,14 +172,6 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
             *result_remarks.loop_remarks(assembled),
         ),
     )
-
-
-def errors_on_common_rows(
-    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], result.Errors]
-) -> tuple[result.Errors, result.Errors]:
-    """Errors of two sets of readings, over the readings that both fits predict."""
-    in_both = np.isfinite(before) & np.isfinite(after)
-    return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
 
 
 def _hold_out_gains(

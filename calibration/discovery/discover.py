@@ -15,9 +15,10 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
-from calibration.discovery import log_stages, loop_input, outliers, preference, stages, verdict
+from calibration.discovery import log_stages, loop_input, preference, stages, verdict
 from calibration.discovery.assembly import assemble_result
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.outliers import Screening
 from calibration.discovery.result import DiscoveryResult, NoiseVerdict
 from calibration.discovery.settings import FIT
 from calibration.inference import fit_notes, population
@@ -213,7 +214,7 @@ def trace_windows(given: loop_input.LoopInput) -> verdict.LoopStages | Candidate
 
 
 def trace_settled_runs(
-    given: loop_input.LoopInput, begin: Candidate | None, screened: outliers.Screening
+    given: loop_input.LoopInput, begin: Candidate | None, screened: Screening
 ) -> verdict.LoopStages | None:
     """Stages of the settled runs of a log that no fit describes. None for others, and if these are too few."""
     base = screened.base
@@ -228,7 +229,7 @@ def trace_settled_runs(
 
 
 def trace_readings(
-    given: loop_input.LoopInput, begin: Candidate | None, screened: outliers.Screening, sds: verdict.VerdictNoise
+    given: loop_input.LoopInput, begin: Candidate | None, screened: Screening, sds: verdict.VerdictNoise
 ) -> verdict.LoopStages | None:
     """Stages of the linear readings of a log about its simulated fit, and the simulation of the model that they
     choose. None for other tables, and for a log with backlash that the robot lacks.

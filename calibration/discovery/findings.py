@@ -17,11 +17,13 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
+from calibration.discovery.result import EffectRanking, RejectedCandidate
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, linearization
 from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.identifiability import held_by_prior
+from calibration.inference.linearization import amplitude_unit
 from mmrjax.effects import Effect
 from mmrjax.model import params
 from mmrjax.model.balances import BALANCES
@@ -74,7 +76,7 @@ def _effect_parameters(
     space: CandidateSpace, best: Candidate, slot: int, settings: Settings
 ) -> dict[str, result.ParameterEstimate]:
     effect, p = space.library[best.active[slot]], space.free
-    amplitude, unit = linearization.amplitude_of(effect), linearization.amplitude_unit(effect)
+    amplitude, unit = linearization.amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
     held_names = held_by_prior(best.sd)
     values = {
@@ -102,7 +104,7 @@ def _class_member(
     active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == active_names)
     position = other.active.index(name)
-    amplitude = other.amplitude[position] * linearization.amplitude_unit(space.library[name])
+    amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
     return result.ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
@@ -147,7 +149,7 @@ def unnamed_discrepancy(
 
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
-) -> tuple[tuple[result.RejectedCandidate, ...], tuple[result.RejectedCandidate, ...]]:
+) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:
     """Candidates that explain the data nearly as well as the proposal, and separately those of implausible
     size.
 
@@ -158,7 +160,7 @@ def listed_alternatives(
         cost: objective of the proposal [½σ²].
         best: the proposal, if it is a candidate.
     """
-    near: tuple[list[result.RejectedCandidate], list[result.RejectedCandidate]] = ([], [])
+    near: tuple[list[RejectedCandidate], list[RejectedCandidate]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
     for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
@@ -172,7 +174,7 @@ def listed_alternatives(
     return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> result.RejectedCandidate:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> RejectedCandidate:
     sds, sizes, why = {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
@@ -186,8 +188,8 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
             why.append(RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
-    amplitudes = {name: a * linearization.amplitude_unit(space.library[name]) for name, a in sds.items()}
-    return result.RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
+    amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
+    return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
@@ -256,30 +258,30 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
-                amplitude=amplitude * linearization.amplitude_unit(effect),
+                amplitude=amplitude * amplitude_unit(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
     return tuple(sorted(score_list, key=lambda s: (-round(s.score, 9), s.name)))
 
 
-def rank_library(space: CandidateSpace, left: adequacy.Diagnosis, settings: Settings) -> result.EffectRanking:
+def rank_library(space: CandidateSpace, left: adequacy.Diagnosis, settings: Settings) -> EffectRanking:
     """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
     test = left.test
     ranking = _rank_effects(space, left.scores, settings)
-    return result.EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
+    return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
 
 
 def rank_effects_by_weak_form(
     space: CandidateSpace, known: search.WeakFormScreening, settings: Settings
-) -> result.EffectRanking:
+) -> EffectRanking:
     """Ranking of the effects by the equations of a log in weak form, before any simulation."""
     p = search.single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     ranking = _rank_effects(space, known.scores, settings)
     shifts = parameter_shifts(space, known.base.z, known.base.z, known.base.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
-    return result.EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
+    return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 
 
 def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.RankedEffect, ...]:
@@ -287,7 +289,7 @@ def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     ranking = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
-        sd = linearization.amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
+        sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = linearization.amplitude_of(effect).spec.unit
         # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
@@ -301,9 +303,7 @@ def _plausible_amplitude_and_score(
     """Best amplitude within plausible limits [prior sds], and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     amplitude_wanted, score = float(scores.amplitude[m]), float(scores.left[m])
-    low = max(
-        -settings.plausible, linearization.amplitude_of(effect).spec.bounds[0] / linearization.amplitude_unit(effect)
-    )
+    low = max(-settings.plausible, linearization.amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
     amplitude = min(max(amplitude_wanted, low), settings.plausible)
     return amplitude, float(scores.single[m] ** 2 - ((amplitude_wanted - amplitude) * score) ** 2)
 

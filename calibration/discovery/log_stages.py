@@ -20,11 +20,13 @@ from calibration.discovery.mechanism import excess_misfit, find_mechanism
 from calibration.discovery.outliers import Screening
 from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate
 from calibration.discovery.settings import Settings, settings_for
-from calibration.inference import observers, priors
+from calibration.discovery.verdict import LoopStages
+from calibration.inference import observers
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.observers.linear_rows import problem_of_readings
 from calibration.inference.observers.windows import Windows, problem_of_windows
+from calibration.inference.priors import DELAY
 from calibration.inference.weak_form import fit_weak_form
 
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
@@ -112,8 +114,8 @@ def readings_of_log(given: LoopInput, screened: Screening, sds: verdict.VerdictN
 
 
 def confirm_readings(
-    given: LoopInput, readings: LoopInput, screened: Screening, sds: verdict.VerdictNoise, traced: verdict.LoopStages
-) -> verdict.LoopStages:
+    given: LoopInput, readings: LoopInput, screened: Screening, sds: verdict.VerdictNoise, traced: LoopStages
+) -> LoopStages:
     """Stages of a log's linear readings after the simulation of the model that they choose.
 
     Args:
@@ -139,7 +141,7 @@ def confirm_readings(
     if not confirmed.rejected and traced.screened.cluster is None:
         left = dataclasses.replace(traced.left, test=confirmed)
         none = dataclasses.replace(run, best=run.base, promised=0.0, gained=0.0)
-        return verdict.LoopStages("none", traced.screened, left, traced.sds, run=none)
+        return LoopStages("none", traced.screened, left, traced.sds, run=none)
     return _lower_if_contradicted(readings, traced)
 
 
@@ -207,7 +209,7 @@ def best_simulated_size(
     return dataclasses.replace(searched, best=best, diagnosis=diagnosis)
 
 
-def _chosen_fit(traced: verdict.LoopStages) -> Candidate:
+def _chosen_fit(traced: LoopStages) -> Candidate:
     """Fit of the verdict: the proposal, or else the best set of its mechanism."""
     base, searched, mechanism = traced.screened.base.candidate, traced.searched, traced.mechanism
     if searched is None or traced.best is not base:
@@ -223,9 +225,9 @@ def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
     do not lead to the other.
     """
     coordinates, steps = given.space.coordinates.base, np.diff(given.runs.whole["time_s"])
-    if priors.DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
+    if DELAY not in coordinates.names or given.robot.rig.between_rows == "linear":
         return fit
-    k, step = coordinates.names.index(priors.DELAY), float(np.median(steps[steps > 0]))
+    k, step = coordinates.names.index(DELAY), float(np.median(steps[steps > 0]))
     delay = float(coordinates.value(fit.z[: given.space.free])[k])
     off = round(delay / step) * step - delay
     if abs(off) > NEAREST * step:
@@ -233,7 +235,7 @@ def delayed_by_rows(given: LoopInput, fit: Candidate) -> Candidate:
     return dataclasses.replace(fit, z=fit.z + np.eye(len(fit.z))[k] * off / float(coordinates.spread[k]))
 
 
-def _lower_if_contradicted(windows: LoopInput, traced: verdict.LoopStages) -> verdict.LoopStages:
+def _lower_if_contradicted(windows: LoopInput, traced: LoopStages) -> LoopStages:
     """Stages whose claim falls by one level if the simulation gains too little of what the equations promised."""
     run, screened, left, searched, beside = traced.run, traced.screened, traced.left, traced.searched, traced.beside
     if run is None or searched is None or beside is None or not run.contradicts or traced.verdict == "place":
@@ -248,7 +250,7 @@ def _lower_if_contradicted(windows: LoopInput, traced: verdict.LoopStages) -> ve
     return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
 
 
-def confirm_windows(given: LoopInput, windows: LoopInput, traced: verdict.LoopStages) -> verdict.LoopStages | None:
+def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) -> LoopStages | None:
     """Stages of a log's windows after the simulation of the base model and of the chosen one.
 
     None if nothing is missing: in the windows, or because the simulated base leaves no more than noise or the effects
@@ -257,9 +259,9 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: verdict.LoopSt
     """
     screened, left, searched, beside = traced.screened, traced.left, traced.searched, traced.beside
 
-    def undescribed(missed: tuple[MissedChannel, ...]) -> verdict.LoopStages:
+    def undescribed(missed: tuple[MissedChannel, ...]) -> LoopStages:
         return dataclasses.replace(
-            verdict.LoopStages("undescribed", screened, left, traced.sds, searched), beside=beside, run=traced.run,
+            LoopStages("undescribed", screened, left, traced.sds, searched), beside=beside, run=traced.run,
             predicted=traced.predicted, missed=missed, unused=verdict.unused_inputs(given.runs),
         )  # fmt: skip
 

@@ -213,7 +213,17 @@ def screen_outliers(base: BaseFit, runs: Runs, settings: Settings) -> Screening:
     Args:
         runs: the runs.
     """
-    screened = _exclude_outliers(base, runs, settings)
+    allowed = settings.outliers(int(base.space.included.sum()))
+    clean, excluded = _exclude_gross_errors(base, settings, runs.source)
+    bases, diagnosis = _diagnose_base(clean, runs, settings)
+    while len(excluded) < allowed:
+        far = _isolated_rows(clean, diagnosis[1], bases, allowed - len(excluded), settings)
+        if not far.size:
+            break
+        excluded = (*excluded, *map(int, far))
+        clean = _refit_without(clean, far, settings, runs.source)
+        bases, diagnosis = _diagnose_base(clean, runs, settings)
+    screened = Screening(clean, excluded, bases, diagnosis)
     cluster_rows = np.zeros(len(base.space.included), bool)
     cluster_rows[list(screened.outliers)] = True
     together = _common_property(screened, cluster_rows, runs, settings)
@@ -265,21 +275,6 @@ def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int
     count = 1 if base.space.bare.observe.policy.one_by_one else allowed
     far = np.argsort(-alone)[: min(count, max(allowed, 0))]
     return far[(alone[far] >= level) & (alone[far] >= together)]
-
-
-def _exclude_outliers(base: BaseFit, runs: Runs, settings: Settings) -> Screening:
-    """Base fit without rows whose own shift is more significant than any effect or curve."""
-    allowed = settings.outliers(int(base.space.included.sum()))
-    base, outliers = _exclude_gross_errors(base, settings, runs.source)
-    bases, diagnosis = _diagnose_base(base, runs, settings)
-    while len(outliers) < allowed:
-        far = _isolated_rows(base, diagnosis[1], bases, allowed - len(outliers), settings)
-        if not far.size:
-            break
-        outliers = (*outliers, *map(int, far))
-        base = _refit_without(base, far, settings, runs.source)
-        bases, diagnosis = _diagnose_base(base, runs, settings)
-    return Screening(base, outliers, bases, diagnosis)
 
 
 def _diagnose_base(base: BaseFit, runs: Runs, settings: Settings) -> tuple[Bases, Diagnosed]:

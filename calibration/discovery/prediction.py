@@ -136,12 +136,8 @@ def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:
 
 def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
     """Hold-out scores of a candidate, which is refitted without each block of each kind."""
-    problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {
-        kind: predict_unseen(problem, z, list(blocks_by_name.values()), active).reading
-        for kind, blocks_by_name in blocks_room.predictable_blocks(runs, space.bare).items()
-    }
-    return score_predictions(space, runs, reading)
+    kinds = blocks_room.predictable_blocks(runs, space.bare)
+    return score_predictions(space, runs, FittedProblem(*space.fit_of(candidate.active, candidate.z)).held_out(kinds))
 
 
 def score_predictions(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
@@ -235,6 +231,13 @@ class FittedProblem:
         """Simulated observation at the fit."""
         return self.problem.observe.observation_at(self.problem, self.z, self.active)
 
+    def held_out(self, kinds: Mapping[str, Columns]) -> dict[str, Readings]:
+        """Prediction of each row by fits without its block, for each kind of block."""
+        return {
+            kind: predict_unseen(self.problem, self.z, list(blocks_by_name.values()), self.active).reading
+            for kind, blocks_by_name in kinds.items()
+        }
+
 
 def readings_of_rows(
     runs: Runs,
@@ -252,30 +255,17 @@ def readings_of_rows(
         kinds: blocks from `blocks.predictable_blocks`.
         known_before, known_after: hold-out readings, if they are already known.
     """
-    rows = len(runs)
 
     def fitted_reading(fitted: FittedProblem) -> np.ndarray:
         observation = fitted.observation()
-        unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
-        return np.where(unreachable, np.nan, np.asarray(observation.reading)[:rows])
+        unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[: len(runs), None]
+        return np.where(unreachable, np.nan, np.asarray(observation.reading)[: len(runs)])
 
-    def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
-        return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
-
-    values, labels = {}, {}
-    for kind, blocks_by_name in kinds.items():
-        masks = list(blocks_by_name.values())
-        first = held_out_reading(before, masks) if known_before is None else known_before[kind]
-        later = first
-        if after is not None:
-            later = held_out_reading(after, masks) if known_after is None else known_after[kind]
-        values[kind], labels[kind] = (first, later), tuple(blocks_by_name)
-    stated_readings, fitted = (
-        fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))),
-        fitted_reading(before),
-    )
-    later = fitted if after is None else fitted_reading(after)
-    return ReadingsOfRows(runs.measured(), sd[:rows], stated_readings, fitted, later, values, labels)
-
-
-#: Kind of block → hold-out predictions of each row, shape (rows, channels).
+    first = last = before.held_out(kinds) if known_before is None else known_before
+    if after is not None:
+        last = after.held_out(kinds) if known_after is None else known_after
+    stated, fitted = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))), fitted_reading(before)
+    return ReadingsOfRows(
+        runs.measured(), sd[: len(runs)], stated, fitted, fitted if after is None else fitted_reading(after),
+        {kind: (first[kind], last[kind]) for kind in kinds}, {kind: tuple(names) for kind, names in kinds.items()},
+    )  # fmt: skip

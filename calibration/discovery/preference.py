@@ -12,22 +12,24 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.data.runs import Runs
-from calibration.discovery import candidates, experiments, prediction, search
+from calibration.discovery import candidates, prediction, search
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.experiments import alternatives_of_class
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import NameSupport
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, Predicted
 from calibration.discovery.result import Errors, WorseChannel
+from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import judge_names
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import progress_remark
-from calibration.inference.held_out import predict_unseen
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
 TOLD = 0.01
@@ -36,20 +38,24 @@ TOLD = 0.01
 # --- before and after -----------------------------------------------------------------------------------
 
 
+def errors_on_common_rows(
+    before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
+) -> tuple[Errors, Errors]:
+    """Errors of two sets of readings, over the readings that both fits predict."""
+    in_both = np.isfinite(before) & np.isfinite(after)
+    return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
+
+
 def worse_predictions(
-    readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
+    errors: Mapping[str, tuple[Errors, Errors]],
 ) -> tuple[WorseChannel, ...]:
-    """Channels whose hold-out error rises with the effects, for each kind of block. Only rows that both fits predict
-    count.
+    """Channels whose hold-out error rises with the effects, for each kind of block.
 
     Args:
-        readings: kind of block → hold-out readings without and with the effects [SI], NaN for no prediction.
-        errors: function that returns the errors of readings, by channel.
+        errors: kind of block → hold-out errors without and with the effects, see `errors_on_common_rows`.
     """
     worse = []
-    for kind, (before, after) in readings.items():
-        in_both = np.isfinite(before) & np.isfinite(after)
-        was, now = (errors(np.where(in_both, x, np.nan)) for x in (before, after))
+    for kind, (was, now) in errors.items():
         for channel, e in now.items():
             old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
             if new > (1 + TOLD) * old:
@@ -61,29 +67,21 @@ def worse_predictions(
 
 
 def compare_alternatives(
-    space: CandidateSpace, runs: Runs, best: candidates.Candidate, alike: Classes
+    space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes
 ) -> tuple[HeldOutAlternative, ...]:
     """Hold-out errors of the best fit and of fits in which one effect is replaced by an alternative. The best fit is
     first.
 
     Implausible alternatives are omitted. Empty if no alternative remains, or if there are no blocks.
     """
-    alternatives = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
+    alternatives = [c for c in alternatives_of_class(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     if len(alternatives) < 2 or not kinds:
         return ()
-
-    def residuals_in_sds(c: candidates.Candidate, masks: list[np.ndarray]) -> np.ndarray:
-        problem, z, active = space.fit_of(c.active, c.z)
-        reading = predict_unseen(problem, z, masks, active).reading
-        return np.where(counts, (reading - measured) / sd, np.nan)
-
-    errors = [
-        {kind: residuals_in_sds(c, list(blocks_by_name.values())) for kind, blocks_by_name in kinds.items()}
-        for c in alternatives
-    ]
+    fits = [prediction.FittedProblem(*space.fit_of(c.active, c.z)).held_out(kinds) for c in alternatives]
+    errors = [{kind: np.where(counts, (x - measured) / sd, np.nan) for kind, x in fit.items()} for fit in fits]
     held_out = {
         kind: counts & np.any(list(blocks_by_name.values()), 0)[:, None] for kind, blocks_by_name in kinds.items()
     }
@@ -119,8 +117,8 @@ def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
 
 
 def prefer_by_held_out(
-    space: CandidateSpace, runs: Runs, searched: search.SearchResult, alike: Classes, bases: Bases, settings: Settings
-) -> tuple[search.SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
+    space: CandidateSpace, runs: Runs, searched: SearchResult, alike: Classes, bases: Bases, settings: Settings
+) -> tuple[SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
     """Replaces the best fit by the alternative with the smallest hold-out error, see `_order_alternatives`.
 
     An alternative with significant residuals does not replace a best fit without them.
@@ -131,7 +129,7 @@ def prefer_by_held_out(
     table = compare_alternatives(space, runs, best, alike)
     if not table:
         return searched, alike, ()
-    fitted = {c.key: c for c in experiments.alternatives_of_class(best, alike, stated=False).values()}
+    fitted = {c.key: c for c in alternatives_of_class(best, alike, stated=False).values()}
     for k in _order_alternatives(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
@@ -147,8 +145,8 @@ def prefer_by_held_out(
 
 def _classes_with_leader(
     space: CandidateSpace,
-    best: candidates.Candidate,
-    leader: candidates.Candidate,
+    best: Candidate,
+    leader: Candidate,
     alike: Classes,
     settings: Settings,
 ) -> Classes:
@@ -183,10 +181,10 @@ def choose_effects(
     given: LoopInput,
     screened: Screening,
     left: Diagnosis,
-    searched: search.SearchResult,
+    searched: SearchResult,
     beside: BaseCurve,
     predicted: Predicted,
-) -> tuple[tuple[candidates.Candidate, Diagnosis] | None, search.SearchResult, NameSupport]:
+) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
     """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
 
     The effects are those whose names are established, and those of the smallest set that predicts as well as any.

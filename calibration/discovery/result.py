@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from calibration import described
-from calibration.data import Json, Names, columns, posterior_file, robot_file, writing
+from calibration.data import Json, Names, columns, posterior_file, writing
+from calibration.data.robot_file import write_robot
 from calibration.data.runs import Runs
 from calibration.discovery import REFIT_FILE, formula, loop_notes, prediction
 from calibration.discovery.experiments import Proposal
@@ -599,10 +600,8 @@ class DiscoveryResult:
             else []
         )
         note = "\n".join([described.describe(self, "header", robot_name), *held_sentence])
-        robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
-        robot_file.write_robot(
-            self.refit, folder / REFIT_FILE, note=described.describe(self, "refit header", robot_name)
-        )
+        write_robot(self.robot, folder / "robot.toml", note=note)
+        write_robot(self.refit, folder / REFIT_FILE, note=described.describe(self, "refit header", robot_name))
         posterior_file.write_posterior(self.posterior, folder / posterior_file.FILE)
 
 

@@ -96,7 +96,11 @@ def search_effects(
             break
         progress(progress_remark("more effects", best.effects))
         more = _extend_set(space, best, diagnosis, base, left, settings)
-        best = _accept_if_better(_best_plausible(more), ladder, settings)
+        # It has to explain clearly more than every candidate with one effect fewer.
+        fewer_costs = [c.cost for c in ladder if c.plausible and len(c.effects) == len(best.effects)]
+        best = _best_plausible(more)
+        if best is not None and not 2 * (min(fewer_costs, default=np.inf) - best.cost) >= settings.needed**2:
+            best = None
         ladder += more
         if best is not None:
             fewer = refit_without_each(space, best, settings)
@@ -186,14 +190,6 @@ def _extend_set(
 def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:
     sound = [c for c in candidates if c.plausible and np.isfinite(c.cost)]
     return min(sound, key=lambda c: c.cost) if sound else None
-
-
-def _accept_if_better(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
-    """The candidate, if it explains clearly more than every candidate with one effect fewer. Otherwise None."""
-    if c is None:
-        return None
-    fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]
-    return c if 2 * (min(fewer, default=np.inf) - c.cost) >= settings.needed**2 else None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,10 +20,14 @@ from calibration.discovery import (
     verdict,
 )
 from calibration.discovery.adequacy import Diagnosis
+from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
+from calibration.discovery.outliers import Screening
+from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import HELD_OUT
+from calibration.discovery.verdict import VerdictNoise
 from calibration.inference.fit_notes import progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
@@ -36,9 +40,7 @@ SCREENINGS = 4
 LIKELY = 4.0
 
 
-def fit_base_and_noise(
-    given: LoopInput, begin: candidates.Candidate | None
-) -> tuple[outliers.Screening, verdict.VerdictNoise]:
+def fit_base_and_noise(given: LoopInput, begin: candidates.Candidate | None) -> tuple[Screening, VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
     known_stages, noise = given.known, given.noise
     screened = _fit_base(given, noise, None if known_stages is None else known_stages.screened.base, begin)
@@ -48,7 +50,7 @@ def fit_base_and_noise(
     )
     skip = screened.cluster is not None or not base.space.bare.observe.reads
     factors = {} if skip else common_factors(residuals)
-    sds = verdict.VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
+    sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
         given.progress(progress_remark("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
@@ -58,7 +60,7 @@ def fit_base_and_noise(
 
 def _fit_base(
     given: LoopInput, noise: Noise, before: candidates.BaseFit | None, begin: candidates.Candidate | None
-) -> outliers.Screening:
+) -> Screening:
     """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
     For logs, the equations in weak form give the start of the fit, and rank the library unless effects would only
@@ -85,8 +87,8 @@ def _fit_base(
 
 
 def search_until_clean(
-    given: LoopInput, screened: outliers.Screening, sds: verdict.VerdictNoise
-) -> tuple[outliers.Screening, Diagnosis, search.SearchResult | None]:
+    given: LoopInput, screened: Screening, sds: VerdictNoise
+) -> tuple[Screening, Diagnosis, SearchResult | None]:
     """Searches for effects, again whenever new outliers appear. No search if the base fits, or if the log shows
     backlash that the robot lacks.
     """
@@ -113,9 +115,7 @@ def search_until_clean(
     return screened, diagnosis, searched
 
 
-def _test_base(
-    given: LoopInput, sds: verdict.VerdictNoise, screened: outliers.Screening
-) -> tuple[outliers.Screening, Diagnosis]:
+def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tuple[Screening, Diagnosis]:
     """Tests the base fit by bootstrap."""
     known_stages, weight = given.known, screened.base.space.weight
     null = (
@@ -130,8 +130,8 @@ def _test_base(
 
 
 def _search_effects(
-    given: LoopInput, screened: outliers.Screening, left: Diagnosis
-) -> tuple[outliers.Screening, Diagnosis, search.SearchResult]:
+    given: LoopInput, screened: Screening, left: Diagnosis
+) -> tuple[Screening, Diagnosis, SearchResult]:
     """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search.search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
@@ -140,10 +140,10 @@ def _search_effects(
 
 def end_without_search(
     given: LoopInput,
-    screened: outliers.Screening,
+    screened: Screening,
     left: Diagnosis,
-    sds: verdict.VerdictNoise,
-    searched: search.SearchResult | None,
+    sds: VerdictNoise,
+    searched: SearchResult | None,
 ) -> verdict.LoopStages | None:
     """Verdict on a base without a search for effects: nothing is missing, or the model does not describe the runs."""
     if searched is not None:
@@ -157,28 +157,28 @@ def end_without_search(
 
 def confirm_search(
     given: LoopInput,
-    screened: outliers.Screening,
+    screened: Screening,
     left: Diagnosis,
-    sds: verdict.VerdictNoise,
-    searched: search.SearchResult,
-) -> search.SearchResult:
+    sds: VerdictNoise,
+    searched: SearchResult,
+) -> SearchResult:
     """The search with the set of effects that a simulation confirms, for equations of a log."""
     return searched if given.confirm is None else given.confirm(screened, left, searched, sds.noise)
 
 
-def curve_of_base(given: LoopInput, screened: outliers.Screening, left: Diagnosis) -> discrepancy.BaseCurve:
+def curve_of_base(given: LoopInput, screened: Screening, left: Diagnosis) -> BaseCurve:
     """Smooth curve of the base's discrepancy, which is fitted when it is needed."""
-    return discrepancy.BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases)
+    return BaseCurve(screened.base.space, screened.base.candidate, left, screened.bases)
 
 
 def check_described(
     given: LoopInput,
-    screened: outliers.Screening,
+    screened: Screening,
     left: Diagnosis,
-    sds: verdict.VerdictNoise,
-    searched: search.SearchResult,
+    sds: VerdictNoise,
+    searched: SearchResult,
     chosen: tuple[candidates.Candidate, Diagnosis] | None,
-    beside: discrepancy.BaseCurve,
+    beside: BaseCurve,
     predicted: prediction.Predicted,
 ) -> tuple[loop_notes.MissedChannel, ...] | verdict.LoopStages:
     """Channels that the refit misses but effects describe. Ends the loop if no set of effects describes the runs."""
@@ -201,12 +201,12 @@ def check_described(
 
 def trace_mechanism(
     given: LoopInput,
-    screened: outliers.Screening,
+    screened: Screening,
     left: Diagnosis,
-    searched: search.SearchResult,
+    searched: SearchResult,
     chosen: tuple[candidates.Candidate, Diagnosis] | None,
     standing: loop_notes.NameSupport,
-    beside: discrepancy.BaseCurve,
+    beside: BaseCurve,
     predicted: prediction.Predicted,
 ) -> loop_notes.Mechanism | None:
     """Equation and driving variable of the discrepancy, with ammeter errors that explain the data as well. None if
@@ -232,17 +232,17 @@ def trace_mechanism(
     return dataclasses.replace(found, families=families, ammeter=classes.errors_of_ammeters(space, families))
 
 
-def _location(given: LoopInput, beside: discrepancy.BaseCurve) -> DiscrepancyLocation:
+def _location(given: LoopInput, beside: BaseCurve) -> DiscrepancyLocation:
     return dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))
 
 
 def find_alternatives(
     given: LoopInput,
-    screened: outliers.Screening,
+    screened: Screening,
     left: Diagnosis,
-    searched: search.SearchResult,
+    searched: SearchResult,
     chosen: tuple[candidates.Candidate, Diagnosis] | None,
-) -> tuple[search.SearchResult, classes.Classes | None]:
+) -> tuple[SearchResult, classes.Classes | None]:
     """The search with the chosen effects, and the alternatives to each of them. None without effects."""
     if chosen is None:
         return searched, None
@@ -256,15 +256,15 @@ def find_alternatives(
 
 def reach_verdict(
     given: LoopInput,
-    screened: outliers.Screening,
-    searched: search.SearchResult,
+    screened: Screening,
+    searched: SearchResult,
     alike: classes.Classes | None,
     standing: loop_notes.NameSupport,
-    beside: discrepancy.BaseCurve,
+    beside: BaseCurve,
     mechanism: loop_notes.Mechanism | None,
 ) -> tuple[
     str,
-    search.SearchResult,
+    SearchResult,
     classes.Classes | None,
     loop_notes.NameSupport,
     DiscrepancyLocation | None,

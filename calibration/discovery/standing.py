@@ -17,13 +17,15 @@ from statistics import NormalDist
 import numpy as np
 
 from calibration.data import Names
-from calibration.discovery import projection, score_tests, smooth
+from calibration.discovery import score_tests, smooth
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import remove_effect
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
+from calibration.discovery.projection import Projection, projection_factor
+from calibration.discovery.score_tests import family_columns, statistics_with_columns
 from calibration.discovery.search import SearchResult, diagnose_candidate, refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
@@ -168,7 +170,7 @@ def _curve_evidence(
         if variable in known_curves:
             curve = smooth.fit_smooth_curve(linear, place, variable, included)
             curves.append((curve.evidence, PlacedCurve(place, (variable,))))
-    project = projection.Projection(linear)
+    project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known_curves], 2):
             evidence, _ = smooth.fit_smooth_surface(linear, place, pair, included, project)
@@ -197,7 +199,7 @@ def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Lineariz
             chosen_places.append(
                 int(instances[np.argmin(np.abs(space.library.at[instances] - best.z[p + s + slot]))])
             )
-    a, b = projection.Projection(linear)(np.asarray(linear.signatures)[:, chosen_places])
+    a, b = Projection(linear)(np.asarray(linear.signatures)[:, chosen_places])
     return float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0])
 
 
@@ -221,8 +223,8 @@ def _compare_with_single_curve(
     for index in np.argsort(-np.asarray(left.scores.curve)):
         strongest.setdefault(names[index][0], int(index))
     for k in list(strongest.values())[:ALONE]:
-        statistics, _ = score_tests.statistics_with_columns(
-            left.linear, bases, score_tests.family_columns(left.linear, bases, k), [names[k][0]]
+        statistics, _ = statistics_with_columns(
+            left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]]
         )
         if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
@@ -247,10 +249,8 @@ def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str, settings: Se
     deviate, test = np.array(seen.scores.curve), seen.test
     while test.rejected_with_margin and len(chosen_curves) < CURVES:
         chosen_curves.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
-        columns = np.concatenate([columns, score_tests.family_columns(linear, bases, chosen_curves[-1])], 1)
-        statistics, deviate = score_tests.statistics_with_columns(
-            linear, bases, columns, [places[k] for k in chosen_curves]
-        )
+        columns = np.concatenate([columns, family_columns(linear, bases, chosen_curves[-1])], 1)
+        statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen_curves])
         test = AdequacyTest(statistics, seen.test.null, settings)
     return chosen_curves
 
@@ -449,7 +449,7 @@ def _projected_columns(
     jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Squared norm of each column after projection, and its product with the residual."""
-    half = projection.projection_factor(jacobian)
+    half = projection_factor(jacobian)
     projected_residual, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
     return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ projected_residual[: len(signatures)]
 
@@ -458,7 +458,7 @@ def _augment_with_curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, curves: Sequence[int], effect: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian and residual of a fit with additional families of curves, and the sensitivities to one effect."""
-    columns = [np.zeros((linear.readings, 0)), *(score_tests.family_columns(linear, bases, k) for k in curves)]
+    columns = [np.zeros((linear.readings, 0)), *(family_columns(linear, bases, k) for k in curves)]
     own_columns = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
     return *score_tests.augment_with_columns(linear, np.concatenate(columns, 1)), own_columns
 
@@ -563,10 +563,10 @@ def changed_run(
     columns = [np.asarray(linear.jacobian)[:readings, : space.free]]
     for k, (place, _) in enumerate(bases_room.family_names(bases)):
         if place not in names:
-            columns.append(score_tests.family_columns(linear, bases, k)[:, :1])
+            columns.append(family_columns(linear, bases, k)[:, :1])
             names += [place] * columns[-1].shape[1]  # none if the readings do not show the place
     constants = np.concatenate(columns, 1)
-    half = projection.projection_factor(jacobian)
+    half = projection_factor(jacobian)
     projected_residual = residual - half.T @ (half @ residual)
     best: tuple[int | None, str, float] = None, "", 0.0
     runs = [(k, rows) for k, rows in enumerate(linear.runs()) if space.included[rows].any()]

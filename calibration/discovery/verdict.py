@@ -18,6 +18,7 @@ from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.log_simulation import LogSimulation
+from calibration.discovery.loop_notes import Headline, VerdictSummary
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, HeldOutScore, Predicted
 from calibration.discovery.search import SearchResult
@@ -139,7 +140,7 @@ class LoopStages:
         return self.searched.diagnosis
 
 
-def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> loop_notes.VerdictSummary:
+def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
     """Data of the statement of a verdict. `numbers`: row numbers as used in messages."""
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
@@ -147,7 +148,7 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> loop_notes.Verdi
     base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
-    return loop_notes.VerdictSummary(
+    return VerdictSummary(
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
@@ -187,9 +188,7 @@ def missing_effects(
     )
 
 
-def headline(
-    said: loop_notes.VerdictSummary, others: Sequence[tuple[float, loop_notes.VerdictSummary]] = ()
-) -> loop_notes.Headline:
+def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
     """The most detailed claims that the verdicts at all noise levels share.
 
     Args:
@@ -198,9 +197,9 @@ def headline(
     sentences = [said, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
     if len({_verdict_without_claim(s) for s in sentences}) > 1:
-        return loop_notes.Headline("open", (), factors)
+        return Headline("open", (), factors)
     if _verdict_without_claim(said):
-        return loop_notes.Headline(said.verdict, (), factors)
+        return Headline(said.verdict, (), factors)
     laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in sentences])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(
@@ -210,20 +209,20 @@ def headline(
             next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
         ]
         families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
-        return loop_notes.Headline("named" if alone else "class", laws, factors, (), families, values)
+        return Headline("named" if alone else "class", laws, factors, (), families, values)
     mechanisms, shared = _shared_claims([_claimed_families(s) for s in sentences])
     if mechanisms:
-        return loop_notes.Headline("mechanism", mechanisms, factors, shared)
+        return Headline("mechanism", mechanisms, factors, shared)
     places, shared = _shared_claims([_claimed_equations(s) for s in sentences])
-    return loop_notes.Headline("place", places, factors, shared)
+    return Headline("place", places, factors, shared)
 
 
-def _verdict_without_claim(said: loop_notes.VerdictSummary) -> str:
+def _verdict_without_claim(said: VerdictSummary) -> str:
     """Verdict if it claims no missing effect (`none` or `undescribed`), otherwise empty."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
-def _claimed_families(said: loop_notes.VerdictSummary) -> list[Names]:
+def _claimed_families(said: VerdictSummary) -> list[Names]:
     """Families of each established law or mechanism."""
     families = [m.families for m in said.missing if m.established]
     return (
@@ -233,7 +232,7 @@ def _claimed_families(said: loop_notes.VerdictSummary) -> list[Names]:
     )
 
 
-def _claimed_equations(said: loop_notes.VerdictSummary) -> list[Names]:
+def _claimed_equations(said: VerdictSummary) -> list[Names]:
     """Equations with a discrepancy, in words, without their variable."""
     families = _claimed_families(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
@@ -278,13 +277,16 @@ def missed_channels(
     """
     if not space.bare.observe.reads:
         return ()
+    rows = len(runs)
+    counts = space.weight[:rows] > 0
+    off = np.where(counts, np.asarray(refit.by_row())[:rows], 0.0)
+    sd, size2 = np.where(counts, noise.sd, 0.0), np.sum(np.where(counts, runs.measured(), 0.0) ** 2, 0)
+    share = np.sqrt(np.sum((off * sd) ** 2, 0)) / np.maximum(np.sqrt(size2), 1e-300)
+    sigma = np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
     has_stated_sd = np.array([source not in UNSTATED for source in noise.source])
-    share, sigma = _error_shares(space, runs, noise, refit)
     large = (share > UNDESCRIBED) & ~(has_stated_sd & (sigma <= EXPLAINED))
-    counts = space.weight[: len(runs)] > 0
-    measured_values = np.where(counts, runs.measured(), np.nan)
     with np.errstate(invalid="ignore"):
-        noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured_values**2, 0))
+        noisy = np.sqrt(np.sum(sd**2, 0) / size2)
     noisy = np.where(has_stated_sd, 0.0, noisy)
     return tuple(
         loop_notes.MissedChannel(c.name, float(share[k]), float(noisy[k]))
@@ -331,20 +333,6 @@ def _hold_out_error_shares(space: CandidateSpace, runs: Runs, *scores: HeldOutSc
     with np.errstate(invalid="ignore"):
         size = np.nansum(np.where(counts, measured_values, np.nan) ** 2, 0) / counts.sum(0)
         return np.sqrt(np.nansum(errors**2, 1) / np.isfinite(errors).sum(1) / size)
-
-
-def _error_shares(
-    space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization
-) -> tuple[np.ndarray, np.ndarray]:
-    """rms error and noise of each channel, both divided by its measured rms [-]. Only included readings count. 0 if
-    there is none.
-    """
-    rows = len(runs)
-    counts = space.weight[:rows] > 0
-    off = np.where(counts, np.asarray(fit.by_row())[:rows], 0.0)
-    size = np.sqrt(np.sum(np.where(counts, runs.measured(), 0.0) ** 2, 0))
-    error = np.sqrt(np.sum((off * np.where(counts, noise.sd, 0.0)) ** 2, 0))
-    return error / np.maximum(size, 1e-300), np.sqrt(np.sum(off**2, 0) / np.maximum(counts.sum(0), 1))
 
 
 def unused_inputs(runs: Runs) -> Names:

@@ -415,20 +415,15 @@ def order_collinearity(
     terms = np.concatenate([np.zeros((len(x), 1)), *polynomials], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
-    inner, terms_left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
+    inner, terms_left = (
+        v - (np.stack([np.bincount(level, c) for c in v.T], 1) / count[:, None])[level] for v in (terms, x[:, None])
+    )
     ways, size, _ = np.linalg.svd(inner, full_matrices=False)
     ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
     terms_left = terms_left - ways @ (ways.T @ terms_left)
     terms_used = len(count) + ways.shape[1]
     freedom = (len(x) - 1) / max(len(x) - terms_used, 1)
     return float(1 - freedom * np.sum(terms_left**2) / np.sum((x - x.mean()) ** 2))
-
-
-def _level_sums(level: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sum over the rows of each level, shape (levels, columns)."""
-    sums = np.zeros((int(level.max()) + 1, values.shape[1]))
-    np.add.at(sums, level, values)
-    return sums
 
 
 def wave_families(

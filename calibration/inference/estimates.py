@@ -11,10 +11,13 @@ from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, result, simulation_errors
+from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from calibration.inference.problem import Problem
+from calibration.inference.result import ChannelNoise, ChannelReadings, ChiSquare, Errors, Estimate, HeldOutErrors
 from calibration.inference.scans import Scan
+from calibration.inference.simulation_errors import sized_error
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
@@ -30,12 +33,12 @@ def parameter_estimates(
     posed: Problem,
     base: Robot,
     z: np.ndarray,
-    about: identifiability.Identifiability,
+    about: Identifiability,
     profile: identifiability.ProfileLikelihoods | None,
     beside: np.ndarray | None,
     sources: dict[str, str],
     scans: Mapping[int, Scan],
-) -> dict[str, result.Estimate]:
+) -> dict[str, Estimate]:
     """Estimate of each free parameter, by name.
 
     Args:
@@ -50,8 +53,8 @@ def parameter_estimates(
     point, sd = np.asarray(z), np.asarray(about.sd)
     value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
     stated = coordinates.stated
-    linear = np.stack([coordinates.value(point + side * identifiability.Z95 * sd) for side in (-1, 1)], 1)
-    wide = np.stack([coordinates.value(np.full_like(point, side * identifiability.Z95)) for side in (-1, 1)], 1)
+    linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
+    wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), params.parameters_by_name(base)
     estimates = {}
@@ -64,7 +67,7 @@ def parameter_estimates(
             is_open = scans[k].open()
             ends = [np.where(np.arange(len(z)) == k, x, point) for x in scans[k].interval()]
             interval = np.array([coordinates.value(end)[k] for end in ends])
-        estimates[name] = result.Estimate(
+        estimates[name] = Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),
             interval=_float_pair(interval),
@@ -95,13 +98,11 @@ def _float_pair(ends: np.ndarray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def channel_noise(
-    posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
-) -> dict[str, result.ChannelNoise]:
+def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
     """Source and size of the noise of each channel."""
     share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
     return {
-        name: result.ChannelNoise(
+        name: ChannelNoise(
             known.source[k],
             100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
             100 * float(shares[k]) if known.estimated[k] else None,
@@ -112,14 +113,14 @@ def channel_noise(
 
 def errors_by_channel(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
-) -> result.Errors:
+) -> Errors:
     """Errors of each channel. Arguments have shape (rows, channels)."""
-    return _channel_errors(shown, simulated, measured, sd, simulation_errors.sized_error(simulated, measured))
+    return _channel_errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
 
 def _channel_errors(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
-) -> result.Errors:
+) -> Errors:
     errors = simulation_errors.channel_errors(shown, simulated, measured, sd, percent)
     return {
         name: result.ChannelErrors(
@@ -131,10 +132,10 @@ def _channel_errors(
 
 def hold_out_errors(
     posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
-) -> result.HeldOutErrors:
+) -> HeldOutErrors:
     """Hold-out errors of all rows together and of each block."""
     percent, unreachable = (
-        simulation_errors.sized_error(held.reading, measured),
+        sized_error(held.reading, measured),
         posed.observe.unreachable(held.status),
     )
     blocks = {}
@@ -147,7 +148,7 @@ def hold_out_errors(
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
-    return result.HeldOutErrors(
+    return HeldOutErrors(
         _channel_errors(posed.channels, held.reading, measured, sd, percent),
         _row_numbers(unreachable),
         blocks,
@@ -166,25 +167,25 @@ def readings_by_channel(
     sd: np.ndarray,
     before: np.ndarray,
     after: np.ndarray,
-) -> dict[str, result.ChannelReadings]:
+) -> dict[str, ChannelReadings]:
     """Measured and simulated readings of each channel. Arguments have shape (rows, channels), NaN for missing
     readings.
     """
-    percent, sigma = simulation_errors.sized_error(after, measured), (after - measured) / sd
+    percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
-        name: result.ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
+        name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
         for k, name in enumerate(channels.channel_names(shown))
     }
 
 
 def chi_square(
-    after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: identifiability.Identifiability, known: Noise
-) -> result.ChiSquare:
+    after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
+) -> ChiSquare:
     """χ² of the finite readings, and the degrees of freedom that the fit leaves."""
     finite = np.isfinite(measured)
     misfit = np.where(finite, (after - measured) / sd, 0.0)
     freedom = float(finite.sum() - about.leverage.sum())
-    return result.ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
+    return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
 
 
 def condition_columns(observe: type[Observer], runs: Runs) -> Columns:

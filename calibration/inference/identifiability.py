@@ -202,17 +202,13 @@ def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifi
     middle = len(PROFILE_STEPS)
     at_all = np.insert(pinned, middle, centre, axis=1)
     root_all = np.insert(root, middle, 0.0, axis=1)
-    ends = np.array([_interval_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
+    # Where the signed root reaches ∓Z95, or the end points if it does not.
+    rising = np.maximum.accumulate(root_all, 1)
+    ends = np.array([np.interp([-Z95, Z95], r, a) for a, r in zip(at_all, rising, strict=True)])
     value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T
     low, high = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T)))
     is_open = np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
     return ProfileLikelihoods(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
-
-
-def _interval_ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
-    """Coordinates at which a profile's signed root reaches ∓Z95, or its end points if it does not."""
-    rising = np.maximum.accumulate(root)
-    return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))
 
 
 # --- posteriors of fits ---------------------------------------------------------------------------

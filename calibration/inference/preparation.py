@@ -14,8 +14,9 @@ from calibration.data import Names, Priors, configuration_tables, inferred_facts
 from calibration.data.runs import Runs
 from calibration.data.unused_readings import used_rows
 from calibration.described import describe
-from calibration.inference import checks, fit_notes, observers, repeats
+from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
+from calibration.inference.fit_notes import Notes, Remark
 from calibration.inference.noise import Noise
 from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE
 from mmrjax.errors import UsageError
@@ -34,7 +35,7 @@ CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 DIFFERS = 0.2
 
 
-def rows_to_fit(runs: Runs, robot: Robot, most: int) -> tuple[Runs, fit_notes.Notes]:
+def rows_to_fit(runs: Runs, robot: Robot, most: int) -> tuple[Runs, Notes]:
     """Rows that a fit uses, see `thinning.used_rows`. Of a log of two sides, its settled runs with a remark.
 
     Raises:
@@ -44,7 +45,7 @@ def rows_to_fit(runs: Runs, robot: Robot, most: int) -> tuple[Runs, fit_notes.No
     return settled_rows(runs.whole, robot, "sides") if runs.sampled and runs.turns else (runs, ())
 
 
-def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, fit_notes.Notes]:
+def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, Notes]:
     """Settled runs of a log that is not fitted over time, and a remark on them.
 
     Args:
@@ -56,11 +57,11 @@ def settled_rows(log: Runs, robot: Robot, why: str) -> tuple[Runs, fit_notes.Not
     settled = settling.settle_log(log, robot)
     source, runs, lasts, points = log.source, len(settled.kept), sum(s.lasts for s in settled.kept), settled.points
     if points < (needed := observers.SettledRuns.fewest):
-        few = fit_notes.Remark(
+        few = Remark(
             "few_points", source=source, runs=runs, lasts=lasts, points=points, needed=needed, each=settled.shortest
         )
         raise input_errors.BadData(describe(few))
-    return settled.settled_runs(), (fit_notes.Remark("settled_runs", source=source, why=why, runs=runs, lasts=lasts),)
+    return settled.settled_runs(), (Remark("settled_runs", source=source, why=why, runs=runs, lasts=lasts),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,11 +86,11 @@ class PreparedInput:
     noise: Noise
     stated: Priors
     names: Names
-    foreign: fit_notes.Notes
-    checked: fit_notes.Notes
-    begins: fit_notes.Notes
-    weighed: fit_notes.Notes
-    doubted: fit_notes.Notes = ()
+    foreign: Notes
+    checked: Notes
+    begins: Notes
+    weighed: Notes
+    doubted: Notes = ()
 
 
 def prepare_input(
@@ -100,7 +101,7 @@ def prepare_input(
     *,
     assume: bool = True,
     choose: Callable[[PreparedInput], Sequence[str]] = lambda prepared: (),
-    settled: fit_notes.Notes = (),
+    settled: Notes = (),
 ) -> PreparedInput:
     """Completes the robot from the table and checks both, before any fit.
 
@@ -146,7 +147,7 @@ def prepare_input(
     )
 
 
-def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> list[fit_notes.Remark]:
+def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> list[Remark]:
     """Remarks on parts that differ from those of the nominal robot but have the same friction. Empty for a rig
     without inheritance.
 
@@ -160,7 +161,7 @@ def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> li
     own_friction, nominal = map(values_by_name, (robot, paper_robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in paper_robots.nominal().configurations]
-    inherited: dict[str, fit_notes.Remark] = {}
+    inherited: dict[str, Remark] = {}
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
@@ -175,5 +176,5 @@ def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> li
             if abs(own_friction[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
         )
         if len(kept_priors) > len(inherited[part].kept if part in inherited else ()):
-            inherited[part] = fit_notes.Remark("inherited_priors", part=part, changed=changed, kept=kept_priors)
+            inherited[part] = Remark("inherited_priors", part=part, changed=changed, kept=kept_priors)
     return [note for note in inherited.values() if note.changed]

@@ -226,9 +226,9 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
     ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
-    pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
-    is_pinned = np.zeros(pinned.shape, bool)
-    is_pinned[:, statics] = True
+    pinned, is_pinned = np.zeros((len(ADHESIONS), len(names))), np.zeros((len(ADHESIONS), len(names)), bool)
+    for k in statics:
+        pinned[:, k], is_pinned[:, k] = [_coordinate_of_value(problem, k, x) for x in ADHESIONS], True
     fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(is_pinned)))
     free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(is_pinned.shape, bool)))
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
@@ -249,15 +249,6 @@ def _slides_at_end(problem: Problem, ends: SettledEnds) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = 1 - travelling / (circumference / float(robot.gearbox.ratio))
     return np.nan_to_num(slip) > SLIDES
-
-
-def _with_adhesion(problem: Problem, z: np.ndarray, adhesion: float) -> np.ndarray:
-    """Coordinates z with this adhesion in every configuration."""
-    z, c = z.copy(), problem.coordinates
-    for k, name in enumerate(c.names):
-        if name.endswith(STATIC):
-            z[k] = _coordinate_of_value(problem, k, adhesion)
-    return z
 
 
 def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
