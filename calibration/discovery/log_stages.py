@@ -31,16 +31,10 @@ from calibration.inference.weak_form import fit_weak_form
 
 #: Steps of its longest run from which a log's verdict comes from its windows: a fit by simulation takes minutes.
 LONG = 4000
-
-
 #: Difference of a delay from whole rows up to which a simulation begins at these [rows].
 NEAREST = 0.25
-
-
 #: Sds of a χ² above its mean up to which a simulated base leaves no more than noise.
 CHANCE = 3.0
-
-
 #: Single effects that are simulated if the best of them leaves a discrepancy in the linear readings.
 RIVALS = 3
 

@@ -34,8 +34,6 @@ from calibration.inference.noise_factor import common_factors, noise_remarks
 
 #: Number of times that rows are screened for isolated outliers, with the effects found.
 SCREENINGS = 4
-
-
 #: Root of a score from which an effect is probably missing, before the bootstrap's result [σ].
 LIKELY = 4.0
 
