@@ -466,6 +466,17 @@ def xml_of(file):
     }
 
 
+def test_current_limit_of_a_driver_is_a_saturation_that_comes_back(tmp_path):
+    """Its attribute was one that `<dcmotor>` rejects, so such a drive could not be exported to MuJoCo."""
+    rig = tmp_path / "rig.toml"
+    rig.write_text(rig_new.rig_template("bench") + "\n[driver]\ncurrent_limit = 5.0\n")
+    for name, text in xml_of(rig).items():
+        (tmp_path / name).write_text(text)
+    back = rig_new.joint_numbers(tmp_path / "scene.xml", "drive").drive
+    efficiency = float(robot_file.find_robot_file(str(rig)).robot.gearbox.efficiency_load)
+    assert back["driver.current_limit"].value == pytest.approx(5.0 * efficiency, rel=1e-6)
+
+
 LOSSES = """
 [effects.gear_quadratic_loss]
 amplitude = 0.05

@@ -224,10 +224,8 @@ def test_finished_sweep_is_not_simulated_again(sweep, monkeypatch, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "model, options",
-    [("drive", "duration_s = 0.5"), pytest.param("track", "duration_s = 0.01", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("model, options", [("drive", "duration_s = 0.5"), ("track", "duration_s = 0.01")])
 def test_every_fidelity_is_swept_over_parameters(sweep, tmp_path, model, options):
     config = (
         f'model = "{model}"\n{options}\nreport = false\nchunk = 2\n[axes]\n"motor.resistance" = [0.6, 0.9, 1.2]\n'
@@ -772,8 +770,9 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 
 
 def test_layout_counts_its_bytes_without_writing(whole, robot):
-    """Without overhead for large chunks: 9 bytes a point of one output and its status."""
-    config = Campaign(axes={"voltage": np.linspace(15, 33, 4_000_000).tolist()}, chunk=10**6, outputs=("speed",))
+    """Without overhead for large chunks: 9 bytes a point of one output and its status, and 8 of its sample."""
+    drawn = {"design": "latin_hypercube", "number": 4_000_000, "over": {"motor.resistance": "prior"}}
+    config = Campaign(samples=drawn, chunk=10**6, outputs=("speed",))
     job = prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x")
     assert store_layout(config, job).size == pytest.approx((9 + 8) * 4e6, rel=2e-3)
 

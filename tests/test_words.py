@@ -129,7 +129,7 @@ def made_in_code():
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if (
                 isinstance(node, ast.Call)
-                and ast.unparse(node.func) == "Remark"
+                and ast.unparse(node.func).rpartition(".")[2] == "Remark"
                 and isinstance(node.args[0], ast.Constant)
             ):
                 yield node.args[0].value, {keyword.arg for keyword in node.keywords}
@@ -171,7 +171,7 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
     for room in ("inference", "discovery", "sensitivity", "sizing"):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:
+                if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] == kind and node.args:
                     at = 0 if kind == "progress_remark" else 1
                     used |= {node.args[at].value} if len(node.args) > at else {""}
     assert used | ({""} & set(rows)) == set(rows)

@@ -262,7 +262,7 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
         numbers["motor.voltage_limit"] = number(voltage, "V", "<dcmotor> ctrlrange")
     if model.actuator_forcelimited[actuator]:
         limit = float(np.max(np.abs(model.actuator_forcerange[actuator]))) / constant
-        numbers["driver.current_limit"] = number(limit, "A", "<dcmotor> forcerange / motorconst")
+        numbers["driver.current_limit"] = number(limit, "A", "<dcmotor> saturation / motorconst")
     for name, fields in effects.items():
         numbers |= {f"effects.{name}.{key}": number(value, "SI", "<dcmotor>") for key, value in fields.items()}
     return numbers

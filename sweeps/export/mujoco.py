@@ -189,7 +189,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     if controller := joint.controller:
         fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki), controller.rate))
     if joint.limit is not None:
-        fates.append(EffectFate("current limit of the driver", HELD, "forcerange"))
+        fates.append(EffectFate("current limit of the driver", HELD, "saturation"))
     return [*fates, *fates_outside_joint(joint)]
 
 
@@ -311,34 +311,6 @@ def _controller_gains(joint: DriveJoint, found: MjcfMotor) -> tuple[float, ...]:
     )
 
 
-def _backlash_body(joint: DriveJoint, found: MjcfMotor, name: str, at: str) -> str:
-    """Text of a separate body for the motor's side, and of the tendon between its joint and that of the load."""
-    load, motor = joint.load, found.armature - found.added
-    rate = 1 / motor + 1 / (float(load.inertia) + found.added)
-    if load.stiffness > 0:
-        square, damper = float(load.stiffness) * rate, float(load.damping) * rate
-    else:
-        square, damper = FLANK_STIFFNESS, FLANK_DAMPING
-    if load.backlash > 0:
-        half = 0.5 * float(load.backlash)
-        limits = (
-            f'limited="true" range="{_numbers_text(-half, half)}" solreflimit="{_numbers_text(-square, -damper)}" '
-        )
-        limits += f'solimplimit="{_numbers_text(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
-    else:
-        limits = (
-            f'stiffness="{_numbers_text(float(load.stiffness))}" damping="{_numbers_text(float(load.damping))}" '
-            'springlength="0"'
-        )
-    return (
-        f'  <worldbody>\n    <body name="{at}_rotor">\n      <joint name="{at}_rotor" class="{name}_rotor" '
-        'type="hinge"/>\n      <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-12 1e-12 1e-12"/>\n'
-        f'    </body>\n  </worldbody>\n  <tendon>\n    <fixed name="{name}_play" {limits}>\n'
-        f'      <joint joint="{at}_rotor" coef="1"/>\n      <joint joint="{at}" coef="-1"/>\n'
-        "    </fixed>\n  </tendon>\n"
-    )
-
-
 def _numbers_text(*numbers: float) -> str:
     return " ".join(f"{x:.9g}" for x in numbers)
 
@@ -371,19 +343,12 @@ def mjcf_fragment(
         name: name of the actuator and the default class.
         at: name of the joint.
     """
-    v = found.values
-    share = v[SHARE]
+    v, load = found.values, joint.load
     attributes = {
         "motorconst": (v[CONSTANT],), "resistance": (v[RESISTANCE],), "inductance": (found.inductance,),
         "thermal": found.thermal, "lugre": found.lugre, "cogging": found.cogging,
     }  # fmt: skip
-    limits = f' ctrllimited="false" ctrlrange="{_numbers_text(-volts, volts)}"'
-    if gains := _controller_gains(joint, found):
-        limits = f' input="pos" controller="{_numbers_text(*gains)}"'
-    limits += (
-        "" if found.limit is None else f' forcelimited="true" forcerange="{_numbers_text(-found.limit, found.limit)}"'
-    )
-    written = "".join(f' {key}="{_numbers_text(*x)}"' for key, x in attributes.items() if x)
+    gains = _controller_gains(joint, found)
     head = [
         f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; "
         f"MuJoCo {_version_text()} "
@@ -392,8 +357,8 @@ def mjcf_fragment(
         f"Command: goal angle of the motor [rad], {found.ratio:.6g} times that of the joint; MuJoCo 3.17 or later."
         if gains
         else "Command: voltage at the driver's output [V], its duty times the supply's voltage.",
-        f"Current of the motor [A]: {share:.6g} times the actuator's last activation, or "
-        f"{share / v[CONSTANT]:.6g} times its force.",
+        f"Current of the motor [A]: {v[SHARE]:.6g} times the actuator's last activation, or "
+        f"{v[SHARE] / v[CONSTANT]:.6g} times its force.",
         *notes,
     ]
     about_motor = [
@@ -401,28 +366,24 @@ def mjcf_fragment(
     ]
     # A load that turns separately has its own friction, and the motor's side has the rest.
     numbers = [max(found.friction, 0.0), v[DAMPING], found.armature]
-    sides = [("", numbers, at)]
+    sides, play = [("", *numbers)], dict[str, float]()
     if joint.loose:
-        of_load = (joint.load.loss_coulomb, joint.load.loss_viscous, found.added)
+        of_load = (load.loss_coulomb, load.loss_viscous, found.added)
         own = [min(x, float(y)) for x, y in zip(numbers, of_load, strict=True)]
-        sides = [("", own, at), ("_rotor", [a - b for a, b in zip(numbers, own, strict=True)], f"{at}_rotor")]
-    return (
-        "<mujocoinclude>\n"
-        + _comment_lines(head, "  ")
-        + "  <default>\n"
-        + _comment_lines([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    ")
-        + "".join(
-            f'    <default class="{name}{side}">\n      <joint frictionloss="{_numbers_text(dry)}" '
-            f'damping="{_numbers_text(viscous)}" armature="{_numbers_text(inertia)}"/>\n    </default>\n'
-            for side, (dry, viscous, inertia), _ in sides
-        )
-        + "  </default>\n"
-        + (_backlash_body(joint, found, name, at) if joint.loose else "")
-        + "  <actuator>\n"
-        + _comment_lines(about_motor, "    ")
-        + f'    <dcmotor name="{name}" joint="{sides[-1][2]}" gear="{_numbers_text(found.ratio)}"'
-        f"{written}{limits}/>\n" + "  </actuator>\n</mujocoinclude>\n"
-    )
+        sides = [("", *own), ("_rotor", *(a - b for a, b in zip(numbers, own, strict=True)))]
+        stiffness, damping = float(load.stiffness), float(load.damping)
+        rate = 1 / (found.armature - found.added) + 1 / (float(load.inertia) + found.added)
+        square, damper = (stiffness * rate, damping * rate) if stiffness > 0 else (FLANK_STIFFNESS, FLANK_DAMPING)
+        play = {
+            "half": 0.5 * float(load.backlash), "square": square, "damper": damper, "stiffness": stiffness,
+            "damping": damping,
+        }  # fmt: skip
+    return filled_template(
+        "drive.xml", joint=joint, at=at, name=name, text=_numbers_text, ratio=found.ratio, volts=volts,
+        head=_comment_lines(head, "  "), about_motor=_comment_lines(about_motor, "    "),
+        about_joint=_comment_lines([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    "),
+        sides=sides, attributes=attributes, gains=gains, limit=found.limit, impedance=IMPEDANCE, **play,
+    )  # fmt: skip
 
 
 def _version_text() -> str:

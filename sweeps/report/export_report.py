@@ -13,7 +13,7 @@ from mmrjax.model import channels
 from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
 from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, EffectFate
 from sweeps.export.formats import FORMATS, Export
-from sweeps.export.joint import INSIDE, DriveJoint
+from sweeps.export.joint import INSIDE
 from sweeps.export.law_source import filled_template, jax_source, module_from_source
 from sweeps.report import catalogue
 from sweeps.report.document import Cell, Document, Note, Section, Table, remarks
@@ -201,80 +201,6 @@ def rotor_inertia(found: Export) -> float:
     return value + sum(float(e.amplitude) for e in found.joint.inside if e.balance == "inertia")
 
 
-def law_equations(found: Export) -> list[str]:
-    """Equations of the law in words, in the order of computation, with the symbols of the constants."""
-    robot = found.joint.robot
-    sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
-             "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
-    places = {sections[p.balance] for p in found.joint.parts if p.effect and p.balance in INSIDE}
-    less = {place: f" - {place} effects" if place in places else "" for place in sections.values()}
-    dry, viscous = ("M_t0", "K_ft") if robot.has_ground else ("M_0", "K")
-    rotor = "" if found.joint.loose else " - J_d i_r dω/dt"
-    backward = "2 - 1/η_rm, at least 0.02" if robot.gearbox.mesh_theory else "η_rm"
-    lines = [
-        "ω is the speed of the joint [rad/s], ω_m = i_r ω that of the motor. U is the voltage at the driver's "
-        "output, I the current of the motor. sign ω fades to 0 at rest.",
-        f"Winding: L_d dI/dt = U - C_m ω_m - R_rot I{less['winding']}. [V]",
-        f"Motor: M_d = C_m I - (M_df0 sign ω + K_fd ω_m){less['motor']}, at its shaft. [N·m]",
-        f"Gearbox: M_r = i_r η_rm (M_d - M_rf0 sign ω - K_fr ω_m{rotor}){less['gearbox']}, at its output. 1/η_b "
-        f"replaces η_rm while the sum in brackets brakes; η_b is {backward}. [N·m]",
-        f"Output: M = M_r - ({dry} sign ω + {viscous} ω){' - guides' if robot.has_ground else ''}{less['output']}: "
-        "the torque on the joint. [N·m]",
-    ]
-    if robot.has_ground:
-        lines.append("Guides: μ_t · share · normal load · radius · sign ω. [N·m]")
-    for part in found.joint.parts:
-        if part.effect and part.balance in INSIDE:
-            lines.append(
-                f"`{part.name}`, in {sections[part.balance]}: {part.equation} [{part.unit}] {part.meaning}".rstrip()
-            )
-    lines += _further_equations(found.joint)
-    if found.format == "mujoco":
-        lines += [
-            "MuJoCo's form of it: U = R' I' + L' dI'/dt + i_r K ω and M = i_r K I' - f sign ω - d ω. Here "
-            "R' = R_rot/η_rm (resistance), L' = L_d/η_rm, K = C_m (motorconst), f (frictionloss), d (damping), and "
-            "the motor's current I = c I' (current over act). Its numbers are refitted to the law above.",
-        ]
-    return lines
-
-
-def _further_equations(joint: DriveJoint) -> list[str]:
-    """Equations of a controller, and of a load that turns separately from the motor."""
-    lines = []
-    if joint.controller is not None:
-        goal, unit, rate = GOALS[joint.robot.rig.imposed]
-        own = joint.controller
-        sampled = f" It acts at {own.rate:g} Hz, {own.samples_late:g} samples late, and holds D." * (own.rate > 0)
-        lines.append(
-            f"Controller: e = goal - {goal} [{unit}], D = K_p e + K_i ∫ e dt {rate} within ± limit, U = D times the "
-            "supply. At the limit, an error that drives D further is not integrated. With a lag T, the duty follows: "
-            f"T dD'/dt = D - D'.{sampled} [-]"
-        )
-    if joint.loose:
-        lines.append(
-            "Play: motor and load turn apart by φ. s = φ less half of the backlash towards 0, and 0 within it. "
-            "M_r = k s + d ds/dt is the torque between them, and flanks never pull. Without a stated stiffness, "
-            f"k and d give {MESH_FREQUENCY:g} Hz and a damping ratio of {MESH_DAMPING:g}. The motor's side: "
-            "J i_r² dω/dt = i_r (M_d - M_rf0 sign ω - K_fr ω) - M_r/η - gearbox effects. [N·m]"
-        )
-    return lines
-
-
-def command_sentence(found: Export) -> str:
-    """Sentence on the command of an exported controller, empty if the command is a voltage."""
-    imposed = found.joint.robot.rig.imposed
-    if found.joint.controller is None or found.format == "table":
-        return ""
-    if found.format != "mujoco":
-        return f"\n\nThe command is the controller's goal [{GOALS[imposed][1]}], not a voltage."
-    if imposed != "goal_angle":
-        return ""
-    ratio = float(found.joint.robot.gearbox.ratio)
-    return (
-        f"\n\nThe control is the goal angle of the motor, {ratio:.6g} times that of the joint [rad], not a voltage."
-    )
-
-
 def escape_markdown(text: str) -> str:
     """User's name escaped for Markdown, so that it ends no line, cell or code, and begins no HTML."""
     words = " ".join(printable(text).split())
@@ -286,14 +212,28 @@ def law_text(found: Export) -> str:
     drive, compared = found.joint, found.comparison
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     shares = {f.name: share_kept(f) for f in compared.fates}
+    sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
+                "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
+    effects = [p for p in drive.parts if p.effect and p.balance in INSIDE]
+    places = {sections[p.balance] for p in effects}
     return filled_template(
         "LAW.md",
         origin=escape_markdown(f"{drive.file.name}, {drive.configuration}"),
         version=__version__,
         format=FORMATS[found.format],
         use=USE[found.format].format(name=drive.name, at="drive", armature=rotor_inertia(found)),
-        command=command_sentence(found),
-        equations=law_equations(found),
+        format_name=found.format,
+        joint=drive,
+        ground=drive.robot.has_ground,
+        sections=sections,
+        effects=effects,
+        less=lambda place: f" - {place} effects" if place in places else "",
+        controller=drive.controller,
+        imposed=drive.robot.rig.imposed,
+        goal=None if drive.controller is None else GOALS[drive.robot.rig.imposed],
+        ratio=float(drive.robot.gearbox.ratio),
+        mesh_frequency=MESH_FREQUENCY,
+        mesh_damping=MESH_DAMPING,
         constants=[(c, escape_markdown(c.name), escape_markdown(c.source)) for c in found.constants],
         cited=any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants),
         refitted=[(n, compared.translated[n], v) for n, v in compared.refitted.items()],
