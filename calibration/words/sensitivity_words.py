@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.data import Names
 from mmrjax.errors import count_noun
 
 if TYPE_CHECKING:
@@ -93,15 +92,14 @@ def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
     )
 
 
-def points_left_out(points: int, total: int, sampled: bool, outputs: Names) -> str:
-    who = "too many robots in the sample do" if sampled else "the robot does"
-    return f"{points} of {total} operating points are left out, since {who} not travel there ({', '.join(outputs)})"
-
-
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "sampling": lambda method, points: f"{METHODS[method]}, over {points} operating points",
-    "points_left_out": points_left_out,
+    "points_left_out": lambda points, total, sampled, outputs: (
+        f"{points} of {total} operating points are left out, since "
+        f"{'too many robots in the sample do' if sampled else 'the robot does'} not travel there "
+        f"({', '.join(outputs)})"
+    ),
     "sample_left_out": lambda points, share, outputs: (
         f"at {points} operating points up to {100 * share:.1f} % of the sample does not travel and is left out "
         f"({', '.join(outputs)})"

@@ -149,9 +149,11 @@ def climb_derivatives(
     parts, samples, steps = climb.divide_run(duration, step, sample, part)
     interval, step_numbers = jnp.asarray(step, float), jnp.asarray(steps)
     run, rotated_run = _value_and_derivatives_along(given, values, directions)
-    state, state_change = _value_and_derivatives_along(
-        functools.partial(_initial_state, step=interval), run, rotated_run
-    )
+
+    def begin(run: ClimbInputs) -> Any:
+        return climb.begin_climb(climb.build_climb_system(*run, interval))
+
+    state, state_change = _value_and_derivatives_along(begin, run, rotated_run)
     records: list[Any] = []
     for k in range(parts):
         first_step = jnp.asarray(k * samples * steps * step)
@@ -226,18 +228,10 @@ def _value_and_derivatives_along(function: Callable[[Any], Any], at: Any, direct
     return eqx.combine(values, arrays, further[-1]), changed
 
 
-def _initial_state(run: ClimbInputs, step: Scalar) -> Any:
-    return climb.begin_climb(climb.build_climb_system(*run, step))
-
-
-def _advance_with_samples(
-    at: tuple[ClimbInputs, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int
-) -> Any:
-    run, state = at
-    return climb.advance_samples(climb.build_climb_system(*run, step), state, first, steps, samples)
-
-
 @functools.partial(compiled, options=SELDOM)
 def _advance_part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
-    advance = functools.partial(_advance_with_samples, first=first, step=step, steps=steps, samples=samples)
+    def advance(at: tuple[ClimbInputs, Any]) -> Any:
+        run, state = at
+        return climb.advance_samples(climb.build_climb_system(*run, step), state, first, steps, samples)
+
     return _value_and_derivatives_along(advance, at, directions)

@@ -39,6 +39,14 @@ class Churning(TrackEffect):
         return self.amplitude * signals.speed_wheel**2 * signals.direction
 
 
+def _fade_parameter(low: float = 0.5) -> Scalar:
+    """The speed over which friction falls, a field of effects that decay with speed."""
+    return parameter(
+        8.0, "rad/s", "shaft speed ω_s that scales the decay of the excess", (low, 80.0),
+        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
+    )  # fmt: skip
+
+
 class StribeckTrack(TrackEffect):
     """ΔM_t = a exp(-|ω_k| / ω_s) sign ω_k at the pulley, for a side's tracks.
 
@@ -53,10 +61,7 @@ class StribeckTrack(TrackEffect):
     amplitude: Scalar = amplitude(
         "N·m", "loss torque at rest beyond M_t0", (-0.1, 1.0), "a third of M_t0 of Table 3", sd=0.1
     )
-    speed_fade: Scalar = parameter(
-        8.0, "rad/s", "pulley speed ω_s that scales the decay of the excess", (0.5, 80.0),
-        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
-    )  # fmt: skip
+    speed_fade: Scalar = _fade_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade) * signals.direction
@@ -227,10 +232,7 @@ class StribeckExponent(TrackEffect):
     )
     # The loop frees the first of two shapes, ω_s. For a curve with any δ from 1/2 to 2, after dry and viscous
     # friction are fitted, δ = 1 and δ = 2 with ω_s free leave half the residual of a free δ at one ω_s and δ = 1.
-    speed_fade: Scalar = parameter(
-        8.0, "rad/s", "shaft speed ω_s that scales the decay of the excess", (0.05, 80.0),
-        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
-    )  # fmt: skip
+    speed_fade: Scalar = _fade_parameter(0.05)
     exponent: Scalar = parameter(
         2.0, "-", "exponent δ of the speed", (0.5, 4.0),
         "1/2 to 2 in the survey, and much larger for boundary lubricants", relative_sd=0.5,
@@ -393,10 +395,7 @@ class DirectionalStribeck(TrackEffect):
         "N·m", "excess at low speed in forward rotation minus the mean of both directions", (-0.5, 0.5),
         "half of a common `stribeck_track`", sd=0.05,
     )  # fmt: skip
-    speed_fade: Scalar = parameter(
-        8.0, "rad/s", "shaft speed ω_s that scales the decay of the excess", (0.5, 80.0),
-        "belt speeds of 0.1 to 0.5 m/s", relative_sd=0.5,
-    )  # fmt: skip
+    speed_fade: Scalar = _fade_parameter()
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         excess = jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade)

@@ -46,19 +46,8 @@ TIME_ROLLED = 0.6
 JUMPS, ALOFT = 0.01, 0.01
 
 
-class SampleRecord(eqx.Module):
-    """One sample interval of a run.
-
-    Attributes:
-        motions, reactions: motion and loads at its end.
-        passed: means over it.
-        guided: mean load of the guides over it.
-    """
-
-    motions: HalfRobotState
-    passed: Signals | balances.Travel
-    guided: Float[Array, "samples ..."]
-    reactions: GearReactions
+#: Sample intervals of a run: motion at their end, means over them, mean load of the guides, and loads at their end.
+SampleRecord = tuple[HalfRobotState, Signals | balances.Travel, Float[Array, "samples ..."], GearReactions]
 
 
 class TrackTrajectory(eqx.Module):
@@ -175,7 +164,7 @@ def _advance_and_record(
     def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
         after, records = jax.lax.scan(small, motion, None, length=steps)
         record, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
-        return after, SampleRecord(after, record, guided, kind.loads(run, *kind.instant(run, after)[1:]))
+        return after, (after, record, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)
 
@@ -183,22 +172,20 @@ def _advance_and_record(
 def _assemble_trajectory(
     run: HalfRobotSystem, start: HalfRobotState, end: HalfRobotState, record: SampleRecord, sample: float
 ) -> TrackTrajectory:
-    kind, motions = _moving_system_module(run.conditions), record.motions
+    kind, (motions, passed, guided, reactions) = _moving_system_module(run.conditions), record
     time = sample * jnp.arange(len(motions.q) + 1)
     travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
-    averages = kind.steady_averages(
-        functools.partial(_period_averages, run, time), travelled, record.passed, record.guided
-    )
+    averages = kind.steady_averages(functools.partial(_period_averages, run, time), travelled, passed, guided)
     status = kind.status(run, averages, end)
     valid = (status != FAILED) & (status != TIPS)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
-    signals, answer = signals_of(record.passed), kind.result_of(run, averages, status)
+    signals, answer = signals_of(passed), kind.result_of(run, averages, status)
     load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | flag_mask({"jumps": jumps})
     answer = withhold_numbers(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
-    return TrackTrajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
+    return TrackTrajectory(time[1:], motions.q, motions.v, signals, reactions, averages, answer)
 
 
 def check_track_runs(
@@ -310,7 +297,7 @@ def _end_runs(
 ) -> TrackTrajectory:
     def one(conditions: Conditions, start: HalfRobotState, parts: list[SampleRecord]) -> TrackTrajectory:
         record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
-        end = jax.tree.map(lambda x: x[-1], record.motions)
+        end = jax.tree.map(lambda x: x[-1], record[0])
         return _assemble_trajectory(build_system(robot, conditions, step), start, end, record, sample)
 
     return jax.vmap(one)(conditions, starts, records)
