@@ -775,7 +775,7 @@ MORE_NAMES = {
     "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
     "sweeps/report/climb_report.py": 26,
-    "sweeps/report/export_report.py": 27,
+    "sweeps/report/export_report.py": 26,
     "sweeps/report/loop_report.py": 30,
     "sweeps/report/mission_report.py": 30,
     "sweeps/report/runs_report.py": 30,

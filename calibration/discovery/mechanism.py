@@ -356,8 +356,9 @@ def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, aft
 
 
 def _curves_without_blocks(beside: BaseCurve, blocks: Sequence[np.ndarray]) -> tuple[Names, np.ndarray]:
-    """Family of each smooth curve, and what each explains and could explain [σ²], with all rows and without each block,
-    shape (1 + blocks, curves, 2).
+    """Family of each smooth curve, and what each explains and could explain [σ²], shape (1 + blocks, curves, 2).
+
+    The first entry is with all rows, the others are without each block.
     """
     space, linear, names = beside.space, beside.left.linear, bases_room.family_names(beside.bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES or v in bases_room.ORDERS]

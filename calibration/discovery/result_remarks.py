@@ -23,12 +23,8 @@ from calibration.inference.weak_form import TENTH
 
 #: Size of a delay in its sds from which a note reports it, and as a share of the longest in the equations.
 LATE, ENDS = 4.0, 0.9
-
-
 #: Relative difference of two levels of a series, by its range, above which they are distinct [-].
 LEVEL = 0.02
-
-
 #: Ratio of the error of a refit to that of the robot as stated above which a note reports it [-].
 WORSE = 1.1
 

@@ -1,4 +1,7 @@
-"""Search for effects: one at a time, in addition to the best set, as long as the residuals are significant."""
+"""Search for effects: one at a time, in addition to the best set, as long as the residuals are significant.
+
+For logs, also the ranking of the effects on the equations in weak form, before any simulation.
+"""
 
 from __future__ import annotations
 
@@ -216,6 +219,10 @@ class WeakFormScreening:
 def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormScreening | None:
     """Fits base parameters and effects by regression on a log's equations in weak form. None if the log does not show
     its states (`fit_weak_form`).
+
+    A signature is the derivative of an equation by an amplitude. It ranks every effect in milliseconds, as the
+    inverse dynamic identification model of Gautier and Khalil (1990) does with torques. The regression also gives the
+    start of the fit of the base.
     """
     problem = space.bare
     equations = fit_weak_form(problem, space.library.scored) if problem.observe.long else None

@@ -233,7 +233,8 @@ def _compare_with_single_curve(
             return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
     location = beside.where
     place = equation_of_place(location.place)
-    if space.bare.observe.reads and place in {_equation_of_effect(space, e) for e in best.effects}:
+    # Linear rows of logs have no fit of a curve.
+    if not space.bare.observe.over_time and place in {_equation_of_effect(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])

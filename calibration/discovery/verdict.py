@@ -31,8 +31,6 @@ from calibration.inference.noise import UNSTATED, Noise
 
 #: Share of excluded rows above which the summary begins with it.
 MANY = 0.03
-
-
 #: Distance from the prior above which a note reports a base parameter [prior sd].
 FAR = 3.0
 
