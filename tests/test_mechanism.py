@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import t
 
 from calibration.discovery import candidates
+from calibration.discovery import gains as gains_room
 from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import errors_of_ammeters
@@ -67,14 +68,14 @@ def found(monkeypatch):
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
-    monkeypatch.setattr(room, "cached_hold_out_score", lambda *_: score)
-    monkeypatch.setattr(room.prediction, "score_predictions", lambda *_: score)
-    monkeypatch.setattr(room, "simulated_reading", lambda *_: None)
-    monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
+    monkeypatch.setattr(gains_room, "cached_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(gains_room.prediction, "score_predictions", lambda *_: score)
+    monkeypatch.setattr(gains_room, "simulated_reading", lambda *_: None)
+    monkeypatch.setattr(gains_room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curves_without_blocks", lambda *_: ((), None))
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
     monkeypatch.setattr(room, "_with_ammeter_families", lambda beside, found, settings: found)
-    monkeypatch.setattr(room, "_linear_gain_of_curve", lambda *_: Gain(1.0, 0.1))
+    monkeypatch.setattr(gains_room, "linear_gain_of_curve", lambda *_: Gain(1.0, 0.1))
     differs = [(None, "", 0.0)]
     monkeypatch.setattr(room, "changed_run", lambda *_: differs[0])
     left = SimpleNamespace(linear=SimpleNamespace(jacobian=0.0, residual=0.0))
@@ -172,7 +173,7 @@ def test_of_mechanisms_that_cannot_be_told_apart_one_that_predicts_is_stated(fou
     """A curve has more to fit with, and may predict nothing."""
     where = dataclasses.replace(SPEED, place="electrical", alike=("electrical",), variables_alike=("current",))
     gains = iter([-1.0, 1.0])
-    monkeypatch.setattr(room, "_gain_over_changed", lambda *_: Gain(next(gains), 0.1))
+    monkeypatch.setattr(gains_room, "_gain_over_changed", lambda *_: Gain(next(gains), 0.1))
     got = found(fitted("leads", explains=1500.0), curve=1900.0, where=where)
     assert got.families == (where.family, FAMILIES["leads"]) and got.effects == () and got.gain == 1.0
     # that other curves are as improbable does not count against an effect
@@ -190,7 +191,7 @@ def test_readings_that_it_changes_are_those_it_moves_by_half_of_the_most_moved_c
     space = SimpleNamespace(bare=SimpleNamespace(data=SimpleNamespace(sd=sd)), weight=np.ones((ROWS, 2)))
     before = np.zeros((ROWS, 2))
     after = np.stack([np.where(np.arange(ROWS) < 20, 1.0, 0.2), np.full(ROWS, 5.0)], 1)
-    changed = room._changed_readings(space, np.zeros(ROWS), before, after)
+    changed = gains_room._changed_readings(space, np.zeros(ROWS), before, after)
     assert changed[:, 0].tolist() == [True] * 20 + [False] * 10 and not changed[:, 1].any()
 
 
@@ -202,10 +203,10 @@ def test_the_error_of_a_gain_is_the_mean_of_its_kinds():
     after = HeldOutScore({k: gains for k in blocks}, blocks)
     before = HeldOutScore({k: np.zeros((12, 1)) for k in blocks}, blocks)
     changed = np.ones((12, 1), bool)
-    gain = room._gain_over_changed(after, before, changed)
+    gain = gains_room._gain_over_changed(after, before, changed)
     assert gain.mean == pytest.approx(gains.mean())
     assert gain.se == pytest.approx(np.mean(list(gain.errors.values()))) and set(gain.errors) == set(blocks)
-    assert room._gain_over_changed(HeldOutScore({}, {}), HeldOutScore({}, {}), changed).se == np.inf
+    assert gains_room._gain_over_changed(HeldOutScore({}, {}), HeldOutScore({}, {}), changed).se == np.inf
 
 
 def test_equations_that_act_alike_are_listed(found):
@@ -222,7 +223,9 @@ def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     space = SimpleNamespace(included=np.ones(6, bool))
     beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear), space=space)
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]
-    np.testing.assert_array_equal(room._within_seen_range(beside, masks), [False, True, True, False, True, False])
+    np.testing.assert_array_equal(
+        gains_room._within_seen_range(beside, masks), [False, True, True, False, True, False]
+    )
 
 
 def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(monkeypatch):
@@ -239,16 +242,16 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
         seen.append(included)
         return SimpleNamespace(scale=2.0, root=np.eye(2), basis=lambda x: columns / 2)
 
-    monkeypatch.setattr(room, "fit_smooth_curve", curve_of)
-    monkeypatch.setattr(room, "place_signature", lambda linear, place, shapes: shapes)
-    monkeypatch.setattr(room, "location_columns", lambda *_: columns)
+    monkeypatch.setattr(gains_room, "fit_smooth_curve", curve_of)
+    monkeypatch.setattr(gains_room, "place_signature", lambda linear, place, shapes: shapes)
+    monkeypatch.setattr(gains_room, "location_columns", lambda *_: columns)
     kinds = {"run": {name: np.arange(rows) // 10 == k for k, name in enumerate("abcd")}}
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: kinds)
     monkeypatch.setattr(room.blocks_room, "parts_of_runs", lambda _: {"half": np.arange(rows) % 4 < 2})
     data = SimpleNamespace(sd=np.full((rows, 1), 0.5))
     space = SimpleNamespace(weight=np.ones((rows, 1)), included=np.ones(rows, bool), bare=SimpleNamespace(data=data))
     beside = SimpleNamespace(left=SimpleNamespace(linear=linear), where=SPEED, bases=(), space=space)
-    got = room._linear_gain_of_curve(beside, range(rows), {})
+    got = gains_room.linear_gain_of_curve(beside, range(rows), {})
 
     def errors(design, out):
         kept = np.append(~out, np.ones(len(design) - rows, bool))
@@ -262,11 +265,11 @@ def test_the_linear_gain_of_a_curve_is_that_of_least_squares_without_each_block(
     ]
     none = np.zeros(rows, bool)
     change = np.abs(errors(wide, none) - errors(jacobian, none))
-    counts = change >= room.CHANGED * np.sqrt(np.mean(change**2))
+    counts = change >= gains_room.CHANGED * np.sqrt(np.mean(change**2))
     assert 4 < counts.sum() < rows and got.mean == pytest.approx((density[0] - density[1])[counts].mean(), rel=1e-9)
     assert got.mean > 5 * got.se > 0
     assert all(any((included == ~out).all() for included in seen) for out in kinds["run"].values())
     wave = SimpleNamespace(
         **vars(beside) | {"where": dataclasses.replace(SPEED, variable="order 2 of the driving shaft")}
     )
-    assert list(room._linear_gain_of_curve(wave, range(rows), {}).errors) == ["part"]
+    assert list(gains_room.linear_gain_of_curve(wave, range(rows), {}).errors) == ["part"]

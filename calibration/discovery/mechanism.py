@@ -8,34 +8,29 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data import Columns, Names
+from calibration.data import Names
 from calibration.data.runs import Runs
-from calibration.discovery import prediction
+from calibration.discovery import gains
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import Candidate, excess_misfit, share_of_excess, simulated_reading
+from calibration.discovery.candidates import Candidate, excess_misfit, share_of_excess
 from calibration.discovery.classes import ammeter_families, errors_of_ammeters
 from calibration.discovery.discrepancy import BaseCurve, location_columns
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, BETTER, HALF, Mechanism
-from calibration.discovery.prediction import Gain, HeldOutScore, Predicted, cached_hold_out_score
+from calibration.discovery.prediction import Predicted
 from calibration.discovery.projection import explained_function
-from calibration.discovery.score_tests import augment_with_columns, family_columns
+from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
-from calibration.discovery.smooth import fit_smooth_curve
 from calibration.discovery.standing import changed_run, evidence_over_curves, kept_readings, recurrence_of_families
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
-from calibration.inference.bases import place_signature
-from calibration.inference.held_out import predict_unseen
 
-#: A reading counts if the mechanism changes it by at least this share of the largest rms change of a channel [-].
-CHANGED = 0.5
-#: Fewest blocks of a kind for an error of a gain from their scatter.
-BLOCKS = 3
+#: Fits with and without the effects of one family.
+Fits = tuple[Candidate, Candidate]
 #: Number of parameters of a curve, each of which lowers χ² by one without a discrepancy [σ²].
 OF_CURVE = 5.0
 
@@ -59,7 +54,7 @@ def find_mechanism(
     pairs = _explained_by_family(space, base, ladder, best)
     explained, alike, less = _rank_families(beside, pairs, settings)
     location_families, most = _families_of_location(beside.where), max(explained.values())
-    named = [(f, True) for f in (*alike, *less) if f in best and pairs[f].explained >= HALF * most]
+    named = [(f, True) for f in (*alike, *less) if f in best and _explained(pairs[f]) >= HALF * most]
     curved = location_families[0] in alike and space.bare.observe.reads
     over_time, excess = space.bare.observe.over_time, excess_misfit(space, base)
     fit = np.asarray(left.linear.jacobian), np.asarray(left.linear.residual)
@@ -78,12 +73,14 @@ def find_mechanism(
                 families = (*families, *location_families)
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
         if with_effects:
-            effects, gain = _best_hold_out_gain(space, runs, ladder, best[leader], base, pairs[leader], predicted)
+            effects, gain = gains.best_hold_out_gain(
+                space, runs, ladder, best[leader], base, pairs[leader], predicted
+            )
             again = recurrence_of_families(space, base, best[leader], left, families, beside.bases, blocks, settings)
             if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_recurrence(*curves(), families, settings))
         else:
-            hold_out = _linear_gain_of_curve if over_time else _hold_out_gain_of_curve
+            hold_out = gains.linear_gain_of_curve if over_time else gains.hold_out_gain_of_curve
             gain, again = hold_out(beside, runs, predicted), _curve_recurrence(*curves(), families, settings)
         mechanism = Mechanism(
             families, effects, share_of_excess(excess, explained.get(leader, 0.0)), gain.mean, gain.se, again,
@@ -97,7 +94,7 @@ def find_mechanism(
 
 
 def _rank_families(
-    beside: BaseCurve, pairs: dict[str, FitsWithAndWithout], settings: Settings
+    beside: BaseCurve, pairs: dict[str, Fits], settings: Settings
 ) -> tuple[dict[str, float], Names, Names]:
     """What the effects of each family and the curve explain [σ²], the families that explain most, and those that the
     curve cannot separate from its own if it explains most.
@@ -107,7 +104,7 @@ def _rank_families(
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
-    explained = {family: pair.explained for family, pair in pairs.items()}
+    explained = {family: _explained(pair) for family, pair in pairs.items()}
     explained[families[0]] = max(by_curve, explained.get(families[0], 0.0))
     most = max(explained.values())
     alike = [f for f in explained if explained[f] >= most - settings.tolerance(most)]
@@ -131,32 +128,23 @@ def _with_ammeter_families(beside: BaseCurve, found: Mechanism, settings: Settin
     return dataclasses.replace(found, families=families, ammeter=errors_of_ammeters(space, families))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class FitsWithAndWithout:
-    """Fits with and without the effects of one family."""
-
-    having: Candidate
-    without: Candidate
-
-    @property
-    def explained(self) -> float:
-        """Decrease of χ² by the effects [σ²]."""
-        return 2 * (self.without.cost - self.having.cost)
+def _explained(fits: Fits) -> float:
+    """Decrease of χ² by the effects that only the first fit has [σ²]."""
+    having, without = fits
+    return 2 * (without.cost - having.cost)
 
 
 def _explained_by_family(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
-) -> dict[str, FitsWithAndWithout]:
+) -> dict[str, Fits]:
     """For each family, the two fits with and without its effects that differ most in χ²."""
     fits = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
-    pairs = {family: FitsWithAndWithout(alone, base) for family, alone in best.items()}
+    pairs = {family: (alone, base) for family, alone in best.items()}
     for effects, having in fits.items():
         for family in {space.library[name].family() for name in effects} & set(pairs):
             others = frozenset(n for n in effects if space.library[n].family() != family)
             if others in fits:
-                pairs[family] = max(
-                    pairs[family], FitsWithAndWithout(having, fits[others]), key=lambda pair: pair.explained
-                )
+                pairs[family] = max(pairs[family], (having, fits[others]), key=_explained)
     return pairs
 
 
@@ -189,167 +177,6 @@ def _families_of_location(where: DiscrepancyLocation) -> Names:
     places = [dataclasses.replace(where, place=p) for p in where.alike]
     others = [dataclasses.replace(where, variable=v) for v in where.variables_alike]
     return tuple(dict.fromkeys(x.family for x in (where, *places, *others)))
-
-
-# --- hold-out errors ------------------------------------------------------------------------------------
-
-
-def _best_hold_out_gain(
-    space: CandidateSpace,
-    runs: Runs,
-    ladder: Sequence[Candidate],
-    best: Candidate,
-    base: Candidate,
-    pair: FitsWithAndWithout,
-    predicted: Predicted,
-) -> tuple[Names, Gain]:
-    """Most certain hold-out gain by effects of a family, and these effects.
-
-    Args:
-        best: best candidate of the family. If it has several effects, a single one may predict better.
-        pair: fits with and without the family that differ most.
-    """
-    family = space.library[best.effects[0]].family()
-    single = [c for c in ladder if len(c.effects) == 1 and space.library[c.effects[0]].family() == family]
-    sound = [c for c in single if c.plausible and np.isfinite(c.cost)] if len(best.effects) > 1 else []
-    alone = [best, *([min(sound, key=lambda c: c.cost)] if sound else [])]
-    fits = {(c.key, base.key): (c, base) for c in alone}
-    fits.setdefault((pair.having.key, pair.without.key), (pair.having, pair.without))
-    gains = [(having, _hold_out_gain(space, runs, having, without, predicted)) for having, without in fits.values()]
-    having, gain = max(gains, key=lambda one: one[1].mean / max(one[1].se, 1e-12))
-    return tuple(n for n in having.effects if space.library[n].family() == family), gain
-
-
-def _hold_out_gain(
-    space: CandidateSpace, runs: Runs, having: Candidate, without: Candidate, predicted: Predicted
-) -> Gain:
-    """Hold-out gain of one fit over another, over the readings that differ."""
-    scores, before = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
-    changed = _changed_readings(space, runs, simulated_reading(space, without), simulated_reading(space, having))
-    return _gain_over_changed(scores, before, changed)
-
-
-def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
-    """Gain of one hold-out score over another, over the changed readings only.
-
-    The kinds of blocks leave out the same readings, so their errors are correlated. The standard error is therefore
-    the mean over the kinds, weighted by readings.
-    """
-    kinds = score.by_kind
-    if not kinds:
-        return Gain(0.0, np.inf)
-    by_kind = {k: score.only(k).gain(over.only(k), changed, BLOCKS) for k in kinds}
-    weight = {k: float(np.sum(changed & np.isfinite(kinds[k] - over.by_kind[k]))) for k in kinds}
-    total_weight = sum(weight.values())
-    if not total_weight:
-        return Gain(0.0, np.inf)
-    mean, se = (
-        sum(weight[k] / total_weight * getattr(by_kind[k], x) for k in kinds if weight[k]) for x in ("mean", "se")
-    )
-    return Gain(mean, se, {k: gain.se for k, gain in by_kind.items()})
-
-
-def _hold_out_gain_of_curve(beside: BaseCurve, runs: Runs, predicted: Predicted) -> Gain:
-    """Hold-out gain by the smooth curve of the base's discrepancy.
-
-    Only rows within the range of the curve's variable in each fit count, because a curve does not extrapolate.
-    """
-    space, base, curve = beside.space, beside.base, beside.curve
-    kinds = blocks_room.predictable_blocks(runs, space.bare)
-    predictions = {
-        kind: predict_unseen(curve.problem, curve.z, list(blocks_by_name.values())).reading
-        for kind, blocks_by_name in kinds.items()
-    }
-    changed = _changed_readings(space, runs, simulated_reading(space, base), curve.reading)
-    score = prediction.score_predictions(space, runs, predictions)
-    score = _where_seen(beside, score, kinds)
-    return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
-
-
-def _where_seen(beside: BaseCurve, score: HeldOutScore, kinds: Mapping[str, Columns]) -> HeldOutScore:
-    """The hold-out score without rows outside the range of the curve's variable in their fit."""
-    seen = {kind: _within_seen_range(beside, list(by_name.values())) for kind, by_name in kinds.items()}
-    return dataclasses.replace(
-        score, by_kind={kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
-    )
-
-
-def _linear_gain_of_curve(beside: BaseCurve, runs: Runs, _: Predicted) -> Gain:
-    """The gain of `_hold_out_gain_of_curve` for a log, to first order at the base fit.
-
-    A simulated fit of a curve takes minutes, and windows have no simulation. A wave has its own phase in each run, so
-    only parts of runs can be predicted. Beyond the range that a fit saw, the curve is level: later readings remember
-    the error of an extrapolation.
-    """
-    space, linear, where, rows = beside.space, beside.left.linear, beside.where, len(runs)
-    kinds = blocks_room.predictable_blocks(runs, space.bare)
-    if where.variable in bases_room.ORDERS:
-        kinds = {blocks_room.PART: blocks_room.parts_of_runs(runs)}
-
-    def base_fit(_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.asarray(linear.jacobian), np.asarray(linear.residual)
-
-    def curve_fit(included: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if where.variable not in bases_room.VARIABLES:
-            return augment_with_columns(linear, location_columns(linear, beside.bases, where))
-        curve = fit_smooth_curve(linear, where.place, where.variable, included)
-        x, way = linear.curve_variable(where.place, where.variable)
-        columns = place_signature(linear, where.place, way[:, None] * curve.basis(x))
-        return augment_with_columns(linear, curve.scale * columns @ curve.root)
-
-    def residuals(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], out: np.ndarray) -> np.ndarray:
-        included = space.included & ~np.append(out, np.zeros(len(space.included) - rows, bool))
-        jacobian, residual = fit(included)
-        kept = np.append(kept_readings(space, out, linear.readings), np.ones(len(residual) - linear.readings, bool))
-        z = np.linalg.lstsq(jacobian[kept], -residual[kept], rcond=None)[0]
-        return (residual + jacobian @ z)[: linear.readings].reshape(len(space.included), -1)[:rows]
-
-    def score(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> HeldOutScore:
-        nothing = np.zeros((rows, linear.readings // len(space.included)))
-        errors = {
-            kind: sum((np.where(out[:, None], residuals(fit, out), 0.0) for out in by_name.values()), nothing)
-            for kind, by_name in kinds.items()
-        }
-        return prediction.score_readings(errors, nothing, nothing + 1.0, space.weight[:rows] > 0, kinds)
-
-    sd, none = np.asarray(space.bare.data.sd)[:rows], np.zeros(rows, bool)
-    changed = _changed_readings(space, runs, sd * residuals(base_fit, none), sd * residuals(curve_fit, none))
-    return _gain_over_changed(_where_seen(beside, score(curve_fit), kinds), score(base_fit), changed)
-
-
-def _within_seen_range(beside: BaseCurve, masks: Sequence[np.ndarray]) -> np.ndarray:
-    """True for rows whose value of the curve's variable lies within the range of the rows outside their block, shape
-    (rows,).
-
-    Args:
-        masks: mask of the rows of each block.
-    """
-    included, location, linear, rows = beside.space.included, beside.where, beside.left.linear, len(masks[0])
-    in_range = np.ones(rows, bool)
-    if location.variable not in bases_room.VARIABLES:
-        return in_range
-    x = np.asarray(linear.curve_variable(location.place, location.variable)[0], float)
-    if len(x) != len(included):  # turns, with different sides
-        return in_range
-    for mask in masks:
-        others = x[:rows][included[:rows] & ~mask]
-        if len(others):
-            in_range[mask] = (x[:rows][mask] >= others.min()) & (x[:rows][mask] <= others.max())
-    return in_range
-
-
-def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """True for readings that a mechanism changes noticeably, shape (rows, channels).
-
-    The change in sds is at least `CHANGED` of the rms change of the most changed channel. Other readings would dilute
-    the gain of the mechanism.
-    """
-    rows = len(runs)
-    sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
-    reading_changes = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
-    reading_changes = np.nan_to_num(reading_changes)
-    most = np.max(np.sqrt(np.sum(reading_changes**2, 0) / np.maximum(counts.sum(0), 1)))
-    return np.asarray(counts & (reading_changes >= CHANGED * most))
 
 
 # --- hold-out blocks ------------------------------------------------------------------------------------
