@@ -221,7 +221,7 @@ def test_a_column_that_varies_where_no_condition_does_is_named(measured):
     extras = {"torque_mNm": np.arange(6.0), "who": np.array(list("abcdef"))}
     dyno = dataclasses.replace(alike, columns=alike.columns | speeds, extras=extras)
     known = noise.noise_from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
-    with pytest.raises(BadData, match=r". torque_mNm varies between these rows and is not used. .*; no condition"):
+    with pytest.raises(BadData, match=r". torque_mNm varies from row to row and is not used. .*; no condition"):
         SettledRuns.check(dyno, known)
 
 

@@ -199,8 +199,6 @@ def check_described(
 
 def trace_mechanism(
     given: LoopInput,
-    screened: Screening,
-    left: Diagnosis,
     searched: SearchResult,
     chosen: tuple[candidates.Candidate, Diagnosis] | None,
     standing: loop_notes.NameSupport,
