@@ -9,7 +9,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from calibration.data import Priors
@@ -93,52 +93,70 @@ def discover(
     traced = keep("verdict", functools.partial(trace_verdict, given, ahead=True))
     if traced.settled and (table := given.settled()) is not None:
         ready, given = table, dataclasses.replace(table, progress=tell, keep=keep)
-    known = ready.noise
+    found, sensitivity, outstanding = _with_other_noises(
+        ready, traced, lambda: keep("result", lambda: assemble_result(given, traced)), tell, keep, left
+    )
     refuted = fit_notes.remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
-    notes: fit_notes.Notes = tuple(n for n in ready.notes if n not in refuted)
-    silent = channels.channel_names(known.silent)
-    factors = FACTORS.get(known.word, ())
-    # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
+    notes = (n for n in ready.notes if n not in refuted)
+    remarks = (*_remarks_on_noise(ready.noise, outstanding, notes), *found.remarks)
+    return dataclasses.replace(found, remarks=remarks, sensitivity=sensitivity)
+
+
+def _with_other_noises(
+    ready: loop_input.LoopInput,
+    traced: verdict.LoopStages,
+    assemble: Callable[[], DiscoveryResult],
+    tell: Callable[[fit_notes.Remark], None],
+    keep: StoreStage,
+    left: Callable[[], float | None],
+) -> tuple[DiscoveryResult, tuple[NoiseVerdict, ...], tuple[float, ...]]:
+    """The result, the verdicts at other noises, and the factors of those that the time limit left out.
+
+    Verdicts at other noises use the programs of the first one, so they run on other cores while the result is made.
+    """
+    known = ready.noise
+    silent, factors = channels.channel_names(known.silent), FACTORS.get(known.word, ())
     threads = compiling.Threads(min(2, max(1, CORES - 1)))  # each takes as much memory as the first
     sensitivity, outstanding = list[NoiseVerdict](), list[float]()
+
+    def trace_with_noise(factor: float) -> verdict.LoopStages:
+        noise = known.scaled(dict.fromkeys(silent, factor))
+        scaled = dataclasses.replace(ready, noise=noise, known=traced)
+        return keep(f"noise {factor:g}", functools.partial(trace_verdict, scaled))
+
     try:
         if factors:
             tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
-
-        def trace_with_noise(factor: float) -> verdict.LoopStages:
-            noise = known.scaled(dict.fromkeys(silent, factor))
-            scaled = dataclasses.replace(ready, noise=noise, known=traced)
-            return keep(f"noise {factor:g}", functools.partial(trace_verdict, scaled))
-
         verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
-        found = keep("result", lambda: assemble_result(given, traced))
+        found = assemble()
         if not all(one.done() for one in verdicts.values()):
             tell(fit_notes.progress_remark("others"))
         for f, pending in verdicts.items():
             try:
                 other = pending.result(left())
-                adequate, summary = (
-                    not other.ends.test.rejected_with_margin,
-                    verdict.verdict_summary(other, ready.numbers),
-                )
-                sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
+                continue
+            summary = verdict.verdict_summary(other, ready.numbers)
+            adequate = not other.ends.test.rejected_with_margin
+            sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
     finally:  # an interruption or the time limit waits for none of them
         threads.shutdown(wait=False, cancel_futures=True)
-    if outstanding:
-        notes = (fit_notes.Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
-    assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
+    return found, tuple(sensitivity), tuple(outstanding)
+
+
+def _remarks_on_noise(
+    noise: noise_room.Noise, outstanding: tuple[float, ...], notes: Iterable[fit_notes.Remark]
+) -> fit_notes.Notes:
+    """Remarks on verdicts that are outstanding, then `notes`, then remarks on the source of the noise."""
+    first = [fit_notes.Remark("outstanding", factors=outstanding, word=noise.word)] if outstanding else []
+    assumed, last = [c for c in noise.silent if c not in {s.channel for s in noise.along_series}], []
     if assumed:
-        notes = (
-            *notes,
-            fit_notes.Remark(
-                "assumed_noise", channels=channels.channel_names(assumed), usual=noise_room.default_noise(assumed)
-            ),
-        )
-    if known.along_series:
-        notes = (*notes, fit_notes.Remark("noise_from_series", noise=known.along_series))
-    return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
+        usual = noise_room.default_noise(assumed)
+        last.append(fit_notes.Remark("assumed_noise", channels=channels.channel_names(assumed), usual=usual))
+    if noise.along_series:
+        last.append(fit_notes.Remark("noise_from_series", noise=noise.along_series))
+    return (*first, *notes, *last)
 
 
 # --- the stages -----------------------------------------------------------------------------------------

@@ -273,6 +273,8 @@ def confirm_windows(given: LoopInput, windows: LoopInput, traced: LoopStages) ->
     if not confirmed.rejected or (not run.disturbed and excess_misfit(run.space, run.base) < noise):
         return None
     traced = dataclasses.replace(traced, run=run)
-    linear = (run.diagnosis(x, left).linear for x in (run.base, run.best))
-    refit, fit = (verdict.missed_channels(run.space, given.runs, given.noise, x) for x in linear)
-    return undescribed(refit) if fit else _lower_if_contradicted(windows, traced)
+    missed_by_base, missed = (
+        functools.partial(verdict.missed_channels, run.space, given.runs, given.noise, run.diagnosis(x, left).linear)
+        for x in (run.base, run.best)
+    )
+    return undescribed(missed_by_base()) if missed() else _lower_if_contradicted(windows, traced)

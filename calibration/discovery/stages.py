@@ -122,8 +122,8 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
         else known_stages.left.test.null
     )
     if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
-        for begin in given.later:
-            begin(screened.base)
+        while given.later:
+            given.later.pop()(screened.base)
     return screened, outliers.diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
 
 

@@ -24,12 +24,12 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.input_errors import BadData
+from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 
 MILLI = 1e-3
 GRAM_CM2 = 1e-7  # kg·m²
-COULOMB_PER_MAH = 3.6
 
 
 def _number_field(name: str, factor: float = 1.0) -> Any:

@@ -156,7 +156,7 @@ def instruction_for_further_runs(what: SimpleNamespace) -> str:
     if what.within.imposed != "voltage":
         by_kind = _of_level(what)
     else:
-        by_kind = {} if what.within.has_ground else _of_shaft(what)
+        by_kind = {} if what.within.has_ground else _advice_for_shaft(what)
     last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
     return (_advice_by_variable(what) | by_kind).get(what.variable, last)
 
@@ -260,7 +260,7 @@ def _brake(what: SimpleNamespace) -> str:
     return f"the brake's torque{_up_to(size * most, what.runs, unit)}"
 
 
-def _of_shaft(what: SimpleNamespace) -> dict[str, str]:
+def _advice_for_shaft(what: SimpleNamespace) -> dict[str, str]:
     """Advice by variable, for a shaft as the load."""
     crawl, top = f"Repeat with {_steps(what, 'crawl')}", menu.round_significant(what.top)
     return {

@@ -598,8 +598,10 @@ def roller_clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " lev
 def advance_samples(
     run: ClimbSystem, state: Any, first: Scalar, steps: Scalar, samples: int
 ) -> tuple[Any, ClimbRecord]:
-    """State after a part of a run with `samples` samples of `steps` steps each, from time `first` [s], and its
-    record.
+    """State and record of a part of a run with `samples` samples of `steps` steps each, from time `first` [s].
+
+    A record holds the last step of its sample, and the largest load on the base within it. Each sample updates the
+    verdict. The energy of a run that has ended stays as it is.
     """
 
     def sample(state: Any, k: Array) -> tuple[Any, ClimbRecord]:

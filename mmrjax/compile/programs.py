@@ -294,7 +294,7 @@ def _may_store_programs() -> bool:
 
 
 def _leaf_structure(leaf: Any) -> Any:
-    """Structure of a leaf: shape and kind of an array. Any other leaf is returned unchanged.
+    """Key of a leaf: shape, dtype and weak type of an array. Any other leaf with its type.
 
     Raises:
         Unnamed: an array of keys, or of another kind that NumPy does not have.

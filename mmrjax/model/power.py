@@ -9,9 +9,6 @@ from jaxtyping import Array, Bool
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.params import Scalar, parameter
 
-__all__ = ["COULOMB_PER_MAH", "Battery"]
-
-
 #: Capacity of the paper's cell [C]; Table 1 describes its discharge.
 CAPACITY = 2200 * COULOMB_PER_MAH
 

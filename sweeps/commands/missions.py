@@ -19,8 +19,7 @@ from mmrjax.missions.mission_steps import MARKS
 from mmrjax.missions.profile import PAIRS
 from mmrjax.model import balances, channels, contact, quantities
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.paper_tables import lateral_ratio
-from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.paper_tables import COULOMB_PER_MAH, lateral_ratio
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
@@ -97,7 +96,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
         folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, mission_batch_result.course))
         if not mission_batch_result.whole:
-            print_message("history.csv ends before the mission, which took more steps than can be saved")
+            print_message("history.csv is cut short: the mission has more steps than can be saved")
         result = run.SimulationResult(
             "simulate", config.model, robot, runs, mission_batch_result.table, mission_batch_result.to_json()
         )

@@ -19,8 +19,7 @@ from calibration.sensitivity.result import METHODS, OperatingPoints
 from calibration.sensitivity.study import Study
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax.model.conditions import OF_TURNS
-from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
-from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.paper_tables import COULOMB_PER_MAH, PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps import capabilities

@@ -20,7 +20,7 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import channels, quantities
-from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.signals import FLAGS, STATUSES
 from sweeps import config_campaign
 from sweeps.config import Sweep

@@ -124,7 +124,7 @@ def _mark_rows(axes: Axes, robot: Robot, rows: data.PaperRows) -> None:
 
 def draw_battery(robots: dict[str, Robot]) -> Figure:
     """Fig. 10: cell voltage over load current (a), no-load voltage (b) with the capacity."""
-    from mmrjax.model.power import COULOMB_PER_MAH
+    from mmrjax.model.paper_tables import COULOMB_PER_MAH
 
     fig, grid = new_figure(1, 2, 3.7)
     name, robot = next(iter(robots.items()))

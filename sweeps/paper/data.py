@@ -167,7 +167,7 @@ def gear_efficiency(robot: Robot, speed_rpm: float, torque_input: np.ndarray) ->
 
 def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.ndarray:
     """Voltage of one cell [V] over its load current I_b [A] (12), after a discharge [mAh]."""
-    from mmrjax.model.power import COULOMB_PER_MAH
+    from mmrjax.model.paper_tables import COULOMB_PER_MAH
 
     battery = robot.battery
     total = battery.voltage(jnp.asarray(current) - battery.current_other, discharge_mah * COULOMB_PER_MAH)
@@ -176,7 +176,7 @@ def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.
 
 def cell_no_load(robot: Robot, discharge_mah: np.ndarray) -> np.ndarray:
     """No-load voltage of one cell [V], eq. (13), over discharge [mAh]."""
-    from mmrjax.model.power import COULOMB_PER_MAH
+    from mmrjax.model.paper_tables import COULOMB_PER_MAH
 
     discharge = jnp.asarray(discharge_mah * COULOMB_PER_MAH)
     return np.asarray(robot.battery.voltage_no_load(discharge)) * np.ones_like(discharge_mah)

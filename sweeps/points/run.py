@@ -24,14 +24,13 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import params
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.power import COULOMB_PER_MAH
+from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import DONE, FLAGS, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress_bar
-from sweeps.console import progress_bar as bar
 from sweeps.pages import words
 from sweeps.points import scale
 from sweeps.points.axes import SweepPlan
@@ -176,8 +175,8 @@ def evaluate_runs(
     """
     job = job_of_run_table(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
-    with bar(len(runs), quiet=not slow or advance is not None) as progress_bar:
-        chunks = compute_chunks(job, folder, "chunk", advance or progress_bar)
+    with progress_bar(len(runs), quiet=not slow or advance is not None) as shown:
+        chunks = compute_chunks(job, folder, "chunk", advance or shown)
     columns = {row.column: chunks[row.name] for row in outputs.output_table(robot.channels)}
     further = {name: chunks[name] for name in fidelities.get_fidelity(config.model).columns}
     return {
@@ -355,7 +354,7 @@ def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
 
 
 def with_sd(value: float, sd: float, most: int) -> str:
-    """«4.19 ± 0.06», to two digits of the sd and at most `decimals` decimals."""
+    """«4.19 ± 0.06», to two digits of the sd and at most `most` decimals."""
     if not (np.isfinite(sd) and sd > 0):
         return f"{value:z.{most}f} ± {sd:.{most}f}"
     digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, most))

@@ -135,7 +135,7 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
     lead = f"Robot: **{robot_name}**. Requirements: **{found.asked.source}**."
     sections = []
     if changes and found.missed:
-        sections.append(Section("Changes that would meet them", _changes(found), "changes"))
+        sections.append(Section("Changes that would meet them", _blocks_of_changes(found), "changes"))
     corners = [o.at for o in found.outcomes]
     robot, figures = found.robot, [catalogue.figure("run.chart_of_corners", found.robot, corners)]
     if float(robot.gearbox.efficiency_load) < 1 or run_tables.lost_by_load(robot):
@@ -159,7 +159,8 @@ def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = 
     return catalogue.table("check.requirements", rows, terminal=terminal)
 
 
-def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
+def _blocks_of_changes(found: CheckResult) -> tuple[Note | Table, ...]:
+    """Table of the single changes that would meet a missed requirement."""
     rows: list[tuple[object, ...]] = []
     brief: list[int] = []
     for o in found.missed:
