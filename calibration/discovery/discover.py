@@ -107,7 +107,7 @@ def _with_other_noises(
     traced: verdict.LoopStages,
     assemble: Callable[[], DiscoveryResult],
     tell: Callable[[fit_notes.Remark], None],
-    keep: StoreStage,
+    keep: population.StoreStage,
     left: Callable[[], float | None],
 ) -> tuple[DiscoveryResult, tuple[NoiseVerdict, ...], tuple[float, ...]]:
     """The result, the verdicts at other noises, and the factors of those that the time limit left out.
@@ -146,7 +146,7 @@ def _with_other_noises(
 
 
 def _remarks_on_noise(
-    noise: noise_room.Noise, outstanding: tuple[float, ...], notes: Iterable[fit_notes.Remark]
+    noise: noise_room.Noise, outstanding: tuple[float, ...], notes: Iterable[fit_notes.Remark | str]
 ) -> fit_notes.Notes:
     """Remarks on verdicts that are outstanding, then `notes`, then remarks on the source of the noise."""
     first = [fit_notes.Remark("outstanding", factors=outstanding, word=noise.word)] if outstanding else []
