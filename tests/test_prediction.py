@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from calibration.data.runs import Runs
-from calibration.discovery import mechanism, prediction
+from calibration.discovery import prediction
 from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
 from calibration.inference.blocks import distinct_held_out_blocks, predictable_blocks, unpredictable_kinds
 
@@ -41,7 +41,7 @@ def test_predictions_that_were_scored_before_are_those_of_the_first_time(runs, m
         weight=np.ones_like(measured), bare=None, fit_of=lambda active, z: (None, z, active),
     )  # fmt: skip
     candidate, predicted = SimpleNamespace(active=("churning",), z=np.zeros(2)), {}
-    first, again = (mechanism.cached_hold_out_score(space, runs, candidate, predicted) for _ in range(2))
+    first, again = (prediction.cached_hold_out_score(space, runs, candidate, predicted) for _ in range(2))
     assert len(calls) == 1
     assert_array_equal(first.reading["slope"], measured + 1)
     assert_array_equal(again.reading["slope"], measured + 1)

@@ -88,11 +88,11 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     ladder = () if traced.searched is None else (traced.alike or traced.searched).ladder
     cost_there = decided[1].cost if curve is None else cost
     near, too_large = findings.listed_alternatives(*decided, cost_there, ladder, settings)
-    found: tuple[result.FoundEffect, ...] = ()
+    effects: tuple[result.FoundEffect, ...] = ()
     concealed: tuple[hidden.HiddenEffect, ...] = ()
     if traced.alike is not None:
         named, base_there = dataclasses.replace(best, cost=decided[1].cost), screened.base.candidate
-        found = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
+        effects = findings.found_effects(decided[0], base_there, named, traced.alike, diagnosis.test, settings)
         if not nameless and run is None:
             ask = observe.menu and not observe.long
             concealed = hidden.find_hidden_effects(
@@ -116,7 +116,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         included=included,
         outliers=tuple(int(numbers[k]) for k in screened.outliers if screened.base.space.bare.observe.reads),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
-        effects=found,
+        effects=effects,
         unnamed=None
         if beside is None or traced.where is None
         else findings.unnamed_discrepancy(beside, traced.where, diagnosis.test.p_value, len(runs)),

@@ -93,13 +93,13 @@ def discover(
     traced = keep("verdict", functools.partial(trace_verdict, given, ahead=True))
     if traced.settled and (table := given.settled()) is not None:
         ready, given = table, dataclasses.replace(table, progress=tell, keep=keep)
-    found, sensitivity, outstanding = _with_other_noises(
+    result, sensitivity, outstanding = _with_other_noises(
         ready, traced, lambda: keep("result", lambda: assemble_result(given, traced)), tell, keep, left
     )
     refuted = fit_notes.remarks_with_codes(ready.notes, "lost_motion") if traced.verdict == "none" else ()
     notes = (n for n in ready.notes if n not in refuted)
-    remarks = (*_remarks_on_noise(ready.noise, outstanding, notes), *found.remarks)
-    return dataclasses.replace(found, remarks=remarks, sensitivity=sensitivity)
+    remarks = (*_remarks_on_noise(ready.noise, outstanding, notes), *result.remarks)
+    return dataclasses.replace(result, remarks=remarks, sensitivity=sensitivity)
 
 
 def _with_other_noises(
@@ -128,7 +128,7 @@ def _with_other_noises(
         if factors:
             tell(fit_notes.progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
         verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
-        found = assemble()
+        result = assemble()
         if not all(one.done() for one in verdicts.values()):
             tell(fit_notes.progress_remark("others"))
         for f, pending in verdicts.items():
@@ -142,7 +142,7 @@ def _with_other_noises(
             sensitivity.append(NoiseVerdict(f, other.verdict, summary, other.members, adequate))
     finally:  # an interruption or the time limit waits for none of them
         threads.shutdown(wait=False, cancel_futures=True)
-    return found, tuple(sensitivity), tuple(outstanding)
+    return result, tuple(sensitivity), tuple(outstanding)
 
 
 def _remarks_on_noise(

@@ -49,26 +49,29 @@ def find_mechanism(
         ladder: candidates that were fitted.
         predicted: hold-out predictions of fits that are already known.
     """
-    space, base, left = beside.space, beside.base, beside.left
+    space, base, diagnosis = beside.space, beside.base, beside.left
     best = _best_by_family(space, ladder)
     pairs = _explained_by_family(space, base, ladder, best)
     explained, alike, less = _rank_families(beside, pairs, settings)
     location_families, most = _families_of_location(beside.where), max(explained.values())
-    named = [(f, True) for f in (*alike, *less) if f in best and _explained(pairs[f]) >= HALF * most]
+    by_name = [(f, True) for f in (*alike, *less) if f in best and _explained(pairs[f]) >= HALF * most]
     curved = location_families[0] in alike and space.bare.observe.reads
     over_time, excess = space.bare.observe.over_time, excess_misfit(space, base)
-    fit = np.asarray(left.linear.jacobian), np.asarray(left.linear.residual)
-    run, changed, root = changed_run(space, left.linear, beside.bases, *fit) if over_time else (None, "", 0.0)
+    fit = np.asarray(diagnosis.linear.jacobian), np.asarray(diagnosis.linear.residual)
+    run, changed, root = changed_run(space, diagnosis.linear, beside.bases, *fit) if over_time else (None, "", 0.0)
     kinds = blocks_room.predictable_blocks(runs, space.bare).values()
     blocks = [mask for blocks_by_name in kinds for mask in blocks_by_name.values()]
     curves = functools.cache(functools.partial(_curves_without_blocks, beside, blocks))
     mechanisms: list[Mechanism] = []
-    for leader, with_effects in (*named[:1], *([(location_families[0], False)] if curved else []), *named[1:]):
+    for leader, with_effects in (*by_name[:1], *([(location_families[0], False)] if curved else []), *by_name[1:]):
         effects: Names = ()
         families = (leader, *alike) if with_effects else (leader, *alike, *less)
         if with_effects:
             names = best[leader].effects
-            if evidence_over_curves(space, best[leader], base, names, left.linear, beside.bases, settings) < -BETTER:
+            if (
+                evidence_over_curves(space, best[leader], base, names, diagnosis.linear, beside.bases, settings)
+                < -BETTER
+            ):
                 # A driver whose form a curve refutes is no better than those that curves cannot separate.
                 families = (*families, *location_families)
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
@@ -76,7 +79,9 @@ def find_mechanism(
             effects, gain = gains.best_hold_out_gain(
                 space, runs, ladder, best[leader], base, pairs[leader], predicted
             )
-            again = recurrence_of_families(space, base, best[leader], left, families, beside.bases, blocks, settings)
+            again = recurrence_of_families(
+                space, base, best[leader], diagnosis, families, beside.bases, blocks, settings
+            )
             if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_recurrence(*curves(), families, settings))
         else:
@@ -113,19 +118,19 @@ def _rank_families(
     return explained, tuple(alike), tuple(less)
 
 
-def _with_ammeter_families(beside: BaseCurve, found: Mechanism, settings: Settings) -> Mechanism:
+def _with_ammeter_families(beside: BaseCurve, mechanism: Mechanism, settings: Settings) -> Mechanism:
     """The mechanism with ammeter errors that explain the data as well, see `ammeter_families`."""
     space, linear = beside.space, beside.left.linear
-    if found.effects:
+    if mechanism.effects:
         columns = np.asarray(linear.signatures)[
-            :, [space.library.names[k] in found.effects for k in space.library.of]
+            :, [space.library.names[k] in mechanism.effects for k in space.library.of]
         ]
     else:
         columns = location_columns(linear, beside.bases, beside.where)
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    also = ammeter_families(space, *fit, columns, found.families[0], settings)
-    families = tuple(dict.fromkeys((*found.families, *also)))
-    return dataclasses.replace(found, families=families, ammeter=errors_of_ammeters(space, families))
+    also = ammeter_families(space, *fit, columns, mechanism.families[0], settings)
+    families = tuple(dict.fromkeys((*mechanism.families, *also)))
+    return dataclasses.replace(mechanism, families=families, ammeter=errors_of_ammeters(space, families))
 
 
 def _explained(fits: Fits) -> float:
@@ -197,8 +202,8 @@ def _curves_without_blocks(beside: BaseCurve, blocks: Sequence[np.ndarray]) -> t
     explained = []
     for out in (np.zeros(len(space.included), bool), *blocks):
         kept = kept_readings(space, out, linear.readings)
-        left = np.append(kept, np.ones(len(residual) - len(kept), bool))
-        explains = explained_function(jacobian[left], residual[left])
+        kept_residuals = np.append(kept, np.ones(len(residual) - len(kept), bool))
+        explains = explained_function(jacobian[kept_residuals], residual[kept_residuals])
         explained.append([explains(c[kept]) for c in columns])
     return families, np.array(explained)
 
