@@ -64,6 +64,7 @@ from worlds.paper import NOMINAL, G, Side, soft_sign
 
 LENGTH = 0.300  # wheelbase, and of the track on the ground [m], Table 6
 WIDTH = 0.243  # between the middles of the movers: half of B_b 208 and B_T 278 mm [m], Table 6
+REACH = 0.705  # of the track with its levers level [m], Table 6
 #: J_ψ [kg·m²] of Table 7's parts (issue 28): wheels, tracks with folded and with outstretched levers.
 INERTIA_YAW = {"4W2T": 0.19, "6T2A": 0.23, "outstretched": 0.33}
 #: Height of the centre of mass above the ground without and of a payload's [m]: axles 43.7 and 50 mm.
@@ -361,6 +362,16 @@ def rates(robot: Robot, inputs: Inputs, t: float, state: Sequence[float]) -> np.
     return instant(robot, inputs, t, state).rates
 
 
+def stored(robot: Robot, inputs: Inputs, state: Sequence[float]) -> float:
+    """Kinetic, magnetic and potential energy [J]."""
+    X, _, _, v_x, v_y, omega = state[:6]
+    energy = robot.mass * (v_x**2 + v_y**2) / 2 + robot.inertia * omega**2 / 2
+    energy += robot.mass * G * math.sin(inputs.slope) * X
+    for side, I, w in zip(robot.sides, state[6:8], state[8:10], strict=True):
+        energy += side.J_w * (w / side.i) ** 2 / 2 + side.J_d * w**2 / 2 + side.L * I**2 / 2
+    return energy
+
+
 @dataclasses.dataclass
 class History:
     """A run: times [s], states (times, 11), energy in and by sink since the start (times,) [J]."""
@@ -496,6 +507,52 @@ def circling(robot: Robot, inputs: Inputs, guess: Sequence[float] | None = None)
                 turned = np.array([s.r * y[8 + k] / s.i for k, s in enumerate(robot.sides)])
                 return Circling(*y[3:6], now.current, y[8:10], turned, now, left)
     return None
+
+
+@dataclasses.dataclass
+class Straight:
+    """Straight travel at a constant heading: v_x, v_y [m/s], I [A], w [rad/s]. `steer` is what the right side gets
+    more and the left side less than the mean that was asked for [V, or m/s], else the robot would turn."""
+
+    v_x: float
+    v_y: float
+    steer: float
+    I: np.ndarray
+    w: np.ndarray
+    instant: Instant
+    residual: float
+
+
+def straight(robot: Robot, mean: float, slope: float, heading: float, kind: str = "voltage") -> Straight | None:
+    """Steady straight travel on a slope, None where no root is found (it slides, or has no such travel)."""
+    speed = kind == "speed"
+    side = robot.sides[0]
+
+    def inputs(steer: float) -> Inputs:
+        return Inputs(mean - steer, mean + steer, kind, slope)
+
+    def state(z: np.ndarray) -> np.ndarray:
+        y = np.zeros(len(STATES))
+        y[2], y[3], y[4] = heading, z[0], z[1]
+        if not speed:
+            y[6:8], y[8:10] = 10 * z[3:5], 1000 * z[5:7]
+        return y
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        d = rates(robot, inputs(z[2]), 0.0, state(z))
+        rest = [] if speed else [*(d[6:8] * side.L / 10), *(d[8:10] * side.J_d * 10)]
+        return np.array([d[3] / G, d[4] / G, d[5] * robot.inertia, *rest])
+
+    I, w, V = (0.0, mean * side.i / side.r, 0.99 * mean) if speed else alone(side, mean, slope, heading)
+    rest = [] if speed else [I / 10] * 2 + [w / 1000] * 2
+    drift = 0.5 * side.V_s * math.sin(slope) * math.sin(heading)
+    found = root(residual, np.array([V, drift, 0.0, *rest]), tol=1e-14)
+    left = float(np.abs(residual(found.x)).max())
+    if left > 1e-10:
+        return None
+    y, now = state(found.x), instant(robot, inputs(found.x[2]), 0.0, state(found.x))
+    w_both = np.full(2, w) + np.array([-1, 1]) * (found.x[2] * side.i / side.r) if speed else y[8:10]
+    return Straight(*found.x[:3], now.current, w_both, now, left)
 
 
 # --- closed forms ----------------------------------------------------------------------------------------
