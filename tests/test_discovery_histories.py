@@ -130,7 +130,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
 
 @pytest.mark.slow
 def test_wave_without_a_name_is_in_the_result(oval):
-    """By its place alone: a log is traced on readings that are linear about one fit, to which no curve is added."""
+    """By its place alone: in a log, each run has a phase of its own."""
     found = ANALYST.result(oval.traced, oval.runs)
     where, location = found.summary.where, locate_discrepancy(oval.left, oval.bases, oval.space.included)
     assert found.verdict in WITHOUT_NAME and found.effects == () and found.unnamed is None

@@ -13,9 +13,10 @@ from numpy.testing import assert_allclose
 from synthetic import SETTLED, table
 from worlds import laws, settled, tables
 
-from calibration.discovery import preference, standing
+from calibration.discovery import findings, preference, standing
 from calibration.discovery.candidates import Candidate, fill_slots
-from calibration.discovery.discrepancy import locate_discrepancy
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
@@ -218,6 +219,30 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
     offered = (*waves, SimpleNamespace(names=(("track", "speed_motor"),)))
     found = evidence_over_curves(space, best, without, ("e0",), linear, offered, SimpleNamespace(slots=4))
     assert NameTest("e0", 9.0, 3.3, (), found).stands == named
+
+
+def test_the_curve_of_a_log_is_that_of_bayesian_least_squares_at_its_base(toy, monkeypatch):
+    monkeypatch.setattr("calibration.discovery.discrepancy.propose_formula", lambda *_, **__: None)
+    where = DiscrepancyLocation("track", "speed_motor", ("track",), (), 0.0, 0.0)
+    rig = SimpleNamespace(shows_voltage=True)
+    space = SimpleNamespace(included=toy.counts, bare=SimpleNamespace(base=SimpleNamespace(rig=rig)))
+    beside = BaseCurve(space, None, SimpleNamespace(linear=toy.linear), ())
+    vars(beside)["where"] = where  # in place of a search
+    found = findings.unnamed_discrepancy_of_log(beside, where, 0.01)
+    curve, unit, _ = beside.linear_curve
+    raw = bases.place_signature(toy.linear, "track", curve.basis(toy.linear.variable("speed_motor")))
+    design = np.hstack([toy.slopes, curve.scale * raw @ curve.root])
+    covariance = np.linalg.inv(np.eye(design.shape[1]) + design.T @ design)
+    shape = curve.scale * curve.basis(found.at) @ curve.root
+    assert_allclose(found.value, -shape @ (covariance @ design.T @ toy.readings)[4:], rtol=1e-6)
+    assert_allclose(found.sd, np.sqrt(np.diag(shape @ covariance[4:, 4:] @ shape.T)), rtol=1e-6)
+    assert (found.unit, found.families, found.over) == (unit, (where.family,), None)
+    assert (
+        findings.unnamed_discrepancy_of_log(
+            beside, dataclasses.replace(where, variable=next(iter(bases.ORDERS))), 0.01
+        )
+        is None
+    )
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):

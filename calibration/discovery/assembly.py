@@ -117,9 +117,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         outliers=tuple(int(numbers[k]) for k in screened.outliers if screened.base.space.bare.observe.reads),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=effects,
-        unnamed=None
-        if beside is None or traced.where is None
-        else findings.unnamed_discrepancy(beside, traced.where, diagnosis.test.p_value, len(runs)),
+        unnamed=_unnamed_discrepancy(traced, beside, diagnosis.test.p_value, len(runs)),
         remains=None if nameless or traced.alike is None else traced.where,
         next_experiment=_next_experiment(decided[0], traced, settings),
         cannot_see=findings.invisible_effects(decided[0], diagnosis.scores, settings),
@@ -172,6 +170,17 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
             *result_remarks.loop_remarks(assembled),
         ),
     )
+
+
+def _unnamed_discrepancy(
+    traced: verdict.LoopStages, fitted: discrepancy.BaseCurve | None, p_value: float, rows: int
+) -> result.UnnamedDiscrepancy | None:
+    """The discrepancy without a name, with its fitted curve or, for a log, its linear one."""
+    if traced.where is None or traced.beside is None or traced.verdict not in WITHOUT_NAME:
+        return None
+    if fitted is None:
+        return findings.unnamed_discrepancy_of_log(traced.beside, traced.where, p_value)
+    return findings.unnamed_discrepancy(fitted, traced.where, p_value, rows)
 
 
 def _hold_out_gains(

@@ -40,8 +40,6 @@ from mmrjax.model.robot import Robot
 
 #: Number of starts of the curve's fit, from the linear estimate to zero.
 STARTS = 8
-#: Number of plotted points of a curve.
-POINTS = 61
 #: Extra evidence required of a curve over the supply's voltage, which acts only through currents and speeds [σ²].
 INDIRECT = 6.0
 #: Balances of torques and slip.
@@ -273,9 +271,7 @@ def fit_discrepancy(
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
     z = np.asarray(optima.z[k])
     covariance = np.asarray(optima.covariance[k])
-    grid = np.linspace(at_base.low, at_base.high, POINTS)
-    shape = at_base.scale * at_base.basis(grid) @ at_base.root
-    ordinates = covariance[inner:, inner:]
+    grid, values, sd = at_base.drawn(z[inner:], covariance[inner:, inner:])
     robot = problem.robot(jnp.asarray(z))  # also has the absent effects of the slots
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {at_base.effect}
     return Discrepancy(
@@ -286,8 +282,8 @@ def fit_discrepancy(
         robot=dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names)),
         defect=balance_error_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
-        curve=shape @ z[inner:],
-        sd=np.sqrt(np.einsum("ij,jk,ik->i", shape, ordinates, shape)),
+        curve=values,
+        sd=sd,
         chi2=(2 * base.cost, 2 * float(optima.cost[k])),
         z=z,
         covariance=covariance,
@@ -330,6 +326,14 @@ class BaseCurve:
     def curve(self) -> Discrepancy:
         """The curve, fitted together with the base."""
         return fit_discrepancy(self.space, self.base, self.left.linear, self.where.place, self.where.variable)
+
+    @functools.cached_property
+    def linear_curve(self) -> tuple[SmoothCurve, str, Proposal]:
+        """The curve to first order at the base fit, the unit of its balance, and a formula for it."""
+        linear, where, included = self.left.linear, self.where, self.space.included
+        curve = fit_smooth_curve(linear, where.place, where.variable, included)
+        voltage = self.space.bare.base.rig.shows_voltage
+        return curve, PLACES[where.place][0], propose_formula(linear, where.place, included, curve, voltage=voltage)
 
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:

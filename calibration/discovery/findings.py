@@ -147,6 +147,34 @@ def unnamed_discrepancy(
     )
 
 
+def unnamed_discrepancy_of_log(
+    beside: BaseCurve, where: DiscrepancyLocation, p_value: float
+) -> result.UnnamedDiscrepancy | None:
+    """The same for a log, to first order at its base fit. None for a wave, which has its own phase in each run."""
+    if where.variable in bases.ORDERS:
+        return None
+    curve, unit, formula = beside.linear_curve
+    grid, value, sd = curve.drawn(curve.start, curve.covariance)
+    happens = bases.window_from_name(where.variable)
+    return result.UnnamedDiscrepancy(
+        **dataclasses.asdict(where),
+        unit=unit,
+        families=(where.family,),
+        window=None if happens is None else dataclasses.asdict(happens),
+        effect=curve.effect,
+        p_value=p_value,
+        score=curve.explained,
+        score_free_in_each_run=None,
+        at=grid,
+        value=value,
+        sd=sd,
+        over=None,
+        defect=None,
+        defect_sd=None,
+        proposal=formula,
+    )
+
+
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
 ) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:

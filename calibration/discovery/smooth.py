@@ -29,6 +29,8 @@ BESIDE = 0.3
 NARROW = 0.05
 #: Prior sd of a curve's level and trend, over that of its shape.
 WIDE = 3.0
+#: Number of plotted points of a curve.
+POINTS = 61
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +43,7 @@ class SmoothCurve:
         scale: amplitude of the curve [unit of the balance].
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
+        covariance: their posterior covariance, with the base refitted to first order.
         explained: decrease of χ² [σ²].
         freedom: effective number of parameters.
         evidence: twice the log of the marginal likelihood ratio of curve and no curve [σ²].
@@ -53,6 +56,7 @@ class SmoothCurve:
     scale: float
     root: np.ndarray
     start: np.ndarray
+    covariance: np.ndarray
     explained: float
     freedom: float
     evidence: float
@@ -82,6 +86,12 @@ class SmoothCurve:
     def basis(self, x: np.ndarray) -> np.ndarray:
         """Weight of each ordinate at x, shape (points, ordinates)."""
         return _basis_functions(self.variable, x, self.low, self.high)
+
+    def drawn(self, z: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values of the variable, and the curve and its sd there, for ordinates in prior coordinates."""
+        grid = np.linspace(self.low, self.high, POINTS)
+        shape = self.scale * self.basis(grid) @ self.root
+        return grid, shape @ z, np.sqrt(np.einsum("ij,jk,ik->i", shape, covariance, shape))
 
 
 def _basis_functions(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -130,7 +140,9 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
             degrees_taken = float(np.trace(np.linalg.solve(information, inner)))
-            best = evidence, (scale, root, z, float(explained), degrees_taken, 2 * float(evidence))
+            best = evidence, (
+                scale, root, z, np.linalg.inv(information), float(explained), degrees_taken, 2 * float(evidence)
+            )  # fmt: skip
     name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
     return SmoothCurve(name, variable, low, high, *best[1])
 

@@ -294,7 +294,10 @@ def _blocks_of_missing_terms(
 def _curve(found: DiscoveryResult) -> Figure:
     """Figure of the smooth curve for an unnamed discrepancy."""
     assert found.unnamed is not None
-    key = "tentative" if found.effects else "written" if found.written else "left"
+    if isinstance(found.detail, TimeStatistics):
+        key = "log"
+    else:
+        key = "tentative" if found.effects else "written" if found.written else "left"
     return catalogue.figure(
         "loop.curve", found.unnamed, words=(catalogue.text(f"loop.curve-{key}", found.unnamed.effect),)
     )
