@@ -330,10 +330,14 @@ class BaseCurve:
     @functools.cached_property
     def linear_curve(self) -> tuple[SmoothCurve, str, Proposal]:
         """The curve to first order at the base fit, the unit of its balance, and a formula for it."""
-        linear, where, included = self.left.linear, self.where, self.space.included
-        curve = fit_smooth_curve(linear, where.place, where.variable, included)
+        linear, location, included = self.left.linear, self.where, self.space.included
+        curve = fit_smooth_curve(linear, location.place, location.variable, included)
         voltage = self.space.bare.base.rig.shows_voltage
-        return curve, PLACES[where.place][0], propose_formula(linear, where.place, included, curve, voltage=voltage)
+        return (
+            curve,
+            PLACES[location.place][0],
+            propose_formula(linear, location.place, included, curve, voltage=voltage),
+        )
 
     @functools.cached_property
     def diagnosis(self) -> Diagnosis:

@@ -115,20 +115,20 @@ def linear_gain_of_curve(beside: BaseCurve, runs: Runs, _: Predicted) -> Gain:
     only parts of runs can be predicted. Beyond the range that a fit saw, the curve is level: later readings remember
     the error of an extrapolation.
     """
-    space, linear, where, rows = beside.space, beside.left.linear, beside.where, len(runs)
+    space, linear, location, rows = beside.space, beside.left.linear, beside.where, len(runs)
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    if where.variable in bases_room.ORDERS:
+    if location.variable in bases_room.ORDERS:
         kinds = {blocks_room.PART: blocks_room.parts_of_runs(runs)}
 
     def base_fit(_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(linear.jacobian), np.asarray(linear.residual)
 
     def curve_fit(included: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if where.variable not in bases_room.VARIABLES:
-            return augment_with_columns(linear, location_columns(linear, beside.bases, where))
-        curve = fit_smooth_curve(linear, where.place, where.variable, included)
-        x, way = linear.curve_variable(where.place, where.variable)
-        columns = place_signature(linear, where.place, way[:, None] * curve.basis(x))
+        if location.variable not in bases_room.VARIABLES:
+            return augment_with_columns(linear, location_columns(linear, beside.bases, location))
+        curve = fit_smooth_curve(linear, location.place, location.variable, included)
+        x, way = linear.curve_variable(location.place, location.variable)
+        columns = place_signature(linear, location.place, way[:, None] * curve.basis(x))
         return augment_with_columns(linear, curve.scale * columns @ curve.root)
 
     def residuals(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], out: np.ndarray) -> np.ndarray:
