@@ -236,7 +236,7 @@ def test_the_curve_of_a_log_is_that_of_bayesian_least_squares_at_its_base(toy, m
     shape = curve.scale * curve.basis(found.at) @ curve.root
     assert_allclose(found.value, -shape @ (covariance @ design.T @ toy.readings)[4:], rtol=1e-6)
     assert_allclose(found.sd, np.sqrt(np.diag(shape @ covariance[4:, 4:] @ shape.T)), rtol=1e-6)
-    assert (found.unit, found.families, found.over) == (unit, (where.family,), None)
+    assert (found.unit, found.family, found.over) == (unit, where.family, None)
     assert (
         findings.unnamed_discrepancy_of_log(
             beside, dataclasses.replace(where, variable=next(iter(bases.ORDERS))), 0.01

@@ -102,6 +102,11 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
     summary, kind = verdict.verdict_summary(traced, numbers), type(observe)
     with np.errstate(invalid="ignore"):
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
+    unnamed, p_value = None, diagnosis.test.p_value
+    if beside is not None and traced.where is not None:
+        unnamed = findings.unnamed_discrepancy(beside, traced.where, p_value, len(runs))
+    elif nameless and traced.beside is not None and traced.where is not None:
+        unnamed = findings.unnamed_discrepancy_of_log(traced.beside, traced.where, p_value)
     assembled = result.DiscoveryResult(
         verdict=traced.verdict,
         summary=summary,
@@ -117,7 +122,7 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
         outliers=tuple(int(numbers[k]) for k in screened.outliers if screened.base.space.bare.observe.reads),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=effects,
-        unnamed=_unnamed_discrepancy(traced, beside, diagnosis.test.p_value, len(runs)),
+        unnamed=unnamed,
         remains=None if nameless or traced.alike is None else traced.where,
         next_experiment=_next_experiment(decided[0], traced, settings),
         cannot_see=findings.invisible_effects(decided[0], diagnosis.scores, settings),
@@ -170,17 +175,6 @@ def assemble_result(given: loop_input.LoopInput, traced: verdict.LoopStages) -> 
             *result_remarks.loop_remarks(assembled),
         ),
     )
-
-
-def _unnamed_discrepancy(
-    traced: verdict.LoopStages, fitted: discrepancy.BaseCurve | None, p_value: float, rows: int
-) -> result.UnnamedDiscrepancy | None:
-    """The discrepancy without a name, with its fitted curve or, for a log, its linear one."""
-    if traced.where is None or traced.beside is None or traced.verdict not in WITHOUT_NAME:
-        return None
-    if fitted is None:
-        return findings.unnamed_discrepancy_of_log(traced.beside, traced.where, p_value)
-    return findings.unnamed_discrepancy(fitted, traced.where, p_value, rows)
 
 
 def _hold_out_gains(

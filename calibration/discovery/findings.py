@@ -131,8 +131,6 @@ def unnamed_discrepancy(
     return result.UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=curve.unit,
-        families=(where.family,),
-        window=None if happens is None else dataclasses.asdict(happens),
         effect=curve.effect,
         p_value=p_value,
         score=float(curve.chi2[0] - curve.chi2[1]),
@@ -154,25 +152,11 @@ def unnamed_discrepancy_of_log(
     if where.variable in bases.ORDERS:
         return None
     curve, unit, formula = beside.linear_curve
-    grid, value, sd = curve.drawn(curve.start, curve.covariance)
-    happens = bases.window_from_name(where.variable)
+    at, value, sd = curve.drawn(curve.start, curve.covariance)
     return result.UnnamedDiscrepancy(
-        **dataclasses.asdict(where),
-        unit=unit,
-        families=(where.family,),
-        window=None if happens is None else dataclasses.asdict(happens),
-        effect=curve.effect,
-        p_value=p_value,
-        score=curve.explained,
-        score_free_in_each_run=None,
-        at=grid,
-        value=value,
-        sd=sd,
-        over=None,
-        defect=None,
-        defect_sd=None,
-        proposal=formula,
-    )
+        **dataclasses.asdict(where), unit=unit, effect=curve.effect, p_value=p_value, score=curve.explained, at=at,
+        value=value, sd=sd, proposal=formula,
+    )  # fmt: skip
 
 
 def listed_alternatives(

@@ -95,8 +95,7 @@ def hold_out_gain_of_curve(beside: BaseCurve, runs: Runs, predicted: Predicted) 
         for kind, blocks_by_name in kinds.items()
     }
     changed = _changed_readings(space, runs, simulated_reading(space, base), curve.reading)
-    score = prediction.score_predictions(space, runs, predictions)
-    score = _where_seen(beside, score, kinds)
+    score = _where_seen(beside, prediction.score_predictions(space, runs, predictions), kinds)
     return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
 
 

@@ -67,6 +67,12 @@ class DiscrepancyLocation:
         return tuple(dict.fromkeys(map(bases.balance_of, self.alike)))
 
     @property
+    def window(self) -> dict[str, str | float] | None:
+        """Axis, begin and end of a temporary change. None for other discrepancies."""
+        happens = bases.window_from_name(self.variable)
+        return None if happens is None else dataclasses.asdict(happens)
+
+    @property
     def family(self) -> str:
         """Equation and driving variable, in the words of `Effect.family`."""
         happens = bases.window_from_name(self.variable)

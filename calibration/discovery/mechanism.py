@@ -101,8 +101,9 @@ def find_mechanism(
 def _rank_families(
     beside: BaseCurve, pairs: dict[str, Fits], settings: Settings
 ) -> tuple[dict[str, float], Names, Names]:
-    """What the effects of each family and the curve explain [σ²], the families that explain most, and those that the
-    curve cannot separate from its own if it explains most.
+    """Decrease of χ² by the effects of each family and by the curve [σ²], and the families that explain most.
+
+    If the curve explains most, also other families of its location.
     """
     families = _families_of_location(beside.where)
     if beside.space.bare.observe.over_time:  # fits of curves take long, and windows have none

@@ -112,33 +112,29 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
     Attributes:
         unit: unit of the balance.
-        families: equation and driving variable in words, as in `FoundEffect`.
-        window: axis, begin and end of a temporary change. None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
         p_value: family-wise p-value.
         score: decrease of χ² by the curve [σ²].
-        score_free_in_each_run: score of a wave with its own phase in each run. None for other curves.
         at: values of the variable [SI].
         value, sd: value and standard deviation of the curve there [unit].
+        proposal: proposed formula.
+        score_free_in_each_run: score of a wave with its own phase in each run. None for other curves.
         over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
             plus the row's residual, along the travel. None if single rows do not show it.
-        proposal: proposed formula.
     """
 
     unit: str
-    families: Names
-    window: dict[str, str | float] | None
     effect: str
     p_value: float
     score: float
-    score_free_in_each_run: float | None
     at: np.ndarray
     value: np.ndarray
     sd: np.ndarray
-    over: np.ndarray | None
-    defect: np.ndarray | None
-    defect_sd: np.ndarray | None
     proposal: formula.Proposal
+    score_free_in_each_run: float | None = None
+    over: np.ndarray | None = None
+    defect: np.ndarray | None = None
+    defect_sd: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -653,9 +649,8 @@ def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
     return {
         "name": "unnamed",
         "class": [],
-        **writing.entries_of(
-            d, "families", "balance", "channel", "balances_alike", "variable", "variables_alike", "window"
-        ),
+        "families": (d.family,),
+        **writing.entries_of(d, "balance", "channel", "balances_alike", "variable", "variables_alike", "window"),
         "unit": d.unit,
         "equation": None,
         "parameters": {},
