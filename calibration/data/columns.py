@@ -8,7 +8,7 @@ import functools
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from calibration.data import Names
+from calibration.data import Mapped, Names
 from calibration.data.input_errors import BadData
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -124,7 +124,7 @@ class Layout:
     inherits: bool = True
     configurations: Names = ()
     instruments: tuple[Instrument, ...] = ()
-    mapped: tuple[tuple[str, str, float], ...] = ()
+    mapped: Mapped = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
     supply: float = 0.0
 

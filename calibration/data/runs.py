@@ -18,6 +18,7 @@ import numpy as np
 from calibration.data import (
     Columns,
     Json,
+    Mapped,
     Names,
     clock,
     column_names,
@@ -32,7 +33,6 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
 from calibration.data.sources.columnar import EXPECTED
-from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
 from calibration.data.unused_readings import drop_computed_torques, without_held, without_unread
 from mmrjax.model import channels
@@ -76,13 +76,11 @@ def read_runs(
         BadConfiguration: the preset does not exist or has a mistake.
     """
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
-    preset = None
-    if columns is not None:
-        preset = (
-            presets_file.preset_of_table(columns)
-            if isinstance(columns, Mapping)
-            else presets_file.find_preset(columns)
-        )
+    preset = presets_file.NONE
+    if isinstance(columns, Mapping):
+        preset = presets_file.preset_of_table(columns)
+    elif columns is not None:
+        preset = presets_file.find_preset(columns)
     if isinstance(source, str | Path) and str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
             arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
@@ -93,7 +91,7 @@ def read_runs(
         if is_plain_file and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         arrays, mapped = reading.read_columns(source, layout, preset, between)
-    has_known_columns = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
+    has_known_columns = bool(preset.columns) or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
     if not has_known_columns and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(

@@ -104,6 +104,10 @@ class Runs:
         """True if the table has this column."""
         return column in self.columns
 
+    def heading(self, column: str) -> str:
+        """Name of a column in the file."""
+        return self.headings.get(column, column)
+
     @property
     def turns(self) -> bool:
         """True if its robot is free to turn: its sides are driven independently, or it does not head uphill."""

@@ -199,7 +199,7 @@ MOVES, HELD, SLIGHTLY, NOISY = 0.05, 0.1, 0.02, 0.8
 def drive_heading(runs: Runs) -> str:
     """Name in the file of the column that drives the motors."""
     column = "duty" if runs.has("duty") else runs.layout.imposed_column
-    return runs.headings.get(column, column)
+    return runs.heading(column)
 
 
 def without_held(runs: Runs) -> Runs:
@@ -228,7 +228,7 @@ def without_held(runs: Runs) -> Runs:
                 columns[column][held[1:]] = np.nan
                 cure = "Such rows are left out"
             notes[column] = (
-                f"{runs.source} rows {held[0] + 1} to {held[-1] + 1}, {runs.headings.get(column, column)}: the same "
+                f"{runs.source} rows {held[0] + 1} to {held[-1] + 1}, {runs.heading(column)}: the same "
                 f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
             )
     return dataclasses.replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))
