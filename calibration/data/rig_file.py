@@ -338,14 +338,6 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 
 
-def recentre_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """Robot whose stated priors are centred on new parameter values, with unchanged widths."""
-    if not set(values) & {name for name, _, _ in robot.rig.priors}:
-        return robot
-    priors = tuple((name, float(values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
-
-
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that describe a rig: the first lines, then those of each table."""
     head = [

@@ -332,8 +332,9 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str) -> Robot:
             sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in new_values.items()})
-    robot = rig_file.recentre_priors(robot, new_values)
-    robot = dataclasses.replace(robot, sides=settings.pop("sides", robot.sides))
+    priors = tuple((name, float(new_values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
+    rig = dataclasses.replace(robot.rig, priors=priors)  # centred on the new values
+    robot = dataclasses.replace(robot, sides=settings.pop("sides", robot.sides), rig=rig)
     for name, value in settings.items():
         part, _, key = name.partition(".")
         robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})

@@ -112,7 +112,8 @@ STILL = 0.02
 
 def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table may omit, and rejects values that contradict each other."""
-    _add_default_columns(name, columns, rows, layout)
+    if not layout.complete:
+        _add_default_columns(name, columns, rows, layout)
     check_rows(name, columns, _contradictions_in_rows(name, columns, layout))
     if "duty" in columns:
         columns["duty"] = np.nan_to_num(columns["duty"])
@@ -206,8 +207,6 @@ def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
 
 def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may omit: its only configuration, and conditions with their usual value."""
-    if layout.complete:
-        return
     if "configuration" not in columns and layout.configurations:
         labels = np.unique(columns.get("surface", np.zeros(0, str)))
         configuration = configuration_tables.common_configuration(layout.configurations, labels)

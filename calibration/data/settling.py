@@ -172,22 +172,18 @@ class Settled:
         """Settled runs as columns of a table of runs."""
         stretches = self.kept
         columns: Columns = {}
-        means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
-        read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
-        read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}
-        for name, column in means.items():
-            if name in read or name == "mode" or (name == SPEED and self.runs.turns):
-                continue
-            if column.dtype.kind == "f":
-                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in stretches])
-            else:
-                columns[name] = np.array([str(column[s.rows[0]]) for s in stretches])
-        for signal in self.signals:
-            name = signal.channel.name
-            if not any(math.isfinite(s.mean[name]) for s in stretches):
-                continue
-            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in stretches])
-            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in stretches])
+        means = self.runs.columns | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
+        omitted = {s.channel.column for s in self.signals} | {c.sd_column for c in channels.EVERY}
+        omitted |= {"time_s", "order", "run_id", "mode", *(angle for angle, _, _ in RATES)}
+        omitted |= {SPEED} if self.runs.turns else set()
+        for name in (name for name in means if name not in omitted):
+            cells = [means[name][s.rows] for s in stretches]
+            is_number = means[name].dtype.kind == "f"
+            columns[name] = np.array([_digits(_plain(x)) if is_number else str(x[0]) for x in cells])
+        for channel in (s.channel for s in self.signals):
+            if any(math.isfinite(s.mean[channel.name]) for s in stretches):
+                columns[channel.column] = np.array([_digits(s.mean[channel.name]) for s in stretches])
+                columns[channel.sd_column] = np.array([_digits(s.sd[channel.name], 3) for s in stretches])
         columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in stretches])
         columns["order"] = np.arange(1.0, len(stretches) + 1)
         return columns
@@ -422,16 +418,14 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
 def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
     """Rows in which a channel repeats one number for longer than noise allows: saturated or frozen."""
     is_stuck = np.zeros(len(signal.shown), bool)
-    if len(signal.angle):
-        return is_stuck
-    for rows in each:
+    for rows in each if not len(signal.angle) else ():
         readings = signal.shown[rows]
         repeats = np.diff(readings) == 0
-        if not len(repeats) or repeats.mean() > CHANCE:
-            limits = (np.nanmin(readings), np.nanmax(readings))  # coarse steps, or at its limit
-            repeats_inside = repeats & ~np.isin(readings[1:], limits)
-            if not len(repeats) or repeats_inside.mean() > CHANCE:
-                continue
+        if not len(repeats):
+            continue
+        is_limit = np.isin(readings[1:], (np.nanmin(readings, initial=np.inf), np.nanmax(readings, initial=-np.inf)))
+        if (repeats & ~is_limit).mean() > CHANCE:  # coarse steps
+            continue
         edges = np.flatnonzero(np.diff(np.concatenate([[0], repeats.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
             if high - low >= STUCK and readings[low] != 0:
@@ -440,12 +434,6 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
 
 
 # --- levels and stretches -------------------------------------------------------------------------------
-
-
-def _change_noise(x: np.ndarray) -> float:
-    """Sd of changes from sample to sample, robust to steps, 0 if most samples equal the sample before."""
-    steps = np.diff(x[np.isfinite(x)])
-    return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / math.sqrt(2) if len(steps) else 0.0
 
 
 def _levels_of(
@@ -460,23 +448,25 @@ def _levels_of(
     cuts = differs_from_row_before(rows, (runs[name] for name in EXACT if runs.has(name)))
     cuts[0] = True
     x = drives[rows]
-    largest, noise = float(np.max(np.abs(drives))), _change_noise(x)
+    changes = np.diff(x[np.isfinite(x)])
+    largest, noise = float(np.max(np.abs(drives))), 0.0
+    if len(changes):  # robust to steps, 0 if most samples equal the sample before
+        noise = 1.4826 * float(np.median(np.abs(changes - np.median(changes)))) / math.sqrt(2)
     size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
-    sd = noise / math.sqrt(size)
     begin, mean, count = 0, float(x[0]), 0
     starts = np.arange(0, len(rows), size)
     sizes = np.diff(starts, append=len(rows))
     # Lists are faster here, and a log may have a million rows.
-    blocks = ((np.add.reduceat(x, starts) / sizes).tolist(), np.logical_or.reduceat(cuts, starts).tolist())
-    for k, more, value, cut in zip(starts.tolist(), sizes.tolist(), *blocks, strict=True):
-        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * sd)
+    blocks = (starts, sizes, np.add.reduceat(x, starts) / sizes, np.logical_or.reduceat(cuts, starts))
+    for k, more, value, cut in zip(*(block.tolist() for block in blocks), strict=True):
+        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * noise / math.sqrt(size))
         if count and (abs(value - mean) > tolerance or cut):
             # the last averaged samples may belong to the next level
             yield rows[begin : k - size if size > 1 and k - begin > 3 * size else k]
             begin, mean, count = k, value, more
-            continue
-        mean = (mean * count + value * more) / (count + more)
-        count += more
+        else:
+            mean = (mean * count + value * more) / (count + more)
+            count += more
     yield rows[begin:]
 
 
@@ -863,41 +853,43 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
 
     By channel. For vehicles, only speeds of shafts, because the ground speed depends on slip.
     """
-    readings = {}
-    for k, (name, load) in enumerate(robot.configurations.items()):
-        zero, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
-        state = State(zero, jnp.ones(()), jnp.asarray(turns), zero)
-        speeds = {c.name: _reading(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
-        readings[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
-    return readings
+    shafts = {
+        c.name for c in settled_channels(robot) if c.zero_at_rest and not (c.name == "speed" and robot.has_ground)
+    }
+    return {
+        name: {n: x for n, x in _readings_of_one(robot, k)[1].items() if n in shafts}
+        for k, name in enumerate(robot.configurations)
+    }
 
 
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, if known."""
-    constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
-    inertias = {}
+    constant, inertias = float(robot.motor.torque_constant), {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         at_motor = inertia_at_motor(robot, load)
-        zero, one = jnp.zeros(()), jnp.ones(())
-        rolling = float(load.radius) / ratio
-        states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)  # of 1 A, and of 1 rad/s
-        currents, speeds = (
-            {c.name: _reading(robot, k, c, state) for c in settled_channels(robot)} for state in states
-        )
+        currents, speeds = _readings_of_one(robot, k)
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
         is_known = current or robot.rig.imposed == "motor_current"
-        currents[""] = 1.0  # of the imposed one
         if is_known and speed and at_motor > 0 and constant > 0:
-            per_rate = at_motor / constant * currents[current] / speeds[speed]
+            per_rate = at_motor / constant * currents.get(current, 1.0) / speeds[speed]
             inertias[name] = speed, current, per_rate, 1e-3
     return inertias
 
 
-def _reading(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """Reading of a channel that depends only on the state [unit of its column], 0 for others."""
-    signals = balances.begin_signals(robot, Conditions(configuration), state)
-    try:
-        return float(channel.read(robot, signals)) / channel.factor
-    except (AttributeError, TypeError):  # a signal that the balances fill in
-        return 0.0
+def _readings_of_one(robot: Robot, configuration: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Readings of the settled channels [unit of the column] at 1 A at rest, and while the motors turn at 1 rad/s
+    without slip and current. 0 for channels that depend on more than the state.
+    """
+    zero, one = jnp.zeros(()), jnp.ones(())
+    rolling = float(robot.configurations.members[configuration].radius) / float(robot.gearbox.ratio)
+    readings: tuple[dict[str, float], dict[str, float]] = ({}, {})
+    states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)
+    for by_name, state in zip(readings, states, strict=True):
+        signals = balances.begin_signals(robot, Conditions(configuration), state)
+        for channel in settled_channels(robot):
+            try:
+                by_name[channel.name] = float(channel.read(robot, signals)) / channel.factor
+            except (AttributeError, TypeError):  # a signal that the balances fill in
+                by_name[channel.name] = 0.0
+    return readings
