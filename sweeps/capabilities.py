@@ -182,7 +182,7 @@ def imposed_default(robot: Robot, option: str) -> float:
     Raises:
         BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).uses_paper_conditions:
+    if Layout.of(robot).complete:
         return VOLTAGE
     limit = imposed_limit(robot)
     if limit is None:
@@ -207,7 +207,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
     Raises:
         BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).uses_paper_conditions:
+    if Layout.of(robot).complete:
         return VOLTAGES_V
     limit = imposed_limit(robot)
     if limit is None:

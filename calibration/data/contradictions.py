@@ -134,7 +134,7 @@ def _refuse_against(
     got, driven = (" and ".join(f"{float(f'{x:.4g}'):g}" for x in both[:, row]) for both in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
-        f"{runs.source} row {row + 1}, {column}: got {got} although the left and right sides are driven at {driven} "
+        f"{runs.place(row)}, {column}: got {got} although the left and right sides are driven at {driven} "
         f"{unit} (as in {against.sum()} of {counts.sum()} rows); expected {expected}"
     )
 
@@ -196,7 +196,7 @@ def check_contradictions(runs: Runs, robot: Robot) -> Runs:
         check_turns(runs)
     if misplaced := misplaced_levers(runs, robot):
         row, column, why = misplaced
-        raise BadData(f"{runs.source} row {row + 1}, {column}: {why}")
+        raise BadData(f"{runs.place(row)}, {column}: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
         for column in (SUPPLY, "motor_voltage_V"):
             _check_voltage(runs, robot, column)
@@ -293,7 +293,7 @@ def time_goes_back(runs: Runs, before: int, row: int) -> BadData:
     """Error of a run whose time falls from one row to the next, both counted from 0."""
     time = runs["time_s"]
     return BadData(
-        f"{runs.source} row {row + 1}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each "
+        f"{runs.place(row)}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each "
         "recording its own run_id, or sort the rows"
     )
 
@@ -329,7 +329,7 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
         if not large.any():
             continue
         jump, time_steps = int(np.argmax(large)), np.diff(runs["time_s"][rows])
-        place = f"{runs.source} row {rows[jump + 1] + 1}, {column}"
+        place = f"{runs.place(rows[jump + 1])}, {column}"
         why = f"like {one} that wraps or changes its unit; expected {one} that keeps counting"
         if time_steps[jump] > GAP * np.median(time_steps):
             why = f"{float(f'{time_steps[jump]:.3g}'):g} s earlier; give each recording its own run_id"

@@ -218,7 +218,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
         lasts, column = runs["time_s"][last] - runs["time_s"][first], runs.heading("time_s")
         if lasts >= FAR * constant:
             return (
-                f"{runs.source} rows {first + 1} to {last + 1}: {channel.label} changes over {three_digits(lasts)} s "
+                f"{runs.place(first, last)}: {channel.label} changes over {three_digits(lasts)} s "
                 f"at a constant voltage, while these motors need about {three_digits(constant)} s. Is {column} in "
                 f'milliseconds? Then name it time_ms, or state [columns] time_ms = "{column}"'
             )
@@ -279,25 +279,24 @@ def jitter_sentence(runs: Runs) -> str:
         if float(np.mean(deviation[1:] * deviation[:-1])) < TURNS_BACK * spread**2:
             run = f" of run {name}" if name else ""
             return (
-                f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
-                f"{three_digits(spread / 2**0.5)} s around even spacing. Replace these times by even ones, "
-                f"{three_digits(float(np.mean(steps)))} s apart"
+                f"{runs.place(rows[0], rows[-1])}, time_s: the clock{run} jitters by {three_digits(spread / 2**0.5)} "
+                f"s around even spacing. Replace these times by even ones, {three_digits(float(np.mean(steps)))} s "
+                "apart"
             )
     return ""
 
 
 def constant_conditions_sentence(runs: Runs) -> str:
     """Sentence on a log in which no condition changes, empty for others."""
-    conditions = (*changing_columns(runs), *(c for c in runs.layout.sides if runs.has(c)))
-    column = runs.layout.imposed_column
+    conditions, column = (*changing_columns(runs), *runs.layout.sides), runs.layout.imposed_column
     if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
         return ""
-    if any(len(np.unique(runs[c])) > 1 for c in conditions):
+    if any(len(np.unique(runs[c])) > 1 for c in conditions if runs.has(c)):
         return ""
     return (
-        f"{runs.source} rows 1 to {len(runs)}, {runs.heading(column)}: "
-        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row. One level does not separate "
-        "losses by current from those by speed. Log three or more, in both directions if the drive reverses"
+        f"{runs.place(0, len(runs) - 1)}, {runs.heading(column)}: {three_digits(runs[column][0])} "
+        f"{column.rpartition('_')[2]} in every row. One level does not separate losses by current from those by "
+        "speed. Log three or more, in both directions if the drive reverses"
     )
 
 
@@ -313,31 +312,31 @@ def saturation_sentence(runs: Runs) -> str:
     and speeds at higher commands correspond to one constant voltage.
     """
     # With a duty, the supply current is only a share of the motor current.
-    current_columns = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
-    current, speed = next((c for c in current_columns if runs.has(c)), CURRENT), SPEED
-    if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
+    currents = [c for c in (CURRENT, *["total_current_A"] * (not runs.has("duty"))) if runs.has(c)]
+    read = (*currents[:1], SPEED)
+    if runs.layout.imposed != "voltage" or runs.turns or not runs.sampled or not currents or not runs.has(SPEED):
         return ""
-    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
+    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in read):
         return ""
-    drive, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
-    read = np.isfinite(readings).all(1)
-    is_inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
+    drive, readings = applied_drive(runs), np.stack([runs[column] for column in read], 1)
+    is_read, size = np.isfinite(readings).all(1), np.abs(drive)
+    is_inner = is_read & (drive != 0) & (size <= INNER * float(size.max()))
     if is_inner.sum() < ROWS_INNER:
         return ""
     predicted = readings @ np.linalg.lstsq(readings[is_inner], drive[is_inner], rcond=None)[0]
     if np.std(predicted[is_inner] - drive[is_inner]) > FITS * np.std(drive[is_inner]):
         return ""
-    top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
+    top = is_read & (size >= np.quantile(size[is_read], 0.9))
     limit = float(np.median(np.abs(predicted[top])))
-    limited = read & (np.abs(drive) > limit / REACHES)
+    limited = is_read & (size > limit / REACHES)
     # If the voltage from these rows still rises, the driver does not limit it.
     if limited.sum() < ROWS_INNER or np.std(np.abs(predicted[limited])) > FITS * limit:
         return ""
-    row = int(np.flatnonzero(limited)[0])
+    row = int(np.argmax(limited))
     return (
-        f"{runs.source} row {row + 1}, {drive_heading(runs)}: commands {three_digits(drive[row])} V, but "
-        f"current and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the "
-        f"log. Give the voltage that the driver applies, or limit the column to {three_digits(limit)} V"
+        f"{runs.place(row)}, {drive_heading(runs)}: commands {three_digits(drive[row])} V, but current and speed "
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. Give the voltage that "
+        f"the driver applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -356,20 +355,19 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
         return ""
     ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
     highest = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
-    read, is_shown = runs[column], np.isfinite(runs[column]) & (highest > 0)
-    is_shown &= np.abs(np.nan_to_num(read)) > 0
-    if not is_shown.any():
+    speed = np.abs(np.nan_to_num(runs[column]))
+    rows = np.flatnonzero((speed > 0) & (highest > 0))
+    if not rows.size:
         return ""
-    share = float(np.median(np.abs(read[is_shown]) / highest[is_shown]))
+    share = float(np.median(speed[rows] / highest[rows]))
     braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
-    row = int(np.flatnonzero(is_shown)[0])
-    heading, supply = (runs.heading(c) for c in (column, SUPPLY))
+    row, (heading, supply) = int(rows[0]), map(runs.heading, (column, SUPPLY))
     return (
-        f"{runs.source} row {row + 1}, {heading}: got {three_digits(abs(read[row]))} rpm, but with the file's "
-        f"torque constant the motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} "
-        f"and {supply}, and motor.torque_constant"
+        f"{runs.place(row)}, {heading}: got {three_digits(speed[row])} rpm, but with the file's torque constant the "
+        f"motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} and {supply}, and "
+        "motor.torque_constant"
     )
 
 
@@ -386,15 +384,15 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    torque_at_zero, torque_per_ampere = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
-    stall = np.maximum(torque_at_zero + (torque_per_ampere - torque_at_zero) * current, 0.0)
+    at_zero, at_one = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
+    stall = np.maximum(at_zero + (at_one - at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     exceeds_stall = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
     if not braked.any() or exceeds_stall.sum() <= braked.sum() / 2:
         return ""
-    row, heading = int(np.flatnonzero(exceeds_stall)[0]), runs.heading(LOAD)
+    row, heading = int(np.argmax(exceeds_stall)), runs.heading(LOAD)
     return (
-        f"{runs.source} row {row + 1}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
+        f"{runs.place(row)}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
         f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{heading}"'
     )
 
@@ -411,22 +409,24 @@ def swapped_sentence(runs: Runs) -> str:
     if not drive.min() < 0 < drive.max():
         return ""  # a signal that never changes sign may lack it, which other checks report
     for channel, readings in zip(runs.channels, runs.measured().T, strict=True):
+        if not channel.zero_at_rest:
+            continue
         power = np.zeros(len(drive))
-        for rows in of_runs if channel.zero_at_rest else ():
+        for rows in of_runs:
             motion = readings[rows] if channel.settled or len(rows) < 2 else np.gradient(readings[rows])
             power[rows] = np.nan_to_num(drive[rows] * motion)
             power[rows] /= max(float(np.abs(power[rows]).mean()), 1e-300)
-        for rows in (*of_runs, np.concatenate(of_runs)) if channel.zero_at_rest else ():
+        for rows in (*of_runs, np.concatenate(of_runs)):
             total = np.cumsum(power[rows]) / max(float(np.abs(power[rows]).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
-            sums, parts = (total[turn], total[-1] - total[turn]), np.split(drive[rows], [turn + 1])
+            before, after = total[turn], total[-1] - total[turn]
+            parts = np.split(drive[rows], [turn + 1])
             # Of an angle, both parts need both directions: a load without friction returns its energy as it brakes.
             both = channel.settled or all(x.min(initial=0.0) < 0 < x.max(initial=0.0) for x in parts)
-            if both and sums[0] * sums[1] < 0 and min(map(abs, sums)) > SWAPPED:
-                column = runs.heading(channel.column)
+            if both and before * after < 0 and min(abs(before), abs(after)) > SWAPPED:
                 return (
-                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is opposite to "
-                    f"{drive_heading(runs)}. Correct one part"
+                    f"{runs.place(rows[turn] + 1)}, {runs.heading(channel.column)}: from here on its sign is "
+                    f"opposite to {drive_heading(runs)}. Correct one part"
                 )
     return ""
 

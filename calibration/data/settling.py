@@ -295,7 +295,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             if steps[k] < 0:
                 raise time_goes_back(runs, *rows[k : k + 2])
             raise BadData(
-                f"{runs.source} row {rows[k + 1] + 1}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
+                f"{runs.place(rows[k + 1])}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
                 "own time, with more digits if available, or remove one of them"
             )
     if max(map(len, rows_by_run)) < FEWEST:
@@ -761,7 +761,7 @@ def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
     """Place of a stretch, a channel's reading there, and the imposed value, for a message."""
     reading, unit = _digits(s.mean[channel.name], 4), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
-        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {reading:g} "
+        f"{found.runs.place(s.rows[0], s.rows[-1])}, {channel.column}: shows {reading:g} "
         f"{channel.unit} at {_digits(s.imposed, 4):g} {unit}"
     )
 
@@ -787,7 +787,7 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
                 if not runs.has(column):
                     column = angles.get(one, column)
                 raise BadData(
-                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {ratio:.4g} times the value "
+                    f"{runs.place(s.rows[0], s.rows[-1])}, {column}: {ratio:.4g} times the value "
                     f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
                     f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
                     f"{{column = ..., factor = {1 / ratio:.3g}}} in the rig's file"

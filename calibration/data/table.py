@@ -104,6 +104,11 @@ class Runs:
         """True if the table has this column."""
         return column in self.columns
 
+    def place(self, first: int, last: int | None = None) -> str:
+        """Source and row, or rows, counted from 1, for the beginning of a message."""
+        rows = f"row {first + 1}" if last is None else f"rows {first + 1} to {last + 1}"
+        return f"{self.source} {rows}"
+
     def heading(self, column: str) -> str:
         """Name of a column in the file."""
         return self.headings.get(column, column)
@@ -247,7 +252,7 @@ class Runs:
         for name, row in zip(names.tolist(), first_rows, strict=True):
             if name not in robot.configurations:
                 raise BadData(
-                    f"{self.source} row {row + 1}, configuration: got {name}; expected one of these; "
+                    f"{self.place(row)}, configuration: got {name}; expected one of these; "
                     f"{allowed_words(name, robot.configurations)}"
                 )
         return np.array([robot.configurations.index(name) for name in names.tolist()], int)[inverse]

@@ -86,7 +86,7 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
     bad = np.flatnonzero(~(np.abs(current_error) <= ERROR * np.nanmax(np.abs(current))))
     if bad.size:
         raise BadData(
-            f"{runs.source} row {bad[0] + 1}, {LOAD}: it was computed from {channel}, and the file's robot draws "
+            f"{runs.place(bad[0])}, {LOAD}: it was computed from {channel}, and the file's robot draws "
             f"{current[bad[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
         )
     return load
@@ -225,7 +225,7 @@ def without_held(runs: Runs) -> Runs:
                 columns[column][held[1:]] = np.nan
                 cure = "Such rows are left out"
             notes[column] = (
-                f"{runs.source} rows {held[0] + 1} to {held[-1] + 1}, {runs.heading(column)}: the same "
+                f"{runs.place(held[0], held[-1])}, {runs.heading(column)}: the same "
                 f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
             )
     return dataclasses.replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))
