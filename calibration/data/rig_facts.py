@@ -335,8 +335,8 @@ def saturation_sentence(runs: Runs) -> str:
     row = int(np.argmax(limited))
     return (
         f"{runs.place(row)}, {drive_heading(runs)}: commands {three_digits(drive[row])} V, but current and speed "
-        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. Give the voltage that "
-        f"the driver applies, or limit the column to {three_digits(limit)} V"
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. Give the voltage "
+        f"that the driver applies, or limit the column to {three_digits(limit)} V"
     )
 
 

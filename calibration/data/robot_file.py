@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from calibration.data import Json, Names, rig_file, stated
+from calibration.data import Json, Names, input_files, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolve_likes
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import (
@@ -22,7 +22,6 @@ from calibration.data.input_errors import (
     stated_names,
     stated_word,
 )
-from calibration.data.input_files import flat_table, toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
 from mmrjax.compile.compiling import in_double
@@ -186,8 +185,8 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME) -> RobotFil
             number, not finite, or outside its field's bounds. Also for the reasons of `loads_from_tables` and
             `add_effects`.
     """
-    where, text = path.name, toml_text(path, path.name)
-    content = toml_content(text, where)
+    where, text = path.name, input_files.toml_text(path, path.name)
+    content = input_files.toml_content(text, where)
     if not content:
         raise BadConfiguration(
             f'{where}: is empty; expected parameter tables such as [motor], or base = "nominal" for the packaged '
@@ -211,7 +210,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME) -> RobotFil
         if isinstance(table, dict) and FACTORS in table:
             scaled[name] = _scaled_effect(library, name, table.pop(FACTORS), f"{where}, effects.{name}.{FACTORS}")
     robot = add_effects(robot, tuple(present), {**library, **scaled}, acting, where)
-    parameters = flat_table(content)
+    parameters = input_files.flat_table(content)
     robot = rig_file.with_priors(change_robot(robot, parameters, where), sds, where)
     remarks = battery_remarks(robot, parameters, where)
     return RobotFile(robot, str(path), frozenset(parameters), linear, text, remarks)
@@ -231,7 +230,7 @@ def _robot_before_parameters(
         resolve_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.split_values_and_sds(tables, where)
-    values = flat_table(tables)
+    values = input_files.flat_table(tables)
     sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
     loads, travels, linear, lacking = loads_from_tables(base, content, sds, where)
     rig = rig_file.parse_rig(content, where, list(loads), travels=travels, inherits=base is not None)
@@ -245,7 +244,7 @@ def _robot_before_parameters(
         robot = dataclasses.replace(base, configurations=Configurations(loads), rig=rig, controller=controller)
         return robot, sds, linear
     robot = dataclasses.replace(paper_robots.blank_robot(Configurations(loads), rig=rig), controller=controller)
-    parameters, values = params.parameters_by_name(robot), flat_table(content)
+    parameters, values = params.parameters_by_name(robot), input_files.flat_table(content)
     defaults = {name: value for name, (value, _) in rig_file.DEFAULTS.items()}
     resistance = values.get("motor.resistance", float(robot.motor.resistance))
     if isinstance(resistance, int | float):

@@ -37,7 +37,7 @@ from calibration.data.table import Runs
 from calibration.data.unused_readings import drop_computed_torques, without_held, without_unread
 from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
-from mmrjax.model.rig import STARTS, Instrument
+from mmrjax.model.rig import STARTS
 from mmrjax.model.robot import NO_BRAKE, Robot
 
 __all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "read_runs", "runs_of_arrays", "single_run"]
@@ -151,14 +151,13 @@ def runs_of_arrays(
     notes += contradictions.duties_from_side_voltages(name, columns, battery)
     is_kept, copied = row_checks.distinct_rows(name, columns)
     columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
-    unsigned: tuple[Instrument, ...] = ()
     if measured:
         notes += copied
         if robot is not None:
             notes += row_checks.split_at_jumps(name, columns, robot.rig.start == STARTS[0])
         notes += _drop_repeats(name, columns, layout)
-        unsigned = contradictions.unsigned_current_channels(columns, layout)
     instruments = inferred_facts.infer_instruments(layout.instruments, columns)
+    unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in instruments})
     layout = dataclasses.replace(layout, instruments=(*instruments, *unsigned))
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)

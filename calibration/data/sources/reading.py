@@ -15,7 +15,7 @@ from calibration.data import Columns, Mapped, Names, delimited, input_files, pre
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
-from calibration.data.presets_file import Preset, PresetColumn
+from calibration.data.presets_file import Preset
 from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import (
     RUN,
@@ -235,7 +235,7 @@ def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dic
     return signals_by_column, clock, tuple(missing)
 
 
-def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
+def _decode_raw_numbers(column: presets_file.PresetColumn, raw: Raw) -> Raw:
     """Raw numbers converted to signed numbers around zero. Cells without a number are unchanged."""
     if not (column.sign_bit or column.zero):
         return raw
@@ -246,7 +246,7 @@ def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
     return [cell if np.isnan(x) else repr(x) for cell, x in zip(raw, counted.tolist(), strict=True)]
 
 
-def _decoded_signal(column: PresetColumn, signal: Signal) -> Signal:
+def _decoded_signal(column: presets_file.PresetColumn, signal: Signal) -> Signal:
     """Signal whose values are decoded before they are interpolated."""
     return dataclasses.replace(signal, load=lambda: np.asarray(_decode_raw_numbers(column, signal.load())))
 
