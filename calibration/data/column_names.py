@@ -99,7 +99,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
         low, high = meaning.limits()
         hint = _hint_about_cell(meaning, cell, hints, _may_be_empty(layout))
         more_than = "more than " if column in layout.deviation_columns else ""
-        number = "a number, " if math.isnan(cell_number(cell)) else ""
+        number = "a number, " if math.isnan(cell_number(cell)) and cell.lower() != "nan" else ""
         allowed = f"{number}{more_than}{low:g} to {high:g}"
     return f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}"
 
