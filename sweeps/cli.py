@@ -100,7 +100,7 @@ def _command(
             if "plan" in given:
                 given["plan"] = file
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
-            aside = config.resolve_further_options(beside, others)
+            aside = config.resolve_configuration(beside, None, others)
             if resolve is None:
                 resolved = config.resolve_configuration(kind, file, stated, trust)
             else:

@@ -26,7 +26,6 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress_bar
 from sweeps.inputs import given_runs, load_robot, posterior_beside_robot
 from sweeps.pages import words
 from sweeps.points import run, scale
@@ -108,10 +107,8 @@ def _simulate_table(
         return run.evaluate_runs(robot, runs, config, folder), None
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
-    with progress_bar(len(runs), quiet=not fidelity.facts.slow) as advance:
-        counter = scale.share_counter(advance, len(runs))
-        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, counter))
-        counter(1.0)
+    with scale.share_progress(len(runs), quiet=not fidelity.facts.slow) as told:
+        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
     assert batch.history is not None  # the fidelity was asked for it
     folder.write_table(
         "history.csv", capabilities.drop_inapplicable_columns(robot, history_table(robot, batch.history, runs))

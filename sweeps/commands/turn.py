@@ -21,7 +21,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress_bar, report_stage
+from sweeps.console import report_stage
 from sweeps.inputs import load_robot, one_run
 from sweeps.points import run, scale
 from sweeps.report import runs_report, turn_words
@@ -68,13 +68,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             fidelity = fidelities.get_fidelity(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
             slow = fidelity.facts.slow
-            with (
-                report_stage(1, 2, "the turn over time", slow),
-                progress_bar(1, quiet=not slow) as advance,
-            ):
-                report_share = scale.share_counter(advance, 1)
-                first_run = jax.device_get(fidelity.histories(robot, conditions, config.options, report_share))
-                report_share(1.0)
+            with report_stage(1, 2, "the turn over time", slow), scale.share_progress(quiet=not slow) as told:
+                first_run = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
             turns, history = None, first_run.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, readings))

@@ -31,6 +31,7 @@ from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
 from mmrjax.model.robot import Robot
+from sweeps.console import progress_bar
 from sweeps.points.axes import SweepPlan
 from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import VERDICT, Task
@@ -270,6 +271,15 @@ def _start_chunk(compiled: Compiled, chunk: int, points: concurrent.futures.Futu
     piece = Piece(chunk, compiled(values, counter), values, count)
     counter(1.0)
     return piece
+
+
+@contextlib.contextmanager
+def share_progress(count: int = 1, quiet: bool = False) -> Iterator[Callable[[float], None]]:
+    """Progress bar of `count` runs in one batch. Yields a function to call with the share that is done."""
+    with progress_bar(count, quiet) as advance:
+        told = share_counter(advance, count)
+        yield told
+        told(1.0)
 
 
 def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
