@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
@@ -65,14 +65,17 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
     return Field(default=default, description=description, json_schema_extra=extra or None)
 
 
+Rules = tuple[tuple[str, ...], ...]
+
+
 class Part(BaseModel):
     """A part of a command's configuration. Unknown keys are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     #: Two fields that cannot be combined, and the end of the message.
-    exclusive: ClassVar[Iterable[Sequence[str]]] = ()
+    exclusive: ClassVar[Rules] = ()
     #: A field, another one that it needs, and what the message says of it.
-    needed: ClassVar[Iterable[Sequence[str]]] = ()
+    needed: ClassVar[Rules] = ()
 
     def states(self, name: str) -> bool:
         """True if a field is present and has another value than its default."""
@@ -93,7 +96,7 @@ class Part(BaseModel):
 
 def idle(message: str) -> PydanticCustomError:
     """Error on the combination of several fields, whose names are between backticks."""
-    return PydanticCustomError("idle", message)  # type: ignore[arg-type]  # no literal
+    return PydanticCustomError("idle", message)
 
 
 class RobotPart(Part):
@@ -245,8 +248,8 @@ class SupplyPart(Part):
         0.0, "Charge taken from the battery before"
     )
 
-    exclusive = (("voltages_V", "battery", ", whose charge sets the voltage"),)
-    needed = (("discharge_mAh", "battery", "has an effect only with `battery`"),)
+    exclusive: ClassVar[Rules] = (("voltages_V", "battery", ", whose charge sets the voltage"),)
+    needed: ClassVar[Rules] = (("discharge_mAh", "battery", "has an effect only with `battery`"),)
 
 
 SURFACE = "Surface of Table 5, or one of the rig's"
@@ -399,8 +402,8 @@ class TurnPart(Part):
         """True if the robot is free to turn."""
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
-    exclusive = (("left_V", "duty_left", "; give one pair"),)
-    needed = tuple(
+    exclusive: ClassVar[Rules] = (("left_V", "duty_left", "; give one pair"),)
+    needed: ClassVar[Rules] = tuple(
         (one, other, f"needs `{other}`; give both")
         for pair in (("left_V", "right_V"), ("duty_left", "duty_right"))
         for one, other in (pair, pair[::-1])
@@ -440,7 +443,7 @@ class ProfilePart(FidelityPart):
             return {"model": PROFILED, **values}
         return values
 
-    exclusive = (("duration_s", "profile", ", which sets the duration"),)
+    exclusive: ClassVar[Rules] = (("duration_s", "profile", ", which sets the duration"),)
 
     @model_validator(mode="after")
     def _profiled(self) -> Self:
@@ -457,7 +460,7 @@ class ProfilePart(FidelityPart):
 class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
     """A few given runs. Runs over time begin at standstill, or follow a profile."""
 
-    exclusive = (
+    exclusive: ClassVar[Rules] = (
         *itertools.product(TurnPart.model_fields, ("profile", "posterior")),
         ("left_V", "battery", "; give `duty_left` and `duty_right`"),
         ("posterior", "profile"),
@@ -556,7 +559,7 @@ class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
         "--battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
 
-    exclusive = (
+    exclusive: ClassVar[Rules] = (
         *itertools.combinations(("step_mm", "stairs", "gap_mm", "terrain"), 2),
         ("supply_voltage_V", "battery"),
         ("derivatives", "find"),
@@ -676,7 +679,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     joints: Names = option_field((), "Joints of --model, comma-separated, or all")
 
-    needed = (
+    needed: ClassVar[Rules] = (
         ("model", "joints", "and `joints` must be given together"),
         ("joints", "model", "needs `model`; give both"),
     )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +102,7 @@ def _climb_of_configuration(
             return grounds, climb_batch(robot, alike[0], grounds, alike[1], progress=told, **integration)
 
     size, make, words = obstacle
-    integration = {"duration": config.duration_s, "step": config.time_step_s}
+    integration: Any = {"duration": config.duration_s, "step": config.time_step_s}
     shown_index, largest = 0, None
     tried: tuple[tuple[float, str], ...] = ()
     derivatives: ClimbDerivatives | None = None
@@ -191,8 +191,8 @@ def _search_largest(
         grounds, climb_runs = run(sizes)
         verdict_of_size |= {float(s): v for s, v in zip(sizes, climb_runs.names, strict=True)}
         order = sorted(verdict_of_size)
-        climbed = list(itertools.takewhile(lambda s, verdicts=verdict_of_size: verdicts[s] == "over", order))
-        best, larger = climbed[-1] if climbed else None, order[len(climbed) :]
+        missed = next((k for k, s in enumerate(order) if verdict_of_size[s] != "over"), len(order))
+        best, larger = order[missed - 1] if missed else None, order[missed:]
         if largest_climbed is None or best in sizes:
             largest_climbed = grounds, climb_runs, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
         if best is None or not larger or larger[0] - best <= NEAR:

@@ -62,11 +62,11 @@ class Chain:
                 constraints close a loop.
         """
         self.library, self.model = library, model = mujoco.mujoco_module(), read_mujoco_model(source)
-        names = [library.mj_id2name(model, library.mjtObj.mjOBJ_JOINT, k) or "" for k in range(model.njnt)]
-        on_joint = [int(library.mjtTrn.mjTRN_JOINT), int(library.mjtTrn.mjTRN_JOINTINPARENT)]
-        driven = [int(model.actuator_trnid[k, 0]) for k in range(model.nu) if model.actuator_trntype[k] in on_joint]
+        names = [model.joint(k).name for k in range(model.njnt)]
+        on_joint = (library.mjtTrn.mjTRN_JOINT, library.mjtTrn.mjTRN_JOINTINPARENT)
+        driven = list(model.actuator_trnid[np.isin(model.actuator_trntype, on_joint), 0])
         for k, name in enumerate(names):
-            if model.jnt_type[k] != int(library.mjtJoint.mjJNT_HINGE) or not name:
+            if model.jnt_type[k] != library.mjtJoint.mjJNT_HINGE or not name:
                 raise BadConfiguration(
                     f"--model: {source.name}, joint {name or k + 1} is no named hinge; expected only named hinges"
                 )

@@ -166,7 +166,8 @@ def run_missions(
             assert batch.course is not None  # it was asked for
             is_complete &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             advance(count)
-    return Missions(*map(_concatenate_tables, (tables, segments, courses)), source, is_complete)
+    table, segment_rows, course = map(_concatenate_tables, (tables, segments, courses))
+    return Missions(table, segment_rows, course, source, is_complete)
 
 
 def _concatenate_tables(tables: list[Columns]) -> Columns:
@@ -198,7 +199,7 @@ def _segment_rows(
     number, time = np.arange(cycles * segments), np.ravel(found.segments.time)
     steps = np.where(found.course.segment < 0, len(number), found.course.segment)  # after the end, beyond the last
     last = np.maximum(np.searchsorted(steps, number, side="right") - 1, 0)
-    discharge = found.course.signals.discharge.reshape(len(steps), -1)[last, 0]
+    discharge = np.reshape(found.course.signals.discharge, (len(steps), -1))[last, 0]
     has_charge = (conditions.battery > 0.5) & (steps[last] == number)
     numbers["state_of_charge"] = np.where(has_charge, 1 - discharge / float(robot.battery.capacity), np.nan)
     rows = {
@@ -242,7 +243,8 @@ def _course_rows(
 ) -> Columns:
     """Rows of history.csv for one run."""
     assert found.course is not None  # it was asked for
-    course = jax.tree.map(lambda x: x[found.course.segment >= 0], found.course)
+    is_step = found.course.segment >= 0
+    course = jax.tree.map(lambda x: x[is_step], found.course)
     largest = np.abs(course.signals.current).reshape(len(course.segment), -1).max(1)  # both sides
     picked = select_course_rows(course.segment, largest, most, course.event >= _LASTING)
     course = jax.tree.map(lambda x: x[picked], course)

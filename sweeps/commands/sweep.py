@@ -349,8 +349,8 @@ def chunk_tables(store: Path, layout: StoreLayout) -> Iterator[Any]:
         table: dict[str, Any] = {}
         for name, values in zip(layout.design.names, layout.design.values_in_slices(box).T, strict=True):
             column, unit = COLUMNS.get(name, (name, 1.0))
-            words = layout.labels.get(name)
-            table[column] = pa.array(values / unit) if words is None else in_words(values, words)
+            labels = layout.labels.get(name)
+            table[column] = pa.array(values / unit) if labels is None else in_words(values, labels)
         for name, (dtype, attributes) in layout.variables.items():
             array: Any = group[name]
             flat = array[box].ravel()

@@ -158,10 +158,10 @@ def _export_mujoco(drive: DriveJoint, constants: Sequence[LawConstant], runs: Co
     checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
     if follows_angle or (drive.loose and drive.controller is None):
         times = np.linspace(0.0, START, 26)
-        given = {"voltage": volts}
+        conditions = Conditions(voltage=volts)
         if drive.controller is not None:
-            given = {"voltage": drive.controller.supply_voltage, "goal": GOAL}
-        conditions = jax.tree.map(lambda x: jnp.asarray(x, float)[None], Conditions(**given))
+            conditions = Conditions(voltage=drive.controller.supply_voltage, goal=GOAL)
+        conditions = jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions)
         native = np.asarray(drive_batch(drive.robot, conditions, jnp.asarray(times)).signals.angle)[0]
         angles = mujoco.angles_in_mujoco(texts, command if follows_angle else volts, times)
         checks[f"angle over {START:g} s from rest, MuJoCo C against native [%]"] = _rms_percent(angles, native)

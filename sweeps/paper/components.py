@@ -60,7 +60,7 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
     fig, grid = new_figure(1, 2, 3.7)
     name, robot = next(iter(robots.items()))
     colour, battery = MODEL.get(name, PURPLE), robot.battery
-    current = np.linspace(0, 12, 50)
+    current = jnp.linspace(0, 12, 50)
     left, right = grid[0]
     for words, share, line in (("full", 0.0, "-"), ("half discharged", 0.5, "--"), ("at capacity", 1.0, ":")):
         volts = battery.voltage(current - battery.current_other, share * battery.capacity) / battery.cells
@@ -73,15 +73,15 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
     left.legend()
 
     capacity = float(battery.capacity) / COULOMB_PER_MAH
-    charge = np.linspace(0, 1.9 * capacity, 200)
-    volts = np.broadcast_to(battery.voltage_no_load(charge * COULOMB_PER_MAH), charge.shape)
-    right.plot(charge, volts, color=colour)
+    charge = jnp.linspace(0, 1.9 * capacity, 200)
+    no_load = np.broadcast_to(battery.voltage_no_load(charge * COULOMB_PER_MAH), charge.shape)
+    right.plot(charge, no_load, color=colour)
     right.axvline(capacity, color=INK, lw=1, label=f"capacity {capacity:.0f} mAh, beyond: status battery_empty")
     right.axvspan(capacity, charge[-1], color="#f0f0f0", zorder=0)
-    low = int(np.argmin(volts))
+    low = int(np.argmin(no_load))
     if 0 < low < len(charge) - 1:
         label = f"parabola (13) turns up at {charge[low]:.0f} mAh"
-        right.plot(charge[low], volts[low], "v", color=FAINT, label=label)
+        right.plot(charge[low], no_load[low], "v", color=FAINT, label=label)
     right.set(xlabel="discharge $C_b$ [mAh]", ylabel="no-load cell voltage [V]", xlim=(0, charge[-1]))
     right.set_title("b) no-load voltage")
     right.legend()
@@ -92,7 +92,7 @@ def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
     """Fig. 11: motor friction torque (14) over speed, with the maker's no-load point."""
     fig, grid = new_figure(1, 1, 3.4)
     axes, motor = grid[0, 0], next(iter(robots.values())).motor
-    rpm = np.linspace(0, 12_500, 60)
+    rpm = jnp.linspace(0, 12_500, 60)
     for name in (name for name in robots if name != "sm1"):  # whose curve is that of SM-2
         torque = 1e3 * np.broadcast_to(robots[name].motor.torque_loss(rpm * RPM, 1.0), rpm.shape)
         label = CONSTANTS if name == CONSTANT else displayed_robot_name(name)
