@@ -184,10 +184,18 @@ def imposed_default(robot: Robot, option: str) -> float:
     """
     if Layout.of(robot).uses_paper_conditions:
         return VOLTAGE
-    limit = imposed_limit(robot)
-    if limit is None:
-        raise BadConfiguration(_missing_limit_message(robot, option, IMPOSED_WORDS[robot.rig.imposed].one))
+    limit = _stated_limit(robot, option, IMPOSED_WORDS[robot.rig.imposed].one)
     return limit if robot.rig.imposed == "voltage" else _digits(limit)
+
+
+def _stated_limit(robot: Robot, option: str, example: str) -> float:
+    """`imposed_limit` of a file that states it. The refusal has an example of the option."""
+    limit, about = imposed_limit(robot), IMPOSED_WORDS[robot.rig.imposed]
+    if limit is None:
+        # currents are not limited by files
+        missing = f", and the robot's file has no motor.{about.limit}" * (robot.rig.imposed != "motor_current")
+        raise BadConfiguration(f"{option}: not given{missing}; give it [{about.unit}], such as {option} {example}")
+    return limit
 
 
 def imposed_example(robot: Robot) -> float:
@@ -209,31 +217,13 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
     """
     if Layout.of(robot).uses_paper_conditions:
         return VOLTAGES_V
-    limit = imposed_limit(robot)
-    if limit is None:
-        raise BadConfiguration(_missing_limit_message(robot, option, IMPOSED_WORDS[robot.rig.imposed].several))
+    about = IMPOSED_WORDS[robot.rig.imposed]
+    limit = _stated_limit(robot, option, about.several)
     levels = tuple(_digits(share * limit) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
-        notes.append(
-            f"{option}: not given. Thirds of the {_robot_phrase(robot)} in the robot's file are used: {level_text}"
-        )
+        notes.append(f"{option}: not given. Thirds of the {about.limit} in the robot's file are used: {level_text}")
     return levels
-
-
-def _robot_phrase(robot: Robot) -> str:
-    return IMPOSED_WORDS[robot.rig.imposed].limit
-
-
-def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
-    unit = IMPOSED_WORDS[robot.rig.imposed].unit
-    if robot.rig.imposed == "motor_current":  # not limited by files
-        return f"{option}: not given; give it [{unit}], such as {option} {example}"
-    return (
-        f"{option}: not given, and the robot's file has no motor.{_robot_phrase(robot)}; "
-        f"give it [{unit}], such as {option} "
-        f"{example}"
-    )
 
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:

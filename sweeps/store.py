@@ -28,6 +28,7 @@ from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
+from sweeps import stage_files
 from sweeps.config import FolderPart, RobotPart
 from sweeps.console import print_message, print_output
 from sweeps.report import terminal_renderer
@@ -464,8 +465,6 @@ class RunFolder(Folder):
 
     def chunk(self, name: str) -> Any:
         """Chunk from an interrupted run. None if missing or damaged, which is reported."""
-        from sweeps import stage_files
-
         file = self._chunk_file(name)
         try:
             return stage_files.read_stage(file) if file.is_file() else None
@@ -475,8 +474,6 @@ class RunFolder(Folder):
 
     def keep_chunk(self, name: str, content: Any) -> None:
         """Stores a finished chunk, for continuing an interrupted run."""
-        from sweeps import stage_files
-
         with writing.replacing(self._chunk_file(name)) as temporary:
             stage_files.write_stage(temporary, content)
 
@@ -484,8 +481,6 @@ class RunFolder(Folder):
         """Result of a stage: read if an interrupted run of the same identity stored it, otherwise computed and
         stored. A result that cannot be written is not stored.
         """
-        from sweeps import stage_files
-
         stored: tuple[T] | None = self.chunk(name)  # in a tuple, since a result may be None
         if stored is None:
             stored = (make(),)

@@ -25,7 +25,7 @@ from sweeps import store
 from sweeps.inputs import recorded_fit
 from sweeps.report import catalogue, check_report, comparison_report, page_renderer, settle_report, terminal_renderer
 from sweeps.report.check_report import CheckResult, SizeResult
-from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
+from sweeps.report.comparison_report import Comparison, compare_readings
 from sweeps.report.document import Cell, Column, Document, Note, Section, Table, remarks
 
 
@@ -117,9 +117,7 @@ def comparison_two():
     """The same with a second robot, 2 % below the readings, which reaches the first row but not the second."""
     measured, table, summary = above_the_bench(rise=0.0)
     error = np.where(np.arange(len(measured)) == 1, np.nan, 0.98)
-    table = add_second_robot(
-        table, measured.channels, {c.column: error * measured[c.column] for c in measured.channels}
-    )
+    table = table | {f"against_{c.column}": error * measured[c.column] for c in measured.channels}
     return comparison_report.comparison_document(
         Comparison(
             table, summary, measured.channels, "measured", "steady", "nominal (PM)", against="found/robot.toml"

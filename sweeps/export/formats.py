@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,7 +25,8 @@ from mmrjax.model.conditions import Conditions
 from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco
 from sweeps.export.comparison import ComparisonRuns, ExportComparison, situation_of_joint
 from sweeps.export.joint import DriveJoint, joint_of_robot
-from sweeps.export.law_source import LawConstant, law_constants, posterior_next_to
+from sweeps.export.law_source import LawConstant, law_constants
+from sweeps.inputs import posterior_beside_robot
 
 #: Names of formats and their uses.
 FORMATS = {
@@ -95,7 +97,9 @@ def export_format(
     if to in ("mujoco", "randomization"):
         mujoco.mujoco_module()
     drive = joint_of_robot(file, configuration)
-    posterior = posterior_next_to(drive) if posterior is None else posterior
+    source = Path(file.source)
+    if posterior is None and source.suffix == ".toml" and source.with_name(FILE).is_file():
+        posterior = posterior_beside_robot(file)
     runs = situation_of_joint(drive.steady, data)
     constants = law_constants(drive, runs.signals, posterior)
     checks: Mapping[str, float] = {}

@@ -332,7 +332,9 @@ def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float],
 
     positive = {"loguniform": "low", "lognormal": "median"}.get(kind)
     if positive and numbers[positive] <= 0:
-        raise BadConfiguration(f"{where}.{positive}: got {numbers[positive]:g}; expected a number above 0 with {kind}")
+        raise BadConfiguration(
+            f"{where}.{positive}: got {numbers[positive]:g}; expected a number above 0 with {kind}"
+        )
     if kind in ("uniform", "loguniform"):
         low, high = numbers["low"], numbers["high"]
         if kind == "uniform":
