@@ -231,7 +231,7 @@ def option_refusal(robot: Robot, option: str, instead: str) -> str:
     reason = IMPOSED_WORDS[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
         return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
-    return f"{option}: the voltage is imposed on this robot, and the motor speed follows; give {instead} [V]"
+    return f"{option}: the voltage is imposed on this robot; give {instead} [V]"
 
 
 def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> None:
@@ -244,7 +244,7 @@ def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> N
         BadConfiguration: there is one.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "slope, payload, mass and surface do not act on a shaft; remove it"
+        why = "has no effect on a shaft; remove it"
         raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
 
 
@@ -256,9 +256,7 @@ def check_battery(robot: Robot) -> None:
     """
     if robot.rig.imposed != "voltage":
         imposed_words = IMPOSED_WORDS[robot.rig.imposed].words
-        raise BadConfiguration(
-            f"--battery: the {imposed_words} is imposed on this robot, regardless of the supply; remove --battery"
-        )
+        raise BadConfiguration(f"--battery: the {imposed_words} is imposed on this robot; remove --battery")
     if not has_battery(robot):
         raise BadConfiguration("--battery: the robot's file has no battery; add [battery], or give --voltage")
 

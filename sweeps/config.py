@@ -107,7 +107,7 @@ class RobotPart(Part):
         {}, "Change a parameter (SI units). May be repeated: 6T2A.ground.friction.static=0.6"
     )
     effects: Names = option_field(
-        (), "Python file with effects. Its code is run. May be repeated", verbatim=True, executes=True
+        (), "Python file with effects, which is run. May be repeated", verbatim=True, executes=True
     )
 
 
@@ -121,7 +121,7 @@ class FolderPart(Part):
 class VerbosePart(FolderPart):
     """Amount of text that a command prints. It changes no number."""
 
-    verbose: bool = option_field(False, "Print every table and remark instead of about five lines")
+    verbose: bool = option_field(False, "Print every table and remark")
 
 
 class Measured(FolderPart):
@@ -142,7 +142,7 @@ class SettledLog(FolderPart):
 
     data: str = option_field(
         ...,
-        "Log in any format, with time_s, the imposed quantity and channels",
+        "Log with time_s, the imposed quantity and channels",
         argument=True,
         metavar="LOG",
     )
@@ -253,7 +253,7 @@ class SupplyPart(Part):
 
 
 SURFACE = "Surface of Table 5, or one of the rig's"
-FRONT = "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)"
+FRONT = "Angle of the front levers (0: extended, positive: up, 180: folded)"
 REAR = "Angle of the rear levers, likewise"
 
 
@@ -304,7 +304,7 @@ class GivenRuns(OneRun, FolderPart):
     def _once(self) -> Self:
         if self.runs is not None and self.stated:
             names = ", ".join(f"`{name}`" for name in self.stated)
-            raise idle(f"{names}: not allowed with `runs`; give it as a column there, or omit `runs`")
+            raise idle(f"{names}: not allowed with `runs`; give it as a column there")
         return self
 
 
@@ -361,8 +361,8 @@ class InferencePart(Part):
     )
     noise: str = option_field(
         "",
-        "Standard deviations in % or in A, rpm, mm/s: current=2%,motor_speed=10rpm,speed=5mm/s",
-        usual="from the columns, else estimated. Settled rows without series in the loop: 2, 0.5 and 1 %",
+        "Standard deviations: current=2%,motor_speed=10rpm,speed=5mm/s",
+        usual="from columns, else estimated. Settled rows without series in the loop: 2, 0.5, 1 %",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
         ROWS, "Most rows used. Larger data are thinned evenly"
@@ -395,7 +395,7 @@ class TurnPart(Part):
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = option_field(None, "Duty of the left motor")
     duty_right: Duty | None = option_field(None, "Duty of the right motor")
-    heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
+    heading_deg: Heading | None = option_field(None, "Heading at the start, from uphill to the left")
 
     @property
     def turns(self) -> bool:
@@ -430,9 +430,9 @@ class ProfilePart(FidelityPart):
 
     profile: Annotated[str, Field(min_length=1)] | None = option_field(
         None,
-        "Mission: a CSV with time_s and any of speed_mm_s, motor_speed_rpm, duty, mode, supply_voltage_V, "
-        "slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left and duty_right, "
-        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed. Or one of stair, stop_and_go, "
+        "Mission: CSV with time_s and any of speed_mm_s, motor_speed_rpm, duty, mode, supply_voltage_V, "
+        "slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left, duty_right, "
+        "voltage_left_V, voltage_right_V, or yaw_rate_rad_s. Or stair, stop_and_go, "
         "shuttle, patrol (docs/reference/profiles.md)",
     )
 
@@ -502,7 +502,7 @@ class Resonance(RobotPart, ConfigurationPart, FidelityPart, OutputPart):
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
-        None, "Length of a run (s). Its second half shows the ripple", usual="1.5", minimum=0.5
+        None, "Length of a run (s), whose second half is evaluated", usual="1.5", minimum=0.5
     )
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
@@ -525,7 +525,7 @@ class ClimbPart(Part):
     nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Edge radius of steps and stairs")
     sequence: Path | None = option_field(
         None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg. "
-            "Or front_V and rear_V, voltages of the lever motors",
+            "Or front_V, rear_V of the lever motors",
         format="path",
     )  # fmt: skip
     levers_voltage_V: Annotated[float, positive_number(1e6)] | None = option_field(
@@ -551,7 +551,7 @@ class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
     surface: PaperSurface = option_field(BENCH, "Surface of Table 5")
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None,
-        "Find the largest obstacle. For stairs: largest rise at the tread of --stairs",
+        "Find the largest obstacle. For stairs: the rise at the tread of --stairs",
     )
     derivatives: Names = option_field(
         (),
@@ -668,14 +668,12 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "Order of indistinguishable effects: by misfit, or by held-out error",
+        "Order of indistinguishable effects: misfit or held-out error",
     )
-    forbid: Names = option_field(
-        (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', a configuration"
-    )
+    forbid: Names = option_field((), "Experiment to avoid, repeatable: stall, lifted, 'one motor', a configuration")
     model: Path | None = option_field(
         None,
-        "MuJoCo model of several joints, whose torques are their loads",
+        "MuJoCo model of several joints",
     )
     joints: Names = option_field((), "Joints of --model, comma-separated, or all")
 
@@ -726,9 +724,7 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
     parameters: Names = option_field(
         (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
-    vary: Names = option_field(
-        (), "Also treat an operating condition as uncertain. May be repeated: voltage=22:26, slope_deg=0:5"
-    )
+    vary: Names = option_field((), "Also vary an operating condition. May be repeated: voltage=22:26, slope_deg=0:5")
     outputs: Names = option_field(
         (),
         "Outputs, comma-separated: of a run, steepest_slope, highest_step, best_step, or start (three outputs)",
@@ -777,7 +773,7 @@ def resolve_configuration(kind: type[C], file: Path | None, options: Json, trust
             option = options_of_fields(kind)[name]
             raise BadConfiguration(
                 f"{file.name}, {name}: would run code, which a file may not request; give {option} on the command "
-                "line, or --trust if you trust the author of the file"
+                "line, or --trust"
             )
     if "set" in option_values:
         set_values = values.get("set", {})

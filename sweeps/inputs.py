@@ -44,8 +44,8 @@ def load_robot(config: RobotPart) -> RobotFile:
         type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
     ):
         raise BadConfiguration(
-            f"--robot {file.name}: its controller follows a goal over time; use calibrate, compare, loop or rig "
-            "check with a log, export, or mmrjax.simulate in Python"
+            f"--robot {file.name}: its controller follows a goal; use calibrate, compare, loop or rig check with "
+            "a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))

@@ -161,9 +161,7 @@ class Folder:
             return
         mark = interrupted_run(self.partial)
         if mark is None:
-            raise BadConfiguration(
-                f"--out: {self.partial} already exists and was not created by mmrjax; choose another path"
-            )
+            raise BadConfiguration(f"--out: {self.partial} was not created by mmrjax; choose another path")
         if foreign := sorted(self._foreign()):
             raise BadConfiguration(
                 f"--out: {self.partial} contains {foreign[0]}, which its command did not write; move that file, or "
@@ -171,8 +169,8 @@ class Folder:
             )
         if mark["command"] not in ("", command) and not force and holds_work(self.partial):
             raise BadConfiguration(
-                f"--out: {self.partial} contains an interrupted {mark['command']}, which the same command resumes; "
-                "choose another path, or use --force to start again"
+                f"--out: {self.partial} contains an interrupted {mark['command']}; choose another path "
+                "or --force to start again"
             )
 
     def refuse_appeared(self, force: bool) -> None:
@@ -429,9 +427,9 @@ class RunFolder(Folder):
                 if not self._force:
                     raise BadConfiguration(
                         f"--out: {self.partial} contains interrupted work of another configuration; choose "
-                        "another path, or use --force to start again"
+                        "another path, or --force to start again"
                     )
-                print_message(f"{self.partial}: was made with another configuration, so it is started again")
+                print_message(f"{self.partial}: was made with another configuration and is started again")
             self._clear()
             self._lock.truncate(0)
             self._lock.write(lock_text(self._command, self._digest))

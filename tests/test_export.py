@@ -579,7 +579,7 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
         (
             {"side_friction": 1e-3},
             None,
-            r"side_friction makes the sides differ, but an export is one drive",
+            r"side_friction makes the sides differ; export a file for each side",
         ),
         ({}, "4W2", r"--configuration: got 4W2; .* did you mean 4W2T\?"),
     ],

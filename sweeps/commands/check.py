@@ -37,7 +37,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
         if depends and r.envelope.battery and not capabilities.has_battery(robot):
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: the robot's file has no battery; add [battery] to it, or set "
+                f"{demands.source}, {r.name}: the robot's file has no battery; add it, or set "
                 "supply_voltage_V in [envelope]"
             )
     lacking = robot.unknown(HEAT)
@@ -45,7 +45,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         if lacking and r.name in OF_HEAT:
             raise BadConfiguration(
                 f"{demands.source}, {r.name}: needs the winding temperature, for which the robot's file lacks "
-                f"{', '.join(lacking)}; add them, or remove the requirement"
+                f"{', '.join(lacking)}; add them"
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as report:

@@ -45,10 +45,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     if runs.sampled:
         options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
         for option in (name for name, is_given in options.items() if is_given):
-            raise BadConfiguration(
-                f"{option}: {Path(runs.source).name} contains time histories with their own masses and times; remove "
-                "this option"
-            )
+            raise BadConfiguration(f"{option}: {Path(runs.source).name} contains time histories; remove this option")
         ready = preparation.prepare_input(runs, file.robot)
         robot, remarks = ready.robot, (*ready.checked, *ready.begins, *ready.weighed)
     else:

@@ -156,7 +156,7 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
                 shares[c.label] = 100 * (reading_with / reading_without - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):
             changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
-            yield f"change of the readings at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
+            yield f"change at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
 
 
 def _status_lines(name: str, library: Library) -> Iterator[Line]:

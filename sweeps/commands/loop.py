@@ -119,7 +119,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
                 minutes = max(5, math.ceil(time_budget / 30))  # with twice the time
-                hint = f", and no fit of the base model; allow more time, such as --within {minutes}min"
+                hint = f", and no fit of the base model; allow more, such as --within {minutes}min"
                 print_message(f"no verdict within {time_budget:g} s{hint * (not stages)}")
                 for note in lost_motion_notes(runs, robot):  # then no effect is ranked
                     print_message(describe(note))

@@ -50,7 +50,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         imposed_words = capabilities.IMPOSED_WORDS[robot.rig.imposed].words
         raise BadConfiguration(
             f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the voltage; "
-            'simulate a table, or set imposed = "voltage" in the robot\'s file'
+            'simulate a table, or set imposed = "voltage"'
         )
     if robot.loose:
         raise BadConfiguration(
@@ -58,7 +58,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:
-            raise BadConfiguration(f"--profile: {name} is an arm, which profiles do not cover; use --model drive")
+            raise BadConfiguration(f"--profile: {name} is an arm; use --model drive")
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
@@ -78,8 +78,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
     if config.battery and config.discharge_mAh >= capacity:
         raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
-            "mission"
+            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh"
         )
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
@@ -103,7 +102,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         folder.write_table("segments.csv", capabilities.drop_inapplicable_columns(robot, missions.segments))
         folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, missions.course))
         if not missions.whole:
-            print_message("history.csv is cut short: the mission has more steps than can be saved")
+            print_message("history.csv is cut short: the mission has too many steps")
         result = run.SimulationResult("simulate", config.model, robot, runs, missions.table, missions.to_json())
         page = print_report(mission_report.missions_document(file, missions), file)
         return run.write_run_folder(folder, config, result, page)

@@ -102,9 +102,7 @@ class RigCheck:
         """Sentences on points to check, one each."""
         notes = []
         if self.robot.rig.inherits:
-            notes.append(
-                'values missing in the file come from its base, a packaged robot. base = "none" prevents this'
-            )
+            notes.append('missing values come from the base, a packaged robot. base = "none" prevents this')
         widened = f"({EXAMPLE}): {{}}. a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
         for lines, text in (
             (self.examples, f"example number {widened}"), (self.unmarked, "example: {}. Check that it is yours"),
@@ -114,9 +112,7 @@ class RigCheck:
                 notes.append(f"{count_noun(len(lines), 'line')} with the template's {numbers}")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
-            notes.append(
-                "with a duty, total_current is that of the supply. A sensor in the motor leads measures motor_current"
-            )
+            notes.append("with a duty, total_current is that of the supply. Motor leads carry motor_current")
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [o for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value]
         if loose and not self.robot.rig.inherits:
@@ -127,7 +123,7 @@ class RigCheck:
             lacking = " and ".join(self.robot.unknown(HEAT))
             notes.append(f"motor.temperature_limit cannot be checked without {lacking}: add {lacking}")
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
-            notes.append("motor.voltage_limit is not given: experiments go up to the table's highest voltage")
+            notes.append("no motor.voltage_limit: experiments go up to the table's highest voltage")
         return notes
 
     def channels(self) -> list[Json]:
@@ -191,12 +187,12 @@ class RigCheck:
             return []
         names = {c.column: c.name for c in channels.EVERY}
         notes = [
-            f"{name}: not a channel of the rig. To use it, add {names[name]} to channels in the rig's file"
+            f"{name}: not a channel of the rig. To use it, add {names[name]} to its channels"
             for name in self.runs.unknown
             if name in names
         ]
         if others := [name for name in self.runs.unknown if name not in names]:
-            text = "not used by the model, only to group residuals. To use one, name it under [columns]"
+            text = "used only to group residuals. To use one, name it under [columns]"
             notes.append(f"{', '.join(others)}: {text}")
         return notes
 
@@ -361,9 +357,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     ]  # fmt: skip
     notes_of_data = [*found.unused(), *runs.missing()]
     if len(seen.status) < len(runs):
-        notes_of_data.insert(
-            0, f"loop and calibrate use {len(seen.status)} of these rows, evenly spaced in time (--rows)"
-        )
+        notes_of_data.insert(0, f"loop and calibrate use {len(seen.status)} of these rows (--rows)")
     has_clamped_rows = runs.has("held") or (
         runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any()
     )
@@ -372,9 +366,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
         f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]
     if others:
-        notes_of_data.append(
-            f"with the file's numbers, some rows have no steady state ({', '.join(others)}), and do not count"
-        )
+        notes_of_data.append(f"some rows have no steady state with the file's numbers ({', '.join(others)})")
     determined = [
         (p.name, p.value, p.prior_sd, p.unit, p.share, found.determined(p))
         for p in sorted(seen.parameters, key=lambda p: p.share)

@@ -245,7 +245,7 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
         "motor.inertia": number(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
         "motor.friction_coulomb": number(0.0, "N·m", "all friction is at the joint"),
         "motor.friction_viscous": number(0.0, "N·m·s", "all damping is at the joint"),
-        "gearbox.efficiency_load": number(1.0, "-", "no loss proportional to the torque: add one if you know it"),
+        "gearbox.efficiency_load": number(1.0, "-", "no loss proportional to the torque"),
         "load.loss_coulomb": number(friction, "N·m", "frictionloss and lugre of the joint", "100 %"),
         "load.loss_viscous": number(np.ravel(model.dof_damping[dof])[0], "N·m·s", "damping of the joint", "100 %"),
     }

@@ -350,7 +350,7 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         "motor.friction_viscous": StatedNumber(
             0.0,
             "N·m·s",
-            "Coulomb and viscous friction are not separated, ± as if half were viscous",
+            "not separated from Coulomb friction, ± as if half were viscous",
             f"{0.5 * constant**2 * idle / back_emf:.2g}",
         ),
     }
@@ -405,6 +405,6 @@ def _reject_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) ->
     ]
     if faults:
         raise BadConfiguration(
-            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %; give "
-            "data of the motor shaft at one voltage"
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %, at "
+            "the motor's shaft and one voltage"
         )

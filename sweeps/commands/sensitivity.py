@@ -130,7 +130,7 @@ def _operating_points(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: has no effect on a battery, whose charge sets it")
+        raise BadConfiguration("--vary voltage: has no effect on a battery")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:

@@ -255,8 +255,8 @@ def finish_sweep(
     done = store.done()
     if not store.finished:
         print_output(
-            f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, or the "
-            "command without --shard, completes the sweep"
+            f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, or no "
+            "--shard, completes the sweep"
         )
         return DONE
     for kind in options.export:

@@ -41,8 +41,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     """
     if beside.runs is not None:
         raise BadConfiguration(
-            "--runs: got a file in addition to --left, --right or --heading; put duty_left and duty_right into the "
-            "file, or omit --runs"
+            "--runs: cannot be combined with --left, --right or --heading; put duty_left and duty_right into the file"
         )
     file, beside_columns = load_robot(config), beside.stated
     robot = file.robot
@@ -108,7 +107,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     larger_voltage, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
     if supply is not None and supply < larger_voltage:
         raise BadConfiguration(
-            f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, the voltage of --left and --right"
+            f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, as --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
     source, duties = contradictions.supply_and_shares(volts, None if supply is None else np.asarray(supply))

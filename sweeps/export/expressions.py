@@ -250,8 +250,7 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
         (result,) = _evaluate_jaxpr(closed.jaxpr, closed.consts, arguments)
     except NotImplementedError as error:
         raise BadConfiguration(
-            f"{what}: its equation uses {error or 'an operation'} of JAX; rewrite it with sums, products, powers "
-            "and scalar functions, or export without it"
+            f"{what}: its equation uses {error or 'an operation'} of JAX; rewrite it with scalar functions"
         ) from error
     symbol: Any = result[()]
     return symbol

@@ -146,7 +146,7 @@ def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list
             changed.append(EffectFate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
         elif fate.name == mujoco.PLAY:
             play, twist = float(joint.load.backlash), float(joint.load.twist(1.0))
-            how = f"tables have no state, so  {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
+            how = f"tables have no state, so {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
             changed.append(EffectFate(fate.name, DROPPED, how))
         elif fate.name == mujoco.CONTROLLER:
             changed.append(EffectFate(fate.name, DROPPED, "the tables give its voltage"))

@@ -201,13 +201,11 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     stated_word(name, robot.configurations, "--configuration", wrong)
     if robot.unlike:
         raise BadConfiguration(
-            f"{file.name}: {', '.join(robot.unlike)} makes the sides differ, but an export is one drive; export "
-            "a file for each side, without this effect"
+            f"{file.name}: {', '.join(robot.unlike)} makes the sides differ; export a file for each side "
+            "without this effect"
         )
     if robot.controller is not None and not robot.controller.supply_voltage:
-        raise BadConfiguration(
-            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it; add it [V]"
-        )
+        raise BadConfiguration(f"{file.name}, controller.supply_voltage: missing; add it [V]")
     if robot.rig.imposed != "voltage" and robot.controller is None:
         imposed_words = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(

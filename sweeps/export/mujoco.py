@@ -153,7 +153,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
             EffectFate(
                 "gearbox losses proportional to the load", APPROXIMATED,
                 "resistance / η and current = act / η: exact while power flows to the load. While it flows "
-                "back, the joint is braked less than in reality",
+                "back, the joint is braked too little",
             )
         )  # fmt: skip
     if robot.has_ground:
@@ -165,7 +165,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
             EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if joint.loose:
-        how = "a joint for the motor's side, and a tendon with a range or a stiffness"
+        how = "a joint for the motor's side, and a tendon"
         fates.append(EffectFate(PLAY, HELD, how))
     if joint.controller is not None:
         fates.append(_controller_fate(joint, joint.controller))
@@ -193,9 +193,9 @@ def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     place_by_effect = {
         "sensor": "an instrument error, not part of the drive",
         "supply": "the battery; reduce the command's voltage accordingly",
-        "mass": "the mass of the robot. Set it in the model",
+        "mass": "set the mass in the model",
     }
-    other = "a property of the ground. Set it in the model"
+    other = "set the ground in the model"
     return [EffectFate(e.name, DROPPED, place_by_effect.get(e.balance, other)) for e in joint.outside]
 
 

@@ -107,9 +107,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
             raise BadConfiguration(f"{where}, {name}: given twice; give it once, under conditions, axes or samples")
     names, on_battery = {*fixed, *design.names}, fixed.get("battery", 0.0) > 0.5
     if on_battery and "voltage" in names:
-        raise BadConfiguration(
-            f"{where}: voltage has no effect on a battery, whose charge sets it; remove one of the two"
-        )
+        raise BadConfiguration(f"{where}: voltage has no effect on a battery; remove one of the two")
     _check_acting_conditions(names, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
     configuration_names = [robot.configurations.names[int(k)] for k in configuration_indices]

@@ -347,8 +347,8 @@ def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
     if is_incomplete.any():
         share = 100 * (1 - found.columns[SHARE].min())
         remarks.append(
-            f"in {int(is_incomplete.sum())} of {len(is_incomplete)} runs some draws fail (up to {share:.0f} %). "
-            "Intervals use the others"
+            f"in {int(is_incomplete.sum())} of {len(is_incomplete)} runs some draws fail (up to {share:.0f} %) "
+            "and are left out"
         )
     return remarks
 

@@ -285,7 +285,7 @@ class SweepStore(Folder):
         differ = self._differs(folder)
         if differ == IDENTITY:
             raise BadData(
-                f"--out: {folder / 'identity.json'} is damaged; choose another path, or use --force to start again"
+                f"--out: {folder / 'identity.json'} is damaged; choose another path, or --force to start again"
             )
         if differ:
             raise BadConfiguration(
@@ -350,7 +350,7 @@ class SweepStore(Folder):
             records = self._records().get(damaged_chunk, [])
             damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
-            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to start again")
+            raise BadData(f"--out: {damaged} is damaged; choose another path, or --force to start again")
 
     # --- chunks -----------------------------------------------------------------------------------
 
