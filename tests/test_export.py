@@ -770,7 +770,7 @@ def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     assert "acts at each step, not at 50 Hz" in fates[mujoco.CONTROLLER].how
     assert "0.03 rad of play" in verdicts[2][mujoco.PLAY].how
     rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
-    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; the exported controller"):
+    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; add it"):
         joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
 
 

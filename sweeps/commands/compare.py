@@ -80,9 +80,8 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         notes = (*missing_readings_notes(comparison, runs.channels), *sentences(remarks))
         of_draws: list[str] = []
         if posterior is not None and config.posterior is not None:
-            spread = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            of_draws = run.interval_ranges(table, spread)
-            table |= spread.columns
+            table |= run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            of_draws = run.interval_ranges(table, robot.channels, config.posterior)
             ends = (run.SD, run.LOWER, run.UPPER)
             comparison |= {
                 f"simulated_{key}": table[key] for c in robot.channels for e in ends if (key := c.column + e)

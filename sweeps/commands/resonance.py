@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -78,7 +77,11 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         columns = _ripple_columns(folder, robot, conditions, config, parts_words)
         table = {**run.condition_table(robot, runs), **columns}
         result = _modes_and_peaks(config, robot, parts_words, table)
-        _write_folder(folder, config, result)
+        folder.write_table("points.csv", table)
+        rows = [{"payload_kg": p, **m._asdict()} for p, modes in result.modes.items() for m in modes]
+        folder.write_table("modes.csv", _tuple_columns(rows, Mode))
+        folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in result.peaks], RipplePeak))
+        folder.write_json("result.json", result.to_json())
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
         return finish_run_folder(
@@ -174,24 +177,14 @@ def _modes_and_peaks(
     )
 
 
-def _write_folder(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
-    folder.write_table("points.csv", found.table)
-    folder.write_table(
-        "modes.csv",
-        _tuple_columns([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
-    )
-    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], RipplePeak))
-    folder.write_json("result.json", found.to_json())
-
-
 _COLUMNS = {
     "frequency": "frequency_Hz", "low": "low", "natural": "natural_Hz", "payload": "payload_kg", "speed": "speed_m_s",
 }  # fmt: skip
 
 
-def _tuple_columns(rows: Iterable[Json], kind: type) -> Columns:
+def _tuple_columns(rows: list[Json], kind: type) -> Columns:
     """Columns, with units in their names, of a list of named tuples."""
-    rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
+    unit = "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)
     names = _COLUMNS | {"low": f"low_{unit}", "high": f"high_{unit}"}
     return {names.get(key, key): np.array([row[key] for row in rows]) for key in keys}

@@ -75,9 +75,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
         if posterior is not None and config.posterior is not None:
-            draws = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            table |= draws.columns
-            remarks += run.interval_remarks(draws)
+            table |= run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            remarks += run.interval_remarks(table, config.posterior)
         if postures is not None:
             folder.write_table("posture.csv", postures.table)
             further["notes"] += turn_words.tipping_remarks(postures)

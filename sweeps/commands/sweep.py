@@ -80,9 +80,8 @@ def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> 
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
         if posterior is not None and config.posterior is not None:
-            draws = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            notes = run.interval_ranges(table, draws)
-            table |= draws.columns
+            table |= run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            notes = run.interval_ranges(table, robot.channels, config.posterior)
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
         document = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
         return run.write_run_folder(folder, config, result, document)

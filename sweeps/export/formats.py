@@ -146,7 +146,7 @@ def _export_mujoco(drive: DriveJoint, constants: Sequence[LawConstant], runs: Co
         mujoco.approximated_terms,
     )
     motor, name = mujoco.mjcf_motor(drive, compared.refitted), f"{drive.name}_drive"
-    notes = mujoco.attribute_notes(drive, constants, compared.translated, compared.refitted)
+    notes = mujoco.attribute_notes(constants, compared.translated, compared.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     follows_angle = drive.robot.rig.imposed == "goal_angle"

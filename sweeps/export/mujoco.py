@@ -404,7 +404,7 @@ def _body_text(inertia: float, weight: float, angle: float) -> str:
 
 
 def attribute_notes(
-    joint: DriveJoint, constants: Sequence[LawConstant], translated: Mapping[str, float], values: Mapping[str, float]
+    constants: Sequence[LawConstant], translated: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, str]:
     """Origin of each attribute in words, with intervals of the parameters from which it is computed."""
     by_name = {c.name: c for c in constants}
