@@ -336,16 +336,28 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         (_ratio_or_none(torque, drop), "stall torque / stall current"),
     ]
     stated_constants = [(value, source) for value, source in constants if value is not None]
-    _reject_contradictions((known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
     constant = stated_constants[0][0]
+    spread = [_largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
+    groups = (known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A")
+    faults = [
+        f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
+        f"{100 * apart:.0f} % apart"
+        for (pairs, name, unit), apart in zip(groups, spread, strict=True)
+        if apart > APART
+    ]
+    if faults:
+        raise BadConfiguration(
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %, at the motor's "
+            "shaft and one voltage"
+        )
 
     def line(value: float, unit: str, source: str, width: float) -> StatedNumber:
         return StatedNumber(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
 
-    spread = [100 * _largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
+    width = max(WIDTH_RESISTANCE, 100 * spread[0]), max(WIDTH_CONSTANT, 100 * spread[1])
     return {
-        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], max(WIDTH_RESISTANCE, spread[0])),
-        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], max(WIDTH_CONSTANT, spread[1])),
+        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], width[0]),
+        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], width[1]),
         "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
         "motor.friction_viscous": StatedNumber(
             0.0,
@@ -394,17 +406,3 @@ def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
 def _largest_difference(pairs: list[tuple[float, str]]) -> float:
     values = [value for value, _ in pairs]
     return max(values) / min(values) - 1
-
-
-def _reject_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
-    faults = [
-        f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
-        f"{100 * _largest_difference(pairs):.0f} % apart"
-        for pairs, name, unit in groups
-        if _largest_difference(pairs) > APART
-    ]
-    if faults:
-        raise BadConfiguration(
-            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %, at "
-            "the motor's shaft and one voltage"
-        )

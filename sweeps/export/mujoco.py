@@ -366,41 +366,25 @@ def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: floa
         mass: mass of the vehicle [kg].
         command, load: command and load of the key frame `run` [V or rad], [N·m].
     """
-    moved_load = joint.load
+    body, head, arm = joint.load, "The rig's shaft", 0.05
+    inertia, centre, own_mass = float(body.inertia), (0.0, 0.0, 0.0), 1.0
+    own_inertia = inertia
     if joint.robot.has_ground:
-        radius = float(moved_load.radius)
-        inertia = float(moved_load.inertia) + mass / float(joint.robot.sides) * radius**2
-        head = f"One side of the robot: its wheel, carrying 1/{float(joint.robot.sides):g} of {mass:.4g} kg"
-        weight, arm, angle = 0.0, radius, 0.0
-    else:
-        inertia, weight, angle = (
-            float(moved_load.inertia),
-            float(moved_load.torque_gravity),
-            float(moved_load.angle_zero),
-        )
-        head, arm = "The rig's shaft", 0.05
+        arm, sides = float(body.radius), float(joint.robot.sides)
+        own_inertia += mass / sides * arm**2
+        head = f"One side of the robot: its wheel, carrying 1/{sides:g} of {mass:.4g} kg"
+    elif (weight := float(body.torque_gravity)) > 0:
+        # the mass on its lever has half of the inertia
+        gravity, angle = 9.81, float(body.angle_zero)  # MuJoCo's default
+        lever = inertia * gravity / (2 * weight)
+        own_mass = weight / (gravity * lever)
+        own_inertia = inertia - own_mass * lever**2
+        centre = lever * math.sin(angle), 0.0, -lever * math.cos(angle)
     return filled_template(
-        "scene.xml", at=at, name=name, timestep="0.0005" if joint.loose else "0.001",
-        head=_comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  "),
-        body=_body_text(inertia, weight, angle), arm=_numbers_text(arm), run=_numbers_text(command, load),
+        "scene.xml", at=at, name=name, timestep="0.0005" if joint.loose else "0.001", text=_numbers_text,
+        head=_comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  "), centre=centre,
+        mass=own_mass, inertia=own_inertia, arm=arm, run=_numbers_text(command, load),
     )  # fmt: skip
-
-
-def _body_text(inertia: float, weight: float, angle: float) -> str:
-    """Text of a body with an inertia about its joint [kg·m²], and the centre of mass of an arm that hangs at `angle`
-    [rad].
-    """
-    if weight <= 0:
-        return f'      <inertial pos="0 0 0" mass="1" diaginertia="{_numbers_text(inertia, inertia, inertia)}"/>\n'
-    gravity = 9.81  # MuJoCo's default
-    arm = inertia * gravity / (2 * weight)  # the mass on its arm has half of the inertia
-    mass = weight / (gravity * arm)
-    rest = inertia - mass * arm**2
-    position_text = _numbers_text(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
-    return (
-        f'      <inertial pos="{position_text}" mass="{_numbers_text(mass)}" '
-        f'diaginertia="{_numbers_text(rest, rest, rest)}"/>\n'
-    )
 
 
 def attribute_notes(

@@ -242,7 +242,8 @@ class Piece:
 
 
 Advance = Callable[[float], None]
-#: Stores a chunk by its number: values of its points by variable, and its samples from `drawn_samples`.
+#: Stores a chunk by its number: values of its points by variable, and values of its samples, one row for each
+#: name, None if another chunk writes them.
 Keep = Callable[[int, Columns, np.ndarray | None], Any]
 
 
@@ -299,16 +300,6 @@ def fetch_values(arrays: Json, count: int) -> Columns:
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
 
 
-def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
-    """Sample values along a chunk, one row for each name. None if another chunk writes them."""
-    design, samples = job.plan.design, job.plan.design.samples
-    if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
-        return None
-    sample_range = job.blocks.box(piece.chunk)[-1]
-    # samples vary fastest
-    return piece.values[: sample_range.stop - sample_range.start, len(design.axes) :].T
-
-
 def write_chunks(keep: Keep, compiled: Compiled, chunks: Iterable[int], advance: Advance) -> None:
     """Computes chunks and writes each in a separate thread, while the next is computed.
 
@@ -331,7 +322,12 @@ def write_chunks(keep: Keep, compiled: Compiled, chunks: Iterable[int], advance:
         host_values = fetch_values(piece.arrays, count)
         if stop.is_set() and not is_ready:  # interrupted during its computation
             return
-        keep(piece.chunk, host_values, drawn_samples(compiled.job, piece))
+        design, blocks, drawn = compiled.job.plan.design, compiled.job.blocks, None
+        if design.samples is not None and not any(blocks.place(piece.chunk)[:-1]):
+            # samples vary fastest; other chunks along their dimension repeat them
+            along = blocks.box(piece.chunk)[-1]
+            drawn = piece.values[: along.stop - along.start, len(design.axes) :].T
+        keep(piece.chunk, host_values, drawn)
         advance(count - piece.told)
 
     def keep_writing() -> None:
