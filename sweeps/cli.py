@@ -54,7 +54,7 @@ _Trust = Annotated[
     typer.Option("--trust", hidden=True, help="Allow the file of --config to name effects, whose code is run."),
 ]
 _Effects = Annotated[
-    list[str] | None, typer.Option("--effects", help="Python file with your own effects. May be repeated.")
+    list[str] | None, typer.Option("--effects", help="Python file with your own effects. Repeatable.")
 ]
 _Columns = Annotated[
     str | None,
@@ -525,7 +525,7 @@ def inspect_file(
 def explain(
     name: Annotated[
         list[str] | None,
-        typer.Argument(help="Name to explain. None: list all."),
+        typer.Argument(help="Effect, status, output, parameter or other name. None: list all."),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,

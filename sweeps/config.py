@@ -104,10 +104,10 @@ class RobotPart(Part):
 
     robot: str = option_field("nominal", "nominal, sm1, sm2, or the TOML file of a robot")
     set: dict[str, bool | float] = option_field(
-        {}, "Change a parameter (SI units). May be repeated: 6T2A.ground.friction.static=0.6"
+        {}, "Change a parameter (SI units). Repeatable: 6T2A.ground.friction.static=0.6"
     )
     effects: Names = option_field(
-        (), "Python file with effects, which is run. May be repeated", verbatim=True, executes=True
+        (), "Python file with effects, which is run. Repeatable", verbatim=True, executes=True
     )
 
 
@@ -357,7 +357,7 @@ class InferencePart(Part):
     """Prior knowledge and data of a fit."""
 
     prior: Names = option_field(
-        (), "A prior in SI units. May be repeated: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
+        (), "A prior in SI units. Repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
     )
     noise: str = option_field(
         "",
@@ -512,7 +512,7 @@ class Resonance(RobotPart, ConfigurationPart, FidelityPart, OutputPart):
     )
     payloads_kg: Several[Payload] = option_field(PAYLOADS_KG, "Additional load masses")
     slope_deg: Slope = option_field(0.0, "Slope, positive uphill")
-    surface: PaperSurface = option_field(BENCH, "Surface of Table 5")
+    surface: PaperSurface = option_field(BENCH, "Surface of Table 5")  # type: ignore[valid-type]
 
 
 Angle = Annotated[float, number_between(-360, 360)]
@@ -548,7 +548,7 @@ class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
     levers_rear_deg: Angle | None = option_field(None, REAR, usual="the robot's")
     supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
     payload_kg: Payload = option_field(0.0, "Additional load mass")
-    surface: PaperSurface = option_field(BENCH, "Surface of Table 5")
+    surface: PaperSurface = option_field(BENCH, "Surface of Table 5")  # type: ignore[valid-type]
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None,
         "Find the largest obstacle. For stairs: the rise at the tread of --stairs",
@@ -723,7 +723,7 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
     parameters: Names = option_field(
         (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
-    vary: Names = option_field((), "Also vary an operating condition. May be repeated: voltage=22:26, slope_deg=0:5")
+    vary: Names = option_field((), "Also vary an operating condition. Repeatable: voltage=22:26, slope_deg=0:5")
     outputs: Names = option_field(
         (),
         "Outputs, comma-separated: of a run, steepest_slope, highest_step, best_step, or start (three outputs)",

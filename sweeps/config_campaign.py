@@ -90,7 +90,7 @@ class StoreOptions(FolderPart):
     zarr: bool = option_field(False, "Write a Zarr store for small grids too")
     outputs: Names = option_field((), "Outputs to store, comma-separated", usual="the channels of its instruments")
     dry_run: bool = option_field(False, "Print points, chunks, size and expected time only")
-    export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. May be repeated")
+    export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. Repeatable")
     shard: str | None = option_field(None, "Simulate the i-th of n shares, such as 3/8")
 
     @model_validator(mode="after")

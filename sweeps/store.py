@@ -119,7 +119,7 @@ class Folder:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
         self.path, self.partial = path, path.with_name(path.name + ".partial")
         self.tables = "csv"
-        self._results_begun = False
+        self._results_begun, self._digest = False, ""
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
@@ -196,14 +196,6 @@ class Folder:
             f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix != ENDING
         }
 
-    def _begin_results(self) -> None:
-        """Lists foreign files in the lock file before the first result is written. All other files are then ours."""
-        mark = _json(self.partial / LOCK)
-        if FOREIGN not in mark:
-            text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
-            with writing.naming_file(self.partial / LOCK), (self.partial / LOCK).open("r+b", buffering=0) as lock:
-                lock.write(text.encode())  # in one write, so that others never read a part
-
     def _clear(self) -> None:
         """Deletes all our files in the partial folder except its lock."""
         foreign = self._foreign()
@@ -221,9 +213,13 @@ class Folder:
 
     def results(self) -> Path:
         """Folder for the results, which is moved into place when all are written."""
-        if not self._results_begun:
-            self._begin_results()
-            self._results_begun = True
+        mark, lock = _json(self.partial / LOCK), self.partial / LOCK
+        if not self._results_begun and FOREIGN not in mark:
+            # Foreign files are listed before the first result is written. All other files are then ours.
+            text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
+            with writing.naming_file(lock), lock.open("r+b", buffering=0) as stream:
+                stream.write(text.encode())  # in one write, so that others never read a part
+        self._results_begun = True
         return self.partial
 
     def write_text(self, name: str, text: str) -> None:
@@ -252,28 +248,22 @@ class Folder:
         hashes = {"robot": sha256_hex((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
         if runs is not None and runs.digest:
             hashes[runs.source] = runs.digest
-        end_time = datetime.datetime.now(datetime.UTC)
-        times = {
-            "started": self.started.isoformat(timespec="seconds"),
-            "seconds": round((end_time - self.started).total_seconds(), 3),
-        }
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
-        # Program, versions and devices that made a result
         import jax
         import jax.numpy as jnp
 
         new_manifest = {
-            **{
-                "schema": MANIFEST,
-                "program": f"mmrjax {__version__}",
-                "arguments": sys.argv[1:],
-                "python": platform.python_version(),
-                "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
-                "devices": [str(d) for d in jax.devices()],
-                "float": jnp.result_type(float).name,
-            },
-            **times,
+            "schema": MANIFEST,
+            "program": f"mmrjax {__version__}",
+            "arguments": sys.argv[1:],
+            "python": platform.python_version(),
+            "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+            "devices": [str(d) for d in jax.devices()],
+            "float": jnp.result_type(float).name,
+            "started": self.started.isoformat(timespec="seconds"),
+            "seconds": round((datetime.datetime.now(datetime.UTC) - self.started).total_seconds(), 3),
             **manifest,
+            **({"identity": self._digest} if self._digest else {}),
             "hashes": hashes,
             "contents": sorted(names),
         }
@@ -492,10 +482,6 @@ class RunFolder(Folder):
 
     def _chunk_file(self, name: str) -> Path:
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}{ENDING}"
-
-    def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """As in `Folder`, with the identity of the run in the manifest."""
-        return super().finish({**manifest, "identity": self._digest}, runs)
 
     def move_into_place(self) -> Path:
         """Deletes the chunks and moves the folder to its final path. The lock file is removed last.

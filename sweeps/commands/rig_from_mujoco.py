@@ -140,11 +140,10 @@ class _MujocoModel:
         self.joints = [model.joint(k).name for k in range(model.njnt)]
         on_joint = (library.mjtTrn.mjTRN_JOINT, library.mjtTrn.mjTRN_JOINTINPARENT)
         self.is_motor = model.actuator_gaintype == library.mjtGain.mjGAIN_DCMOTOR
+        of_joints = np.flatnonzero(np.isin(model.actuator_trntype, on_joint))
         #: Actuator of each driven joint, a `<dcmotor>` before others.
         self.actuators = {
-            int(model.actuator_trnid[k, 0]): k
-            for k in sorted(range(model.nu), key=lambda k: (self.is_motor[k], -k))
-            if model.actuator_trntype[k] in on_joint
+            int(model.actuator_trnid[k, 0]): int(k) for k in sorted(of_joints, key=lambda k: (self.is_motor[k], -k))
         }
 
     def _chosen(self, joint: str | None) -> int:

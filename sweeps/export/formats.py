@@ -33,7 +33,7 @@ FORMATS = {
     "mujoco": "MJCF with <dcmotor>, and a runnable scene",
     "jax": "an actuator function in JAX, as source and as a serialised program",
     "onnx": "an ONNX model of one time step, for Isaac Lab, Unity or C++",
-    "mjlab": "an actuator configuration for law_source, in PyTorch",
+    "mjlab": "an actuator configuration of mjlab, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
     "randomization": "samples from the posterior, for MuJoCo and the actuator",
 }

@@ -234,7 +234,7 @@ def module_from_source(source: str) -> ModuleType:
     """
     tree = ast.parse(source)
     if not _states_a_law(tree):
-        raise BadConfiguration("export: the generated source contains more than the drive law")
+        raise BadConfiguration("export: the generated source contains more than the drive law, so it is not executed")
     module = ModuleType("exported_law")
     exec(compile(tree, "<exported_law>", "exec"), module.__dict__)
     return module

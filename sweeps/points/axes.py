@@ -263,7 +263,7 @@ def _sampled_design(stated: Json, robot: Robot, where: str) -> tuple[Samples | N
     if not isinstance(overrides, dict):
         raise BadConfiguration(f"{where}.over: got {overrides!r}; expected a table of names and distributions")
     marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in overrides.items()}
-    joint, data = None, ()
+    joint, data = None, Names()
     if "posterior" in stated:
         from calibration.data import posterior_file
 
