@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,10 +13,10 @@ from calibration.data import Columns, Json, Names, runs
 from calibration.inference import simulation_errors
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
+from mmrjax.fidelities.steady import results_of_rows, steady_batch
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
-from mmrjax.model.quantities import MM
 from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import StartRun
@@ -52,18 +53,13 @@ def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditio
 
 def operating_points(robot: Robot, asked: Conditions) -> Columns:
     """Steady operating points of a batch, in the columns of `runs.csv`."""
-    import jax
-
-    from mmrjax.fidelities.steady import steady_batch
-
     rows = asked.shape[0]
     parts = []
     for first in range(0, rows, _CHUNK):
         index = np.minimum(np.arange(first, first + _CHUNK), rows - 1)
-        part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))
-        parts.append(jax.tree.map(np.asarray, part))
+        parts.append(jax.device_get(steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))))
     answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
-    return {**outputs.output_columns(answer, robot.channels), "total_mass_kg": np.asarray(answer.mass)}
+    return {**outputs.output_columns(answer, robot.channels), "total_mass_kg": answer.mass}
 
 
 def channels_of_paper() -> tuple[Channel, ...]:
@@ -285,21 +281,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     Returns:
         Points, and item → power. `other` is the power of effects beyond the paper's terms.
     """
-    import equinox as eqx
-
-    from mmrjax.model import balances
-    from mmrjax.model.signals import State
-
-    points = operating_points(robot, asked)
-    wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(asked.configuration).radius)
-    current = points["power_supply_W"] / points["voltage_V"] / robot.sides
-    state = State(
-        jnp.asarray(current),
-        wheel * robot.gearbox.ratio,
-        points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
-        asked.discharge,
-    )
-    signals, _ = eqx.filter_jit(balances.settled_signals)(robot, asked, state)
+    points, (_, signals) = operating_points(robot, asked), results_of_rows(robot, asked)
     sides = robot.sides
     parts = {
         "winding": sides * signals.voltage_drop * signals.current,
