@@ -1,5 +1,7 @@
 """Bases of curves: over what they go, windows in which something happens, and when row order says nothing new."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -9,17 +11,34 @@ from calibration.inference import bases
 from calibration.inference.bases import (
     COLLINEAR,
     Window,
-    curve_families,
     family_names,
-    order_collinearity,
-    window_families,
     window_from_name,
 )
 from mmrjax.compile.compiling import for_equations
-from mmrjax.model import channels
+from mmrjax.effects.curve import WAYS
+from mmrjax.model import channels, paper_robots
 
 RNG = np.random.default_rng(0)
 ROWS = 60
+SCOPE = bases.CurveScope.of(paper_robots.nominal(), {})
+
+
+def curve_families(columns, weight, **scope):
+    """Of runs that always travel forward."""
+    return bases.curve_families(columns, weight, forward(weight), dataclasses.replace(SCOPE, **scope))
+
+
+def window_families(columns, weight, **scope):
+    """Of runs that always travel forward."""
+    return bases.window_families(columns, weight, forward(weight), dataclasses.replace(SCOPE, **scope))
+
+
+def forward(weight):
+    return dict.fromkeys(WAYS, np.ones(len(weight)))
+
+
+def order_collinearity(columns, weight, axes=SCOPE.axes):
+    return bases.order_collinearity(columns, weight, axes, "order")
 
 
 def table(rows=ROWS, **more):
@@ -76,17 +95,17 @@ def test_order_of_a_sorted_table_is_no_driver(driven):
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
         "total_current_A": RNG.uniform(1, 5, 30), driven: level / level[-1],
     }  # fmt: skip
-    scope = bases.CurveScope(("electrical", "track"), ("supply_voltage_V",))
-    assert "order" not in variables(curve_families(columns, np.ones(30), scope=scope))
-    assert not [v for v in variables(window_families(columns, np.ones(30), scope=scope)) if v.startswith("order")]
+    scope = {"balances": ("electrical", "track"), "axes": ("supply_voltage_V",)}
+    assert "order" not in variables(curve_families(columns, np.ones(30), **scope))
+    assert not [v for v in variables(window_families(columns, np.ones(30), **scope)) if v.startswith("order")]
     for seed in range(5):
-        assert "order" in variables(curve_families(shuffled(columns, seed), np.ones(30), scope=scope))
+        assert "order" in variables(curve_families(shuffled(columns, seed), np.ones(30), **scope))
 
 
 def test_time_of_a_single_ramp_is_no_driver():
     time = np.arange(40.0)
     columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
-    scope = bases.CurveScope(("electrical",), ("supply_voltage_V",))
+    scope = {"balances": ("electrical",), "axes": ("supply_voltage_V",)}
     stairs = np.repeat(np.arange(4.0), 10)  # they tell 0.93 of the time
     for voltage, expected in (
         (time / 4, False),
@@ -95,8 +114,8 @@ def test_time_of_a_single_ramp_is_no_driver():
         (stairs, True),
     ):
         logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
-        assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
-        windows = [v for v in variables(window_families(*logged, scope=scope)) if v.startswith("time")]
+        assert ("time" in variables(curve_families(*logged, **scope))) == expected
+        windows = [v for v in variables(window_families(*logged, **scope)) if v.startswith("time")]
         assert bool(windows) == expected
 
 
@@ -214,8 +233,8 @@ def test_a_table_without_order_or_levels_has_no_windows():
 def test_an_order_that_the_only_condition_tells_has_no_curves():
     order = np.arange(1.0, ROWS + 1)
     columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
-    alone = bases.CurveScope(("electrical", "track"), ("motor_current_A",))
-    assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
+    alone = {"balances": ("electrical", "track"), "axes": ("motor_current_A",)}
+    assert {v for _, v in family_names(curve_families(columns, COUNTS, **alone))} == {bases.CONDITIONS}
 
 
 # --- sizes ----------------------------------------------------------------------------------------------
@@ -267,7 +286,7 @@ def back_and_forth(turn, runs=3, samples=100):
 def waves_of(turn):
     """Order of the shaft → columns of its wave in one balance, of runs that turn so far [rad] and come back."""
     angle, rows = back_and_forth(turn)
-    (basis,) = bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows)
+    (basis,) = bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows, bases.BALANCES)
     every = {n: np.asarray(c) for n, c in zip(basis.names, basis.columns, strict=True)}
     return angle, rows, {v: c for (place, v), c in every.items() if place == "track"}
 
@@ -293,4 +312,4 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
 
 def test_a_shaft_that_stands_has_no_waves():
     angle, rows = back_and_forth(0.0)
-    assert bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows) == ()
+    assert bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows, bases.BALANCES) == ()

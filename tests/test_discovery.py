@@ -178,7 +178,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
     unit = jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in library])
     instances = tuple(with_shape_grid(e, (-1.5, 0.75)) for e in library)
     robot = dataclasses.replace(problem.robot(z), effects=library)
-    linear = jax.jit(lambda z: problem.observe.linearise(problem, z, problem.data, instances))(z)
+    linear = jax.jit(lambda z: problem.observe.linearise(problem, z, instances))(z)
 
     @jax.jit
     @jax.jacfwd
@@ -186,7 +186,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
         there = {f"effects.{n}.amplitude": a for n, a in zip(names, amplitude * unit, strict=True)}
         there |= {f"effects.{n}.{s.name}": v for n, s, v in zip(names, shapes, values, strict=True) if s}
         seen = problem.observe(params.replace(robot, there))
-        return problem.whitened(seen, problem.data)[: problem.data.measured.size]
+        return problem.whitened(seen)[: problem.data.measured.size]
 
     first = np.cumsum([0, *(len(c.at) for c in instances)])[:-1]
     for point in (0, 1):

@@ -71,7 +71,7 @@ def seen(request, runs):
         space = ONE.space(runs)
         z = np.zeros(space.free)
         posed, scored_ = space.bare, space.library.scored
-        linear = jax.jit(lambda z: posed.observe.linearise(posed, z, posed.data, scored_))(jnp.asarray(z))
+        linear = jax.jit(lambda z: posed.observe.linearise(posed, z, scored_))(jnp.asarray(z))
     # Without the run that is already known, because robots with other effects are simulated here.
     problem = dataclasses.replace(space.bare, observe=dataclasses.replace(space.bare.observe, known=None))
     return SimpleNamespace(runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=linear)
@@ -143,7 +143,7 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     """To the simulated fit."""
     run, scored = oval.traced.run, oval.space.library.scored
     posed, z = run.space.bare, jnp.asarray(run.base.z[: run.space.free])
-    before = posed.observe.linearise(posed, z, posed.data, scored)
+    before = posed.observe.linearise(posed, z, scored)
     curve = fit_discrepancy(run.space, run.base, before, "track", "order 2 of the driving shaft")
     assert (
         curve.converged and curve.effect == "wave_track" and isinstance(curve.robot.effects[0], UNNAMED["wave_track"])
@@ -180,7 +180,7 @@ def test_signatures_are_differences_of_runs(seen):
     """At the first and the last point of each shape's grid, through everything that an effect remembers."""
     problem, linear, library = seen.problem, seen.linear, seen.space.library
     robot = problem.robot(seen.z)
-    read = jax.jit(lambda r: problem.whitened(problem.observe(r), problem.data)[: problem.data.measured.size])
+    read = jax.jit(lambda r: problem.whitened(problem.observe(r))[: problem.data.measured.size])
     for k, instances in enumerate(library.scored):
         mine = np.flatnonzero(library.of == k)
         for point in {0, len(instances.at) - 1}:
@@ -207,7 +207,7 @@ def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
     effect = UNNAMED[f"curve_{balance}_time"]
     shape = {"low": 0.0, "high": 0.8, "y0": 0.5, "y1": 0.7, "y2": 0.9, "y3": 1.0, "y4": 1.2, "y5": 0.8}
     size = 1e-3 * effect().amplitude + 1e-3 * {"electrical": 1.0, "track": 0.2, "ground": 4.0, "slip": 0.05}[balance]
-    read = jax.jit(lambda r: problem.whitened(problem.observe(r), problem.data)[: problem.data.measured.size])
+    read = jax.jit(lambda r: problem.whitened(problem.observe(r))[: problem.data.measured.size])
     made = params.replace(effect(), {k: jnp.asarray(v) for k, v in shape.items()})
     sides = [
         dataclasses.replace(problem.robot(z), effects=(dataclasses.replace(made, amplitude=jnp.asarray(s * size)),))
@@ -245,9 +245,9 @@ def test_linear_bootstrap_is_that_of_refits(clean):
     clean_reading = problem.observation(z).reading
 
     def chi2(noise_):
-        data = dataclasses.replace(problem.data, measured=clean_reading + problem.data.sd * noise_, centre=z)
-        back = levenberg_marquardt(problem, z, data, max_steps=6)[0].z
-        return jnp.sum(problem.misfit(back, data) ** 2) + jnp.sum((back - z) ** 2), jnp.sum(noise_**2)
+        drawn = problem.with_data(measured=clean_reading + problem.data.sd * noise_, centre=z)
+        back = levenberg_marquardt(drawn, z, max_steps=6)[0].z
+        return jnp.sum(drawn.misfit(back) ** 2) + jnp.sum((back - z) ** 2), jnp.sum(noise_**2)
 
     after, before = jax.jit(lambda d: jax.lax.map(chi2, d))(draw)
     taken = np.asarray(before - after)  # what a refit of so many parameters takes

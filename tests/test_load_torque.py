@@ -17,6 +17,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import bases, blocks
 from calibration.inference.observers import Histories, SettledRuns
+from mmrjax.effects.curve import WAYS
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
@@ -255,7 +256,9 @@ def test_a_drift_that_goes_with_the_torque_is_none():
     rig = bench()
     for with_torque in (False, True):
         known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
-        over = {variable for basis in bases.curve_families(known, np.ones(18), rig) for _, variable in basis.names}
+        ways, scope = dict.fromkeys(WAYS, np.ones(18)), bases.CurveScope.of(rig, known)
+        families = bases.curve_families(known, np.ones(18), ways, scope)
+        over = {variable for basis in families for _, variable in basis.names}
         assert ("order" in over) != with_torque
 
 

@@ -100,8 +100,7 @@ def _fit_without_prior(
         centre = np.zeros(len(start))
         centre[k] = mean
         start[k] = mean
-        data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
-        problem = dataclasses.replace(equipped, data=data)
+        problem = equipped.with_data(centre=jnp.asarray(centre))
         optima, _ = fit_from_each_start(problem, [start], [space.weight], [indices])
         best = jax.tree.map(lambda x: x[0], optima)
         z = np.asarray(best.z)

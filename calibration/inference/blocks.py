@@ -11,7 +11,7 @@ from calibration.data import Columns, Names
 from calibration.data.clock import rows_of_varying_runs
 from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.runs import Runs
-from calibration.inference import held_out as refits
+from calibration.inference.held_out import HeldOutFits, hold_out_blocks
 from calibration.inference.problem import Problem
 
 #: Kinds of blocks by name, with the columns that distinguish their blocks.
@@ -174,28 +174,7 @@ def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> s
     return first if first in configurations else ""
 
 
-@dataclasses.dataclass(frozen=True)
-class HeldOutReadings:
-    """Readings of each row, predicted by a fit without the row's block.
-
-    Attributes:
-        labels: labels of the blocks.
-        block: index of each row's block, shape (rows,).
-        reading: predicted readings [SI], shape (rows, channels). NaN if the fitted robot does not reach the row.
-        status: status of each row, shape (rows,).
-        z: coordinates of each block's fit, shape (blocks, parameters).
-        converged: True for each block whose fit converged.
-    """
-
-    labels: Names
-    block: np.ndarray
-    reading: np.ndarray
-    status: np.ndarray
-    z: np.ndarray
-    converged: np.ndarray
-
-
-def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOutReadings]:
+def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOutFits]:
     """Refits without each block of each kind in turn, with the same sds, and predicts the rows that were left out.
 
     Args:
@@ -204,19 +183,10 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
         masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are missing in the result.
     """
     answers = {}
-    fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
-    for kind, blocks_by_name in masks.items():
-        if blocks_by_name:
-            parts = tuple(m.tobytes() for m in blocks_by_name.values())
-            held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(
-                problem, start, list(blocks_by_name.values())
-            )
-            answers[kind] = HeldOutReadings(
-                tuple(blocks_by_name),
-                held_out.block,
-                held_out.reading,
-                held_out.status,
-                held_out.z,
-                held_out.converged,
-            )
+    fits: dict[tuple[bytes, ...], HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
+    for kind, blocks in masks.items():
+        if blocks:
+            parts = tuple(m.tobytes() for m in blocks.values())
+            fits[parts] = fits.get(parts) or hold_out_blocks(problem, start, list(blocks.values()))
+            answers[kind] = dataclasses.replace(fits[parts], labels=tuple(blocks))
     return answers

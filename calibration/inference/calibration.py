@@ -316,8 +316,7 @@ def _search(
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
-        search_result = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
-        endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in search_result.items())
+        endings = ", ".join(f"{n} {word.replace('_', ' ')}" for word, n in everyone.outcomes().items())
         raise BadConfiguration(
             f"--population: none of {len(everyone.z)} members runs in every row (ended in: {endings or 'none'}); "
             "begin from another robot, or free fewer parameters"
@@ -368,7 +367,7 @@ def _calibration_result(
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = {k: scans.scan_coordinate(posed, z, posed.data, k) for k in scans.scanned_coordinates(posed)}
+    scanned = {k: scans.scan_coordinate(posed, z, k) for k in scans.scanned_coordinates(posed)}
     about = scans.with_scanned_sds(about, scanned)
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [

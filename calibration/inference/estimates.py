@@ -9,8 +9,8 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
-from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, result, simulation_errors
+from calibration.inference.held_out import HeldOutFits
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
@@ -130,9 +130,7 @@ def _channel_errors(
     }
 
 
-def hold_out_errors(
-    posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
-) -> HeldOutErrors:
+def hold_out_errors(posed: Problem, held: HeldOutFits, measured: np.ndarray, sd: np.ndarray) -> HeldOutErrors:
     """Hold-out errors of all rows together and of each block."""
     percent, unreachable = (
         sized_error(held.reading, measured),

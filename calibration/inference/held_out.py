@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from calibration.data import Names
 from calibration.inference.optimizers import Optimum
 from calibration.inference.problem import Observation, Problem
 
@@ -46,6 +47,7 @@ class HeldOutFits:
         block: index of each row's block, -1 for none, shape (rows,).
         z: coordinates of each block's fit, shape (blocks, coordinates).
         converged: True for each block whose fit is an optimum.
+        labels: labels of the blocks, if they have any.
     """
 
     reading: np.ndarray
@@ -53,6 +55,7 @@ class HeldOutFits:
     block: np.ndarray
     z: np.ndarray
     converged: np.ndarray
+    labels: Names = ()
 
 
 def hold_out_blocks(

@@ -17,7 +17,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.population import Population, PopulationSearch, most_probable_noise
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import Observation, Problem
 from mmrjax.model.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
@@ -145,17 +145,16 @@ def search_one_by_one(
     def elapsed_minutes() -> float:
         return (time.perf_counter() - start_time) / 60
 
-    def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
+    def step(posed: Problem, points: np.ndarray) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
             return optimizers.search_rollout(
                 posed,
                 jnp.asarray(z),
-                data,
                 tell=lambda *done: tell(progress_remark("search", *done, elapsed_minutes())),
             )
 
         optima, start, end = one(points[0])
-        optima, end = scans.search_lower_minima(posed, (optima, end), data, lambda z: one(z)[::2], tell)
+        optima, end = scans.search_lower_minima(posed, (optima, end), lambda z: one(z)[::2], tell)
         optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
         return optima, start.status, end.status
 
@@ -173,7 +172,7 @@ def search_one_by_one(
             posed = _with_noise_shares(posed, noise, shares)
         ends, feasibles = [optima], [feasible]
         for k, point in enumerate(points[1:], 2):
-            end, status, _ = step(posed, point[None], posed.data)
+            end, status, _ = step(posed, point[None])
             ends.append(end)
             feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
             tell(progress_remark("start", k, len(points), end.cost[0], end.steps[0], elapsed_minutes()))
@@ -224,10 +223,8 @@ def optimum_of_population(
     if searched.slope is None:
         optima = search_one_by_one(posed, noise, z[None], shares, tell)
         return dataclasses.replace(optima, searched=searched)
-    observation = Observation(*(jnp.asarray(x[searched.at]) for x in (
-        searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,
-    )))  # fmt: skip
-    error = np.concatenate([np.asarray(posed.whitened(observation, posed.data)), z - np.asarray(posed.data.centre)])
+    observation = jax.tree.map(lambda x: jnp.asarray(x[searched.at]), searched.found.seen)
+    error = np.concatenate([np.asarray(posed.whitened(observation)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
     best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
@@ -240,7 +237,7 @@ def optimum_of_population(
 
 def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
     """Problem with the most probable noise at a member of the population, and that noise relative to the readings."""
-    shares = most_probable_noise(posed, noise, searched.reading[at])
+    shares = most_probable_noise(posed, noise, np.asarray(searched.seen.reading[at]))
     return _with_noise_shares(posed, noise, shares), shares
 
 
@@ -281,7 +278,7 @@ def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.n
 
 def _with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
     sd = np.where(noise.estimated, noise.sd / noise_room.START * shares, noise.sd)
-    return dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=jnp.asarray(sd)))
+    return posed.with_data(sd=jnp.asarray(sd))
 
 
 def _search_until_feasible(
@@ -293,10 +290,9 @@ def _search_until_feasible(
         The problem, the searches, and True for each feasible start.
     """
     for _ in range(TIGHTENINGS + 1):
-        optima, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
+        optima, status_start, status_end = search(posed, jnp.asarray(points))
         k = int(np.nanargmin(optima.cost))
         if not unreachable_rows(posed, status_end)[k].any():
             break
-        data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
-        posed = dataclasses.replace(posed, data=data)
+        posed = posed.with_data(stiffness=posed.data.stiffness / 10)
     return posed, optima, ~np.any(unreachable_rows(posed, status_start), axis=1)

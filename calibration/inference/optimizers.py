@@ -112,21 +112,21 @@ def informative_residuals(data: Data) -> np.ndarray:
 Progress = tuple[Z, SearchState]
 
 
-def _evaluate_residuals(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
+def _evaluate_residuals(problem: Problem, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
     """Residuals (readings, penalties with their signs, priors) at z, their Jacobian, and the observation.
 
     All three come from one evaluation of the model.
     """
-    r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
-    prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+    r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z)
+    prior = jnp.where(pin.held, z - pin.at, z - problem.data.centre)
     return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
 
 
-def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
+def residual_function(problem: Problem, pin: Pin) -> Function:
     """Residual function for optimistix, from `_evaluate_residuals`. Its auxiliary output is the observation."""
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
-        r, jacobian, observation = _evaluate_residuals(problem, data, pin, jax.lax.stop_gradient(z))
+        r, jacobian, observation = _evaluate_residuals(problem, pin, jax.lax.stop_gradient(z))
         return with_derivative(z, r, jacobian), observation
 
     return function
@@ -192,8 +192,9 @@ def _solver_step(solver: OneSidedLevenbergMarquardt, function: Function, at: Pro
     return y, state
 
 
-def _begin_search(problem: Problem, start: Z, data: Data) -> Progress:
+def _begin_search(problem: Problem, start: Z) -> Progress:
     """State of a problem's search before its first evaluation."""
+    data = problem.data
     size = adhesion_penalty_slice(data).stop + start.shape[0]
     codes = jnp.zeros(data.measured.shape[0], int)
     return _initial_progress(
@@ -212,7 +213,7 @@ def _advance_search(problem: Problem, at: Progress, max_steps: int | Numbers) ->
     """
     solver, function = (
         _least_squares_solver(problem.data, problem.observe.long),
-        residual_function(problem, problem.data, no_pin(at[0].shape[0])),
+        residual_function(problem, no_pin(at[0].shape[0])),
     )
     y, state = _solver_step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
@@ -228,20 +229,20 @@ def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
 
 
 def levenberg_marquardt(
-    problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
+    problem: Problem, start: Z, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """Optimum of one search, and the observation there. It can be vmapped over starts, data and pins."""
+    """Optimum of one search, and the observation there. It can be vmapped over problems, starts and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
-    function: Any = residual_function(problem, data, pin)
+    function: Any = residual_function(problem, pin)
     solution: optx.Solution = optx.least_squares(
         function,
-        _least_squares_solver(data, problem.observe.long),
+        _least_squares_solver(problem.data, problem.observe.long),
         pin.apply(start),
         has_aux=True,
         max_steps=max_steps,
         throw=False,
     )
-    return _optimum_of_progress((solution.value, solution.state), data, pin), solution.aux
+    return _optimum_of_progress((solution.value, solution.state), problem.data, pin), solution.aux
 
 
 class SearchMember(eqx.Module):
@@ -261,11 +262,9 @@ class SearchMember(eqx.Module):
 
     def problem(self, problem: Problem) -> Problem:
         """Problem of this search."""
-        data = dataclasses.replace(problem.data, weight=self.weight, measured=self.measured, centre=self.centre)
-        coordinates = problem.coordinates
         if self.active is not None:
-            coordinates = coordinates.with_effects(self.active)
-        return dataclasses.replace(problem, data=data, coordinates=coordinates)
+            problem = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(self.active))
+        return problem.with_data(weight=self.weight, measured=self.measured, centre=self.centre)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -273,7 +272,7 @@ def _placeholder_searches(problem: Problem, members: SearchMember) -> Progress:
     """States of searches that have already ended, as placeholders."""
 
     def placeholder(member: SearchMember) -> Progress:
-        y, state = _begin_search(problem, member.start, member.problem(problem).data)
+        y, state = _begin_search(member.problem(problem), member.start)
         return y, dataclasses.replace(state, over=jnp.asarray(True))
 
     return jax.vmap(placeholder)(members)
@@ -283,7 +282,7 @@ def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Number
     """States of parallel searches after the `fresh` ones were reset to their starts."""
 
     def begin(member: SearchMember, fresh: Array, at: Progress) -> Progress:
-        search_begin = _begin_search(problem, member.start, member.problem(problem).data)
+        search_begin = _begin_search(member.problem(problem), member.start)
         return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), search_begin, at)
 
     return jax.vmap(begin)(members, fresh, at)
@@ -472,25 +471,18 @@ def _search_with_states(
     return jax.tree.map(lambda *x: np.stack(x), *(results_by_member[k] for k in range(count)))
 
 
-def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def linearise(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Residuals (misfit, then priors) at z, their Jacobian, and the observation."""
-    r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
-        problem, z, data
-    )
-    return *clip_penalties(r, jacobian, data), observation
+    evaluate = linearise_rollout if problem.observe.long else _linearise_by_search_program
+    r, jacobian, observation = evaluate(problem, z)
+    return *clip_penalties(r, jacobian, problem.data), observation
 
 
-def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def _linearise_by_search_program(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Result of `linearise`, with the signs of the penalties, by the compiled program of the searches."""
-    active = getattr(problem.coordinates, "active", None)
-    one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
-    members = SearchMember(
-        one_member[0],
-        one_member[1],
-        one_member[2],
-        one_member[3],
-        None if active is None else np.asarray(active)[None],
-    )
+    data, active = problem.data, getattr(problem.coordinates, "active", None)
+    member = SearchMember(z, data.weight, data.measured, data.centre, active)
+    members = jax.tree.map(lambda x: np.asarray(x)[None], member)
     _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
     return state.found.residual, state.found.jacobian, state.aux
@@ -513,23 +505,22 @@ def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def linearise_rollout(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Result of `linearise` for a rollout, with negative penalties and their derivatives.
 
     If a step of the rollout is too long for its friction law (V_s small compared with μ_s), the run oscillates and
     its derivative grows without limit. Such a reading counts as not computed, if it has a weight.
     """
+    r, jacobian, observation = _evaluate_residuals(problem, no_pin(z.size), z)
+    return *mask_uncomputed(r, jacobian, problem.data), observation
 
-    r, jacobian, observation = _evaluate_residuals(problem, data, no_pin(z.size), z)
-    return *mask_uncomputed(r, jacobian, data), observation
 
-
-def evaluate_residuals(problem: Problem, z: Z, data: Data) -> Array:
+def evaluate_residuals(problem: Problem, z: Z) -> Array:
     """Residuals of `linearise` without the Jacobian. It uses the program of `observe_robot`, which saves a
     compilation.
     """
     observation = observe_robot(problem, problem.robot(z))
-    return jnp.concatenate([problem.whitened(observation, data), z - data.centre])
+    return jnp.concatenate([problem.whitened(observation), z - problem.data.centre])
 
 
 @eqx.filter_jit
@@ -540,7 +531,6 @@ def _linearised_step(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array,
 def search_rollout(
     problem: Problem,
     start: Z,
-    data: Data,
     max_steps: int = 100,
     tell: Callable[[int, float], None] = lambda steps, cost: None,
 ) -> tuple[Optimum, Observation, Observation]:
@@ -551,16 +541,17 @@ def search_rollout(
     Returns:
         The optimum, and the observations at the start and at the end.
     """
-    pin, solver = no_pin(start.shape[0]), _least_squares_solver(data, long=True)
+    pin, data = no_pin(start.shape[0]), problem.data
+    solver = _least_squares_solver(data, long=True)
     size = adhesion_penalty_slice(data).stop + start.shape[0]
     progress, first_result, last_result = _initial_progress(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         ahead = progress[1].ahead
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
-        r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
+        r = evaluate_residuals(problem, ahead) if progress[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, observation = linearise_rollout(problem, ahead, data)
+            r, jacobian, observation = linearise_rollout(problem, ahead)
         first_result = observation if first_result is None else first_result
         progress = _linearised_step(solver, progress, r, jacobian)
         done = bool(progress[1].over)
@@ -652,7 +643,7 @@ def search_rollouts(
 
 
 def search_starts(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
+    problem: Problem, starts: Float[Array, "starts parameters"]
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
     """Searches from each start, in batches.
 
@@ -661,14 +652,14 @@ def search_starts(
     Returns:
         The end of each search, and the status of each row at its start and at its end.
     """
+    data = problem.data
     if not problem.observe.apart:
         size = min(len(starts), max(1, AT_ONCE // len(data.measured)))
         filled = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
-        parts = [jax.device_get(_search_starts(problem, z, data)) for z in filled.reshape(-1, size, starts.shape[1])]
+        parts = [jax.device_get(_search_starts(problem, z)) for z in filled.reshape(-1, size, starts.shape[1])]
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(starts)], *parts)
     tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
     members = SearchMember(np.asarray(starts), *tables)
-    problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
     first_results, final_results = (
         search_refilling(problem, members, steps, problem.observe.searches_per_core(problem)) for steps in (1, 100)
@@ -677,9 +668,9 @@ def search_starts(
 
 
 @compiled
-def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> tuple[Optimum, Array, Array]:
+def _search_starts(problem: Problem, starts: Array | np.ndarray) -> tuple[Optimum, Array, Array]:
     def search(z: Any) -> tuple[Optimum, Array, Array]:
-        optimum, observation = levenberg_marquardt(problem, z, data)
+        optimum, observation = levenberg_marquardt(problem, z)
         return optimum, problem.observation(z).status, observation.status
 
     return jax.vmap(search)(starts)
@@ -697,6 +688,4 @@ def _simulated_readings(problem: Problem, robot: Robot) -> Observation:
 
 def observe_at(problem: Problem, z: Z) -> Observation:
     """Observation at z. For rollouts, by a program that the search has already compiled."""
-    return (
-        linearise(problem, z, problem.data)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))
-    )
+    return linearise(problem, z)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))

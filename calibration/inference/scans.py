@@ -19,7 +19,7 @@ from jaxtyping import Float
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.optimizers import Optimum, evaluate_residuals
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import Observation, Problem
 from mmrjax.model.params import parameters_by_name
 
 #: Half of the range of a scan [prior sd].
@@ -98,26 +98,26 @@ def wide_coordinates(problem: Problem) -> tuple[int, ...]:
     return tuple(k for k, width in enumerate(widths) if width is not None and half[k] > width)
 
 
-def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
+def scan_coordinate(problem: Problem, z: np.ndarray, k: int) -> Scan:
     """Scan of coordinate k: at z, evenly over the range of the prior, and more closely near minima.
 
     Without the point at z, a narrow minimum that contains no other point could be missed.
     """
     count = problem.observe.number_of_scan_points(problem, k)
-    scan = _scan_at(problem, z, data, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
+    scan = _scan_at(problem, z, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
     around, few = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        scan = _join_scans(scan, _scan_at(problem, z, data, k, np.resize(close, count)))
+        scan = _join_scans(scan, _scan_at(problem, z, k, np.resize(close, count)))
     low, high = scan.interval()
     return _join_scans(
-        scan, _scan_at(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
+        scan, _scan_at(problem, z, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
     )
 
 
-def _scan_at(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
+def _scan_at(problem: Problem, z: np.ndarray, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
-    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
+    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(at))
     return _sorted_scan(at, np.asarray(cost), np.asarray(other_coordinates))
 
 
@@ -138,7 +138,7 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
     """
     starts = np.array(starts, float)
     for k in scanned_coordinates(problem):
-        scan = scan_coordinate(problem, starts[0], problem.data, k)
+        scan = scan_coordinate(problem, starts[0], k)
         starts[:, k] = scan.at[np.argmin(scan.cost)]
     return starts
 
@@ -147,7 +147,7 @@ Found = tuple[Optimum, Observation]
 
 
 def search_lower_minima(
-    problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
+    problem: Problem, found: Found, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
 ) -> Found:
     """Scans the optimum of a search, and repeats the search from any lower minimum.
 
@@ -163,12 +163,12 @@ def search_lower_minima(
         return found
 
     def objective(z: np.ndarray) -> float:
-        cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z), data) ** 2))
+        cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z)) ** 2))
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
         cost_here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan_coordinate(problem, z, data, k) for k in coordinates}
+        looked = {k: scan_coordinate(problem, z, k) for k in coordinates}
         lower = found
         for k, scan in looked.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:

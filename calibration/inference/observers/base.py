@@ -247,7 +247,7 @@ class Observer(eqx.Module):
     # --- of fits
 
     @abc.abstractmethod
-    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Residuals, Jacobian and sensitivities to effects at z."""
 
     def at_fit(self, problem: Problem, z: Numbers) -> Observer:
@@ -267,13 +267,12 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def fit_replicate(
-        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
+        self, problem: Problem, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
         """Linearization of one bootstrap replicate: a table that is drawn from the fit of the base and refitted.
 
         Args:
             problem: problem of the base.
-            data: data of the table.
             linear: linearization of the fit.
             drawn: one element of `draw_replicates`.
         """
@@ -301,7 +300,7 @@ class Observer(eqx.Module):
         """Number of scanned values of a coordinate, a multiple of `scans.CLOSER`."""
         raise NotImplementedError
 
-    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+    def scan(self, problem: Problem, z: Array, k: int, values: Array) -> tuple[Array, Array]:
         """Objective at each of `values` of coordinate k, shape (values,), and all coordinates there, shape (values,
         coordinates).
 
@@ -347,7 +346,7 @@ class Observer(eqx.Module):
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, their Jacobian and the observation at z. Arguments as in `observation_at`."""
-        return linearise(with_effects(problem, active), jnp.asarray(z), problem.data)
+        return linearise(with_effects(problem, active), jnp.asarray(z))
 
     @abc.abstractmethod
     def bases(self, columns: Columns, included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:

@@ -61,7 +61,8 @@ class LinearRows(Observer):
         own = self.effect == jnp.asarray(coordinates.active)[:, None]
         return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * own * share, 0)
 
-    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Any:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Any:
+        data = problem.data
         evaluated, linear = jax.device_get((_evaluated(self, problem.coordinates, data, z), self.linear))
         linear = linear.rescaled(np.asarray(data.weight) / np.asarray(data.sd))
         return dataclasses.replace(linear, residual=evaluated[0], jacobian=evaluated[1])
@@ -89,9 +90,9 @@ class LinearRows(Observer):
         return keys
 
     def fit_replicate(
-        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
+        self, problem: Problem, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
-        return linear_replicate(data, linear, drawn)
+        return linear_replicate(problem.data, linear, drawn)
 
     def search(
         self,
@@ -106,8 +107,7 @@ class LinearRows(Observer):
         def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
             parts = []
             for at, member in zip(z, members, strict=True):
-                data = dataclasses.replace(problem.data, weight=jnp.asarray(weights[member]))
-                member_problem = dataclasses.replace(problem, data=data)
+                member_problem = problem.with_data(weight=jnp.asarray(weights[member]))
                 parts.append(self.at(member_problem, at, None if active is None else active[member]))
             return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
 
@@ -158,7 +158,7 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
         width: prior sd of amplitudes, relative to those of their fields.
     """
     data, observe, z = problem.data, problem.observe, np.asarray(z)
-    linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), data, effects))
+    linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), effects))
     scale = np.asarray(data.weight / data.sd)
     raw = jax.tree.map(jnp.asarray, linear.rescaled(np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)))
     fields = {f.name: getattr(observe, f.name) for f in dataclasses.fields(observe) if f.name != "known"}

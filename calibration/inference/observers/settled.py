@@ -33,7 +33,7 @@ from calibration.inference.optimizers import (
     search_refilling,
     zero_inactive_residuals,
 )
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import Observation, Problem
 from calibration.inference.repeats import rows_of_same_conditions
 from calibration.inference.simulation_errors import root_mean_square
 from mmrjax import fidelities
@@ -267,13 +267,13 @@ class SettledRuns(Observer):
     def cautions(self, robot: Robot) -> list[str]:
         return fidelities.get_fidelity(self.fidelity).cautions(robot, self.conditions)
 
-    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Linearization as in the protocol.
 
         A signature is the sensitivity of the readings to a defect of the effect's balance, times the effect's term.
         This is exact, because an effect enters one balance and is linear in its amplitude.
         """
-        kind = self.linearization
+        kind, data = self.linearization, problem.data
         probes = tuple(balance_probe(b) for b in kind.probed)
         robot, size, channel_names = problem.robot(z), z.size, channels.channel_names(problem.channels)
 
@@ -284,7 +284,7 @@ class SettledRuns(Observer):
             return dataclasses.replace(robot, effects=(*robot.effects, *put))
 
         z_and_probes = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
-        r, slopes, _, signals = problem.linearised(probed, z_and_probes, data)
+        r, slopes, _, signals = problem.linearised(probed, z_and_probes)
         r, slopes = zero_inactive_residuals(r, slopes, adhesion_penalty_slice(data))
         jacobian = jnp.concatenate([slopes, jnp.eye(size, z_and_probes.size)])
         residual = jnp.concatenate([r, z - data.centre])
@@ -336,14 +336,12 @@ class SettledRuns(Observer):
     def fit_replicate(
         self,
         problem: Problem,
-        data: Data,
         effects: tuple[ScoredEffect, ...],
         linear: Linearization,
         drawn: tuple[Array, Array, Array],
     ) -> Linearization:
         measured, centre, refit = drawn
-        noisy = dataclasses.replace(data, measured=measured, centre=centre)
-        return self.linearise(problem, refit, noisy, effects)
+        return self.linearise(problem.with_data(measured=measured, centre=centre), refit, effects)
 
     def search(
         self,
@@ -377,8 +375,7 @@ class SettledRuns(Observer):
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
         columns = {**_unmeasured(self, robot, columns), **columns}
         ways = dict.fromkeys(WAYS, np.asarray(_run_directions(self, robot)))
-        base_arguments = columns, weight, robot, None, ways
-        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
+        return bases_room.families_of_table(columns, weight, ways, bases_room.CurveScope.of(robot, columns))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> EquationErrors:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.

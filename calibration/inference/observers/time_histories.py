@@ -65,7 +65,7 @@ from calibration.inference.optimizers import (
     zero_inactive_residuals,
 )
 from calibration.inference.priors import DELAY
-from calibration.inference.problem import MISSING, Data, Observation, Problem
+from calibration.inference.problem import MISSING, Observation, Problem
 from calibration.inference.weak_form import fit_weak_form
 from mmrjax import fidelities
 from mmrjax.compile.compiling import OVER_TIME, SELDOM, Threads, compiled
@@ -652,26 +652,24 @@ class Histories(Observer):
             total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
         return float(total)
 
-    def linearise(
-        self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
-    ) -> HistoriesLinearization:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> HistoriesLinearization:
         """Linearization at z, see `Observer.linearise`.
 
         Residuals and Jacobian come from the program of the searches. The changes by errors and effects (`responses`)
         are computed along its runs.
         """
-        problem = dataclasses.replace(problem, data=data)
         residual, jacobian, _, simulated = _evaluate_at(problem, z)
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
+        scale = problem.data.weight / problem.data.sd
         places = {*bases_room.balances_of(problem.base), *itertools.chain(*bases_room.STANDS_FOR.values())}
         probed = tuple(k for k, b in enumerate(PROBED) if b in places)
-        signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd, probed)
+        signatures, defects, signals, angle = _responses(observe, robot, effects, scale, probed)
         return HistoriesLinearization(
             residual,
             jacobian,
             signatures,
             defects,
-            data.weight / data.sd,
+            scale,
             signals,
             self.rows_of,
             self.knots,
@@ -687,9 +685,9 @@ class Histories(Observer):
         return dataclasses.replace(self, known=_evaluate_at(problem, z)[3])
 
     def fit_replicate(
-        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
+        self, problem: Problem, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
     ) -> Linearization:
-        return linear_replicate(data, linear, drawn)
+        return linear_replicate(problem.data, linear, drawn)
 
     def starts(
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
@@ -737,16 +735,14 @@ class Histories(Observer):
         steps_needed = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
         return int(2 ** np.clip(np.ceil(np.log2(steps_needed)), *np.log2(DELAYS)))
 
-    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+    def scan(self, problem: Problem, z: Array, k: int, values: Array) -> tuple[Array, Array]:
         """Scan of a coordinate, see `Observer.scan`. A delay only shifts the readings of a run, so one run serves all
         its values.
         """
         if problem.coordinates.names[k] == DELAY:
-            return _scan_delays(problem, z, data, jnp.arange(len(z)) == k, values)
+            return _scan_delays(problem, z, jnp.arange(len(z)) == k, values)
         scans_found = [
-            _minimum_with_one_held(
-                *linearise(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k
-            )
+            _minimum_with_one_held(*linearise(problem, z.at[k].set(v))[:2], z.at[k].set(v), jnp.arange(len(z)) == k)
             for v in values
         ]
         return jnp.stack([cost for cost, _ in scans_found]), jnp.stack([at for _, at in scans_found])
@@ -788,9 +784,8 @@ class Histories(Observer):
         def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
             return result_of_member(search_from(z[None], slice(k, k + 1)), 0)
 
-        scan_data = dataclasses.replace(problem.data, weight=weights[k])
         best = scans.search_lower_minima(
-            problem, result_of_member(optima, k), scan_data, search_again, lambda _: None
+            problem.with_data(weight=weights[k]), result_of_member(optima, k), search_again, lambda _: None
         )
         put = lambda every, mine: np.concatenate([every[:k], np.asarray(mine)[None], every[k + 1 :]])  # noqa: E731
         return jax.tree.map(put, optima, best)
@@ -814,12 +809,11 @@ class Histories(Observer):
             columns = {**columns, "supply_voltage_V": at_motors}
         configuration = self.conditions.configuration
         on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(configuration).on_tracks > 0.5, np.shape(configuration))
+        scope = bases_room.CurveScope.of(robot, columns)
         waves = bases_room.wave_families(
-            on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot
+            on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), scope.balances
         )
-        weight = included.astype(float)
-        base_arguments = columns, weight, robot, None, ways
-        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments), *waves)
+        return *bases_room.families_of_table(columns, included.astype(float), ways, scope), *waves
 
     def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> TimeStatistics:
         names = bases_room.family_names(bases)
@@ -1178,8 +1172,9 @@ def _shaft_motion(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _scan_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
+def _scan_delays(problem: Problem, z: Array, scanned: Array, values: Array) -> tuple[Array, Array]:
     observe: Histories = problem.observe  # type: ignore[assignment]
+    data = problem.data
 
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
@@ -1224,9 +1219,8 @@ def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | No
     weights, made = np.asarray(weights), threading.Event()
 
     def evaluate_one(z: np.ndarray, member: int) -> tuple[np.ndarray, np.ndarray, Observation]:
-        data = dataclasses.replace(problem.data, weight=weights[member])
         slots = None if active is None else np.asarray(active)[member]
-        return _evaluate_at(with_effects(dataclasses.replace(problem, data=data), slots), z)[:3]
+        return _evaluate_at(with_effects(problem.with_data(weight=weights[member]), slots), z)[:3]
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         with Threads(CORES if made.is_set() else 1) as cores:
@@ -1242,7 +1236,7 @@ def _evaluate(problem: Problem, z: Array) -> tuple[Array, Array, Observation, Li
     """Result of `linearise_rollout` at z, and the simulated runs."""
     observe: Histories = problem.observe.with_simulated_runs(problem.robot(z))  # type: ignore[attr-defined]
     assert observe.known is not None
-    r, jacobian, observation = linearise_rollout(dataclasses.replace(problem, observe=observe), z, problem.data)
+    r, jacobian, observation = linearise_rollout(dataclasses.replace(problem, observe=observe), z)
     penalties = adhesion_penalty_slice(problem.data)  # negative, because adhesion is not penalised
     return *zero_inactive_residuals(r, jacobian, penalties), observation, observe.known
 

@@ -170,8 +170,8 @@ class Windows(LinearRows, SettledRuns):
         ways = {name: np.sign(linear.variable(name)) for name in WAYS}
         table = {bases_room.VARIABLES[v]: linear.variable(v) for v in UNSHOWN}
         table |= {name: np.asarray(x) for name, x in self.table.items()}
-        arguments = table, linear.at_points(included).astype(float), robot, None, ways
-        return (*bases_room.curve_families(*arguments), *bases_room.window_families(*arguments))
+        weight, scope = linear.at_points(included).astype(float), bases_room.CurveScope.of(robot, table)
+        return bases_room.families_of_table(table, weight, ways, scope)
 
 
 def problem_of_windows(
