@@ -45,7 +45,7 @@ from scipy.optimize import least_squares  # noqa: E402
 from calibration.data import inferred_facts  # noqa: E402
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
-from calibration.inference.held_out import fit_from_each_start  # noqa: E402
+from calibration.inference.blocks import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import simulate_members  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402

@@ -17,7 +17,7 @@ from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import scales
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
 from calibration.inference import bases
-from calibration.inference.held_out import hold_out_blocks
+from calibration.inference.blocks import hold_out_blocks
 from calibration.inference.linearization import PROBED, amplitude_of, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization

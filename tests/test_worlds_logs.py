@@ -12,7 +12,7 @@ from worlds.settled import remainder
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, noise, observers, ranges
-from calibration.inference.observers.time_histories import _common_length
+from calibration.inference.observers.run_grids import _common_length
 from calibration.inference.ranges import check_ranges
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params

@@ -17,7 +17,7 @@ from calibration.discovery.projection import explained_function, projection_fact
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
-from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from mmrjax.model import channels
 

@@ -50,9 +50,14 @@ class Scan:
         lowest = np.flatnonzero((self.cost <= padded[:-2]) & (self.cost < padded[2:]))
         return lowest[np.argsort(self.cost[lowest], kind="stable")]
 
+    @property
+    def _inside(self) -> np.ndarray:
+        """True for points within 95 % (a rise of up to 3.84 σ²)."""
+        return 2 * (self.cost - self.cost.min()) <= Z95**2
+
     def interval(self) -> tuple[float, float]:
-        """Smallest interval that contains all points within 95 % (a rise of up to 3.84 σ²)."""
-        places_inside = np.flatnonzero(2 * (self.cost - self.cost.min()) <= Z95**2)
+        """Smallest interval that contains all points within 95 %."""
+        places_inside = np.flatnonzero(self._inside)
         return self._crossing(places_inside[0], -1), self._crossing(places_inside[-1], 1)
 
     def _crossing(self, k: int, side: int) -> float:
@@ -66,13 +71,11 @@ class Scan:
 
     def open(self) -> tuple[bool, bool]:
         """True for each end of the interval that may lie beyond the scanned range."""
-        is_inside = 2 * (self.cost - self.cost.min()) <= Z95**2
-        return bool(is_inside[0]), bool(is_inside[-1])
+        return bool(self._inside[0]), bool(self._inside[-1])
 
     def parts(self) -> int:
         """Number of separate parts of the 95 % region."""
-        is_inside = 2 * (self.cost - self.cost.min()) <= Z95**2
-        return int(np.sum(is_inside & ~np.concatenate([[False], is_inside[:-1]])))
+        return int(np.sum(np.diff(self._inside.astype(int), prepend=0) > 0))
 
     def sd(self) -> float:
         """Standard deviation of the coordinate, with exp(-rise / 2) as its density."""
@@ -184,7 +187,7 @@ def search_lower_minima(
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
     lowest = min(float(scan.cost.min()) for scan in looked.values())
-    sd = np.asarray(found[0].sd).copy()
+    sd = np.array(found[0].sd)
     for k, scan in looked.items():
         sd[k] = scan.sd()
     settled = bool(found[0].converged) or cost_here - lowest < WORTH
@@ -201,15 +204,14 @@ def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifi
 
 
 def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
-    """Number of converged searches that ended outside the 95 % intervals of the scans at the best optimum. `z`: end
-    of each search, shape (searches, parameters), None if unknown.
+    """Number of converged searches that ended outside the 95 % intervals of the scans at the best optimum.
 
     Args:
         z: end of each search, shape (searches, parameters), None if not known.
         converged: True for each converged search.
     """
-    if z is None:
-        return 0
-    ends = {k: scan.interval() for k, scan in scans.items()}
-    outside = [(z[:, k] < low) | (z[:, k] > high) for k, (low, high) in ends.items()]
-    return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
+    outside = np.zeros(len(converged), bool)
+    for k, scan in scans.items() if z is not None else ():
+        low, high = scan.interval()
+        outside |= (z[:, k] < low) | (z[:, k] > high)
+    return int(np.sum(outside & converged))

@@ -49,13 +49,13 @@ from calibration.inference.shown_states import (
 )
 from mmrjax.compile import compiling
 from mmrjax.compile.programs import return_memory
-from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
 from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
 
 #: Fewest windows for each base parameter of a regression that is used.
@@ -316,9 +316,7 @@ def _terms_with_derivatives(
     def terms_of_point(row: LogPoints) -> tuple[Any, tuple[Any, Signals]]:
         def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:
             base = problem.coordinates.robot(problem.base, x[:size])
-            amplitude = x[size : size + len(probes)]
-            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
-            robot = dataclasses.replace(base, effects=(*base.effects, *put))
+            robot = linearization.with_probes(base, probes, x[size : size + len(probes)])
             f, y, signals = equation_terms(
                 plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes)
             )
@@ -383,23 +381,15 @@ def memory_by_point(
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
 
     def of_effect(scored: linearization.ScoredEffect) -> Array:
-        def rate(effect: Effect, at: Array, signals: Signals) -> Array:
-            with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: at})
-            return jnp.asarray(effect.rate(robot, with_memory), float)
-
-        def begun(angle: Array) -> Array:
-            return linearization.map_over_shapes(
-                scored, lambda e, _: jnp.asarray(e.initial(robot, angle), float), jnp.zeros(len(scored.at))
-            )
-
         def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
-            law = lambda m: linearization.map_over_shapes(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
-            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
-            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun(angle))
+            speed, slope = value_and_slope(lambda m: linearization.memory_rates(robot, scored, signals, m), memory)
+            begun = linearization.initial_memory(robot, scored, angle)
+            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun)
             return memory, memory
 
-        return jax.lax.scan(after, begun(rows.angle[0]), (rows.since, rows.angle, signals))[1]
+        begun = linearization.initial_memory(robot, scored, rows.angle[0])
+        return jax.lax.scan(after, begun, (rows.since, rows.angle, signals))[1]
 
     return [zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, nothing, strict=True)]
 

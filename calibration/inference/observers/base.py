@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -124,13 +124,13 @@ class Observer(eqx.Module):
         """
 
     @classmethod
-    @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
         """Rejects runs whose initial state the model cannot reproduce. Returns remarks on the length of the others.
 
         Raises:
             BadData: a run does not begin in an initial state of the model.
         """
+        return []
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
@@ -138,7 +138,6 @@ class Observer(eqx.Module):
         return robot
 
     @classmethod
-    @abc.abstractmethod
     def check_settled(cls, runs: Runs) -> None:
         """Rejects data other than settled runs with one row each.
 
@@ -166,9 +165,9 @@ class Observer(eqx.Module):
         """True if data of this kind, with an external supply, can reveal an effect."""
 
     @classmethod
-    @abc.abstractmethod
     def free(cls) -> tuple[Names, Names]:
         """Names of further parameters that such data determine: of the drive, and of each chassis."""
+        return (), ()
 
     # --- of robots
 
@@ -214,9 +213,9 @@ class Observer(eqx.Module):
         return self.long or not self.reads
 
     @property
-    @abc.abstractmethod
     def starts_from_steady(self) -> bool:
         """True if a search may start at the optimum of the same problem with `steady`."""
+        return self.long and not self.axis
 
     @abc.abstractmethod
     def unreachable(self, status: np.ndarray) -> np.ndarray:
@@ -231,9 +230,9 @@ class Observer(eqx.Module):
         """Warnings about the readings of a calibrated robot, as sentences."""
         return []
 
-    @abc.abstractmethod
     def number_of_included_runs(self, included: np.ndarray) -> int:
         """Number of runs with at least one included row."""
+        return int(included.sum())
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
         """Expected χ² of noise alone. For settled runs it is one for each reading, because rows are independent.
@@ -250,7 +249,7 @@ class Observer(eqx.Module):
     def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Residuals, Jacobian and sensitivities to effects at z."""
 
-    def at_fit(self, problem: Problem, z: Numbers) -> Observer:
+    def at_fit(self, problem: Problem, z: Numbers) -> Self:
         """Observer with facts about its runs that a fit has determined."""
         return self
 
@@ -265,17 +264,23 @@ class Observer(eqx.Module):
         """
         return keys
 
-    @abc.abstractmethod
     def fit_replicate(
         self, problem: Problem, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
         """Linearization of one bootstrap replicate: a table that is drawn from the fit of the base and refitted.
 
+        A table of noise alone, refitted by one linear step, unless the kind of data needs more.
+
         Args:
             problem: problem of the base.
             linear: linearization of the fit.
-            drawn: one element of `draw_replicates`.
+            drawn: one element of `draws`.
         """
+        data, jacobian = problem.data, linear.jacobian
+        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
+        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
+        residual = noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise)
+        return dataclasses.replace(linear, residual=residual)
 
     def starts(
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
@@ -366,14 +371,6 @@ class Observer(eqx.Module):
             included: True for included rows of the table.
             before, after: diagnoses without and with the proposal.
         """
-
-
-def linear_replicate(data: Data, linear: Linearization, key: Array) -> Linearization:
-    """Linearization of a table of noise alone, refitted by one linear step. `key`: random key as numbers."""
-    jacobian = linear.jacobian
-    counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
-    noise = counts * jax.random.normal(jax.random.wrap_key_data(key), counts.shape)
-    return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
 
 def with_effects(problem: Problem, active: Numbers | None) -> Problem:

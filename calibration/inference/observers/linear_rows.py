@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate, with_effects
-from calibration.inference.observers.time_histories import Histories, HistoriesLinearization
+from calibration.inference.linearization import ScoredEffect
+from calibration.inference.observers.base import Observer, SearchPolicy, with_effects
+from calibration.inference.observers.time_histories import Histories
 from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
 
@@ -39,12 +38,12 @@ class LinearRows(Observer):
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=16, steps=30, searches=1, one_by_one=False)
     rows_tell: ClassVar[bool] = False
 
-    linear: eqx.AbstractVar[Any]
-    origin: eqx.AbstractVar[Float[Array, " parameters"]]
-    start: eqx.AbstractVar[Float[Array, " parameters"]]
-    width: eqx.AbstractVar[float]
-    effect: eqx.AbstractVar[Int[Array, " instances"]]
-    grid: eqx.AbstractVar[Float[Array, "three instances"]]
+    linear: Any = eqx.field(kw_only=True)
+    origin: Float[Array, " parameters"] = eqx.field(kw_only=True)
+    start: Float[Array, " parameters"] = eqx.field(kw_only=True)
+    width: float = eqx.field(kw_only=True, static=True)
+    effect: Int[Array, " instances"] = eqx.field(kw_only=True)
+    grid: Float[Array, "three instances"] = eqx.field(kw_only=True)
 
     def errors(self, coordinates: Any, z: Array) -> Array:
         """Predictions minus readings at coordinates z, shape (readings,)."""
@@ -75,8 +74,9 @@ class LinearRows(Observer):
     def over_time(self) -> bool:
         return True
 
-    def operating_points(self, robot: Robot) -> None:
-        return None
+    # Also for windows, which inherit from settled runs.
+    operating_points, at_fit = Observer.operating_points, Observer.at_fit
+    draws, fit_replicate = Observer.draws, Observer.fit_replicate
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.zeros(np.shape(status), bool)
@@ -85,14 +85,6 @@ class LinearRows(Observer):
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
     ) -> np.ndarray:
         return np.asarray(self.start)[None]
-
-    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
-        return keys
-
-    def fit_replicate(
-        self, problem: Problem, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
-    ) -> Linearization:
-        return linear_replicate(problem.data, linear, drawn)
 
     def search(
         self,
@@ -119,23 +111,7 @@ class LinearRows(Observer):
 
 
 class LinearHistories(LinearRows, Histories):
-    """Observer of time histories whose readings are linear about the fit of their base.
-
-    Attributes:
-        linear: linearization of the simulated readings, see `LinearRows`.
-    """
-
-    policy: ClassVar[SearchPolicy] = LinearRows.policy
-
-    linear: HistoriesLinearization = eqx.field(kw_only=True)
-    origin: Float[Array, " parameters"] = eqx.field(kw_only=True)
-    start: Float[Array, " parameters"] = eqx.field(kw_only=True)
-    width: float = eqx.field(kw_only=True, static=True)
-    effect: Int[Array, " instances"] = eqx.field(kw_only=True)
-    grid: Float[Array, "three instances"] = eqx.field(kw_only=True)
-
-    def at_fit(self, problem: Problem, z: Numbers) -> LinearHistories:
-        return self
+    """Observer of time histories whose readings are linear about the fit of their base."""
 
 
 def grid_of_effects(effects: tuple[ScoredEffect, ...]) -> tuple[Array, Array]:
@@ -171,7 +147,8 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
     return dataclasses.replace(problem, observe=rows)
 
 
-def _evaluate(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
+@functools.partial(compiled, options=SELDOM)
+def _evaluated(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
     """Residuals of rows, penalties and priors, their Jacobian, and the observation."""
 
     def both(z: Array) -> tuple[Array, Array]:
@@ -186,6 +163,3 @@ def _evaluate(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tu
     reading = errors.reshape(data.weight.shape) + data.measured
     seen = Observation(reading, penalties, status, jnp.zeros_like(status))
     return r, jnp.concatenate(jacobian), seen
-
-
-_evaluated = functools.partial(compiled, options=SELDOM)(_evaluate)

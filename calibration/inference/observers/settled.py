@@ -22,8 +22,14 @@ from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationErrors
 from calibration.inference.fit_notes import Remark
-from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
-from calibration.inference.noise import Noise
+from calibration.inference.linearization import (
+    Linearization,
+    ScoredEffect,
+    balance_probe,
+    finite_or_zero,
+    with_probes,
+)
+from calibration.inference.noise import Noise, rows_of_same_conditions
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import (
     Numbers,
@@ -34,7 +40,6 @@ from calibration.inference.optimizers import (
     zero_inactive_residuals,
 )
 from calibration.inference.problem import Observation, Problem
-from calibration.inference.repeats import rows_of_same_conditions
 from calibration.inference.simulation_errors import root_mean_square
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -200,14 +205,6 @@ class SettledRuns(Observer):
         return [*thinned, *(Remark(x.code, **x.values, more=len(remarks) - 1) for x in remarks[:1])]
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        return []
-
-    @classmethod
-    def check_settled(cls, runs: Runs) -> None:
-        return
-
-    @classmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
         return runs, runs.measured(), np.full(len(runs), np.inf)
 
@@ -219,10 +216,6 @@ class SettledRuns(Observer):
     @classmethod
     def shows(cls, effect: type[Effect]) -> bool:
         return not (effect.needs_battery or effect.transient or effect.settles_to)
-
-    @classmethod
-    def free(cls) -> tuple[Names, Names]:
-        return (), ()
 
     def __call__(self, robot: Robot) -> Observation:
         return self._simulated_readings(robot, fidelities.get_fidelity(self.fidelity).settled(robot, self.conditions))
@@ -254,15 +247,8 @@ class SettledRuns(Observer):
     def long(self) -> bool:
         return fidelities.fidelity_facts(self.fidelity).rollout
 
-    @property
-    def starts_from_steady(self) -> bool:
-        return self.long
-
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.isin(status, (SLIDES, FAILED, TIPS))
-
-    def number_of_included_runs(self, included: np.ndarray) -> int:
-        return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
         return fidelities.get_fidelity(self.fidelity).cautions(robot, self.conditions)
@@ -279,9 +265,7 @@ class SettledRuns(Observer):
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
-            robot = problem.robot(x[:size])
-            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
-            return dataclasses.replace(robot, effects=(*robot.effects, *put))
+            return with_probes(problem.robot(x[:size]), probes, delta)
 
         z_and_probes = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
         r, slopes, _, signals = problem.linearised(probed, z_and_probes)

@@ -145,7 +145,6 @@ class Windows(LinearRows, SettledRuns):
     """Observer of the windows of a log.
 
     Attributes:
-        linear: linearization of the equations, see `LinearRows`.
         table: columns of the log at its points.
     """
 
@@ -154,12 +153,6 @@ class Windows(LinearRows, SettledRuns):
     blocks: ClassVar[Names] = ("slope", "voltage", "run", "part")
     reads: ClassVar[bool] = False
 
-    linear: WindowsLinearization
-    origin: Float[Array, " parameters"]
-    start: Float[Array, " parameters"]
-    width: float = eqx.field(static=True)
-    effect: Int[Array, " instances"]
-    grid: Float[Array, "three instances"]
     table: dict[str, Array]
 
     def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> Any:
@@ -232,8 +225,9 @@ def problem_of_windows(
     index, grid = grid_of_effects(effects)
     conditions = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[middle]), fit.rows.conditions)
     observe = Windows(
-        conditions, "drive", linear, jnp.asarray(fit.origin), jnp.asarray(fit.z), width, index, grid, table
-    )
+        conditions, "drive", table, linear=linear, origin=jnp.asarray(fit.origin), start=jnp.asarray(fit.z),
+        width=width, effect=index, grid=grid,
+    )  # fmt: skip
     return Problem(problem.base, problem.coordinates, observe, data), np.asarray(fit.rows.first)[middle]
 
 
