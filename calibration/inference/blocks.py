@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -196,9 +197,8 @@ def fit_from_each_start(
     Returns:
         Optimum of each search and the model's observation there. The leading axis is the starts.
     """
-    z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
-    active_sets = None if active is None else np.stack([np.asarray(x) for x in active])
-    return jax.device_get(problem.observe.search(problem, z, weight, active_sets, most=most))
+    sets = None if active is None else np.stack(active)
+    return jax.device_get(problem.observe.search(problem, np.stack(starts), np.stack(weights), sets, most=most))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,19 +234,29 @@ def hold_out_blocks(
         masks: masks of the rows of each block, shape (rows of the table,). The problem may have more, padded rows.
         active: active effects, for a problem with slots.
     """
-    rows, weight = len(masks[0]), np.asarray(problem.data.weight)
-    masks_with_padding = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
+    weight = np.asarray(problem.data.weight)
+    weights = [weight * ~m[:, None] for m in _padded_masks(problem, masks)]
     active_sets = None if active is None else [active] * len(masks)
-    optima, observations = fit_from_each_start(
-        problem, [start] * len(masks), [weight * ~m[:, None] for m in masks_with_padding], active_sets
-    )
-    reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
-    block = np.full(rows, -1)
+    optima, observations = fit_from_each_start(problem, [start] * len(masks), weights, active_sets)
+    return _predictions(problem, masks, observations.reading, observations.status, optima.z, optima.converged)
+
+
+def _padded_masks(problem: Problem, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Masks of the rows of a problem, which may have more, padded rows."""
+    return [np.pad(mask, (0, len(problem.data.weight) - len(mask))) for mask in masks]
+
+
+def _predictions(
+    problem: Problem, masks: Sequence[np.ndarray], readings: Any, statuses: Any, z: Any, converged: Any
+) -> HeldOutFits:
+    """Predictions of each block by the fit without it. First axis of the other arguments: the blocks."""
+    rows = len(masks[0])
+    reading, status, block = np.full((rows, readings[0].shape[1]), np.nan), np.full(rows, -1), np.full(rows, -1)
     for k, mask in enumerate(masks):
-        unreachable = problem.observe.unreachable(np.asarray(observations.status[k]))[:rows, None]
-        reading[mask] = np.where(unreachable, np.nan, observations.reading[k][:rows])[mask]
-        status[mask], block[mask] = observations.status[k][:rows][mask], k
-    return HeldOutFits(reading, status, block, np.asarray(optima.z), np.asarray(optima.converged))
+        unreachable = problem.observe.unreachable(np.asarray(statuses[k]))[:, None]
+        reading[mask] = np.where(unreachable, np.nan, readings[k])[:rows][mask]
+        status[mask], block[mask] = statuses[k][:rows][mask], k
+    return HeldOutFits(reading, status, block, np.asarray(z), np.asarray(converged))
 
 
 def predict_unseen(
@@ -261,31 +271,22 @@ def predict_unseen(
     """
     if not problem.observe.long:
         return hold_out_blocks(problem, start, masks, active)
-    rows, start_values = len(masks[0]), np.asarray(start)
-    masks_with_padding = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
-    data = problem.data
-    residual, jacobian, observation = problem.observe.at(problem, start_values, active)
-    residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
+    data, z = problem.data, np.asarray(start)
+    residual, jacobian, observation = problem.observe.at(problem, z, active)
+    residual, jacobian, reading = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
     scale = np.asarray(data.weight / data.sd)
     count, size = scale.shape[1], scale.size
     slopes = jacobian[:size].reshape(*scale.shape, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
-    unreachable = problem.observe.unreachable(np.asarray(observation.status))
-    reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
-    block, z = np.full(rows, -1), np.tile(start_values, (len(masks_with_padding), 1))
+    steps = []
     promised = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
-    for k, mask in enumerate(masks_with_padding):
-        kept_residuals = np.concatenate(
-            [np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)]
-        )
-        j = jacobian[kept_residuals]
-        step = -np.linalg.solve(j.T @ j, j.T @ residual[kept_residuals]) - promised
-        z[k] += step
-        held_rows = mask[:rows]
-        reading[held_rows] = np.where(unreachable[:, None], np.nan, read + per_unit @ step)[:rows][held_rows]
-        status[held_rows], block[held_rows] = np.asarray(observation.status)[:rows][held_rows], k
-    return HeldOutFits(reading, status, block, z, np.ones(len(masks_with_padding), bool))
+    for mask in _padded_masks(problem, masks):
+        kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
+        j = jacobian[kept]
+        steps.append(-np.linalg.solve(j.T @ j, j.T @ residual[kept]) - promised)
+    readings, statuses = [reading + per_unit @ step for step in steps], [np.asarray(observation.status)] * len(masks)
+    return _predictions(problem, masks, readings, statuses, z + np.stack(steps), np.ones(len(masks), bool))
 
 
 def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOutFits]:

@@ -55,7 +55,10 @@ def parameter_estimates(
     stated = coordinates.stated
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
-    other = None if beside is None else coordinates.value(np.asarray(beside))
+    steady: list[result.SteadyEstimate | None] = [None] * len(point)
+    if beside is not None:
+        with_steady = zip(coordinates.value(beside).tolist(), ((z - beside) / about.sd).tolist(), strict=True)
+        steady = [result.SteadyEstimate(x, apart) for x, apart in with_steady]
     bound, fields = coordinates.beyond(z), params.parameters_by_name(base)
     estimates = {}
     for k, name in enumerate(coordinates.names):
@@ -87,9 +90,7 @@ def parameter_estimates(
             at_bound=SIDE_OF_BOUND[int(bound[k])],
             measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
             profiled=profile is not None,
-            with_steady=None
-            if beside is None
-            else result.SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+            with_steady=steady[k],
         )
     return estimates
 

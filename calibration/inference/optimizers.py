@@ -178,12 +178,8 @@ def _initial_progress(solver: OneSidedLevenbergMarquardt, start: Z, size: int, a
         aux: shapes and dtypes of the auxiliary output of an evaluation.
     """
     struct = jax.ShapeDtypeStruct((size,), start.dtype)
-    return start, solver.init(_unevaluated, start, None, {}, struct, aux, frozenset())
-
-
-def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
-    """A residual function that is never called."""
-    raise NotImplementedError
+    no_function: Any = None  # it is not called
+    return start, solver.init(no_function, start, None, {}, struct, aux, frozenset())
 
 
 def _solver_step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
@@ -197,12 +193,8 @@ def _begin_search(problem: Problem, start: Z) -> Progress:
     data = problem.data
     size = adhesion_penalty_slice(data).stop + start.shape[0]
     codes = jnp.zeros(data.measured.shape[0], int)
-    return _initial_progress(
-        _least_squares_solver(data, problem.observe.long),
-        start,
-        size,
-        jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes)),
-    )
+    aux = jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
+    return _initial_progress(_least_squares_solver(data, problem.observe.long), start, size, aux)
 
 
 def _advance_search(problem: Problem, at: Progress, max_steps: int | Numbers) -> Progress:
@@ -211,10 +203,8 @@ def _advance_search(problem: Problem, at: Progress, max_steps: int | Numbers) ->
     The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
     the result of the search, with its residuals, Jacobian and observation.
     """
-    solver, function = (
-        _least_squares_solver(problem.data, problem.observe.long),
-        residual_function(problem, no_pin(at[0].shape[0])),
-    )
+    solver = _least_squares_solver(problem.data, problem.observe.long)
+    function = residual_function(problem, no_pin(at[0].shape[0]))
     y, state = _solver_step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
     is_over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))

@@ -210,8 +210,10 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
         z: end of each search, shape (searches, parameters), None if not known.
         converged: True for each converged search.
     """
+    if z is None:
+        return 0
     outside = np.zeros(len(converged), bool)
-    for k, scan in scans.items() if z is not None else ():
+    for k, scan in scans.items():
         low, high = scan.interval()
         outside |= (z[:, k] < low) | (z[:, k] > high)
     return int(np.sum(outside & converged))

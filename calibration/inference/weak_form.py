@@ -33,7 +33,6 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from calibration.data import Columns
 from calibration.inference import linearization
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
@@ -414,14 +413,6 @@ def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z:
     return jnp.moveaxis(jax.vmap(one)(rows), 1, 0)
 
 
-def _with_imposed(rows: LogPoints, given: Columns) -> LogPoints:
-    """Points with other imposed quantities, which do not depend on a delay."""
-    conditions = rows.conditions
-    for name, x in given.items():
-        conditions = with_condition(conditions, name, jnp.asarray(x))
-    return dataclasses.replace(rows, conditions=conditions, drift={})
-
-
 def fit_delay(problem: Problem, plan: StatePlan) -> float:
     """Delay of the imposed quantity after the time that its column states [s], negative if earlier.
 
@@ -454,8 +445,14 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
         """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
         prompt = course.at(0.0)[0]
         moves = [prompt, *({**prompt, n: x + np.ptp(x)} for n, x in prompt.items())]
+        imposed_points = []
+        for given in moves:  # which do not depend on a delay
+            conditions = rows.conditions
+            for name, x in given.items():
+                conditions = with_condition(conditions, name, jnp.asarray(x))
+            imposed_points.append(dataclasses.replace(rows, conditions=conditions, drift={}))
         fixed, *others = (
-            np.asarray(_terms_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
+            np.asarray(_terms_by_coordinates(problem, plan, points, jnp.asarray(z))) for points in imposed_points
         )
         change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
         # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
@@ -464,7 +461,10 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
         acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
         unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
         prompt_integrals = np.concatenate([_integrate_terms(plan, w, *fixed) for w in cut], 1)[acts]
-        weighted = {n: [_weigh_terms(plan, w, *x)[acts] for w in cut] for n, x in change.items()}
+        weighted = {
+            n: [_integrate_terms(plan, w, x[0], x[1], "wk,wk...->wk...")[acts] for w in cut]
+            for n, x in change.items()
+        }
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
@@ -639,17 +639,15 @@ def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np
     return np.concatenate(integrals)
 
 
-def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Integrals of terms over a run's windows, shape (equations, windows, ...)."""
-    slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
-    integral = functools.partial(np.einsum, "wk,wk...->w...")
-    return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
+def _integrate_terms(
+    plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray, form: str = "wk,wk...->w..."
+) -> np.ndarray:
+    """Integrals of terms over a run's windows, shape (equations, windows, ...).
 
-
-def _weigh_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Terms at each point of a run's windows with their weights, shape (equations, windows, length, ...)."""
+    With the form `wk,wk...->wk...`, each point's part of them, shape (equations, windows, length, ...).
+    """
     slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
-    weigh = functools.partial(np.einsum, "wk,wk...->wk...")
+    weigh = functools.partial(np.einsum, form)
     return np.stack([weigh(w.weight, f[w.rows, k]) + weigh(slope, y[w.rows, k]) for k, slope in slopes])
 
 

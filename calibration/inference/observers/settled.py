@@ -160,7 +160,7 @@ class SettledRuns(Observer):
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         """Rejects a table of one condition with readings that differ. Notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
-        least, remarks = cls.least(runs), list[Remark]()
+        least, conflicts = cls.least(runs), list[tuple[int, int, int, str]]()
         shared = np.array([source == "series" for source in noise.source])
         usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
@@ -171,38 +171,33 @@ class SettledRuns(Observer):
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
-            for cell in np.argwhere(distance > allowed)[:1]:
-                (one, other, k), cell = cell.tolist(), tuple(cell)
-                first_row, second_row, column = int(rows[one]), int(rows[other]), runs.channels[k].column
-                in_sds = not (noise.estimated[k] or shared[k])
-                deviation = f"{distance[cell] / sd[cell]:.0f} sd" if in_sds else f"{distance[cell] / mean[cell]:.0%}"
-                values = float(runs[column][first_row]), float(runs[column][second_row])
-                without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
-                torque = [c for c in (LOAD,) if c != column and runs.has(c)]
-                cells = {**runs.extras, **runs.columns}
-                other_columns = tuple(c for c in (*without, *torque) if cells[c][first_row] != cells[c][second_row])
-                near = runs.layout.nearest(other_columns[0], runs.columns) if other_columns else ""
-                remarks.append(
-                    Remark(
-                        "repeats",
-                        source=runs.source,
-                        rows=(first_row + 1, second_row + 1),
-                        column=column,
-                        values=values,
-                        apart=deviation,
-                        unused=other_columns,
-                        near=near,
-                    )
-                )
-        if remarks and len(alike) == 1:
-            raise BadData(f"{describe(remarks[0])}; no condition varies")
-        whole_table = runs.whole
-        thinned = (
-            []
-            if whole_table is runs
-            else [Remark("thinned_table", source=runs.source, rows=len(whole_table), kept=len(runs))]
-        )
-        return [*thinned, *(Remark(x.code, **x.values, more=len(remarks) - 1) for x in remarks[:1])]
+            for one, other, k in np.argwhere(distance > allowed)[:1].tolist():
+                cell, as_share = (one, other, k), noise.estimated[k] or shared[k]
+                apart = f"{distance[cell] / mean[cell]:.0%}" if as_share else f"{distance[cell] / sd[cell]:.0f} sd"
+                conflicts.append((int(rows[one]), int(rows[other]), k, apart))
+        remarks: list[Remark | str] = []
+        if runs.whole is not runs:
+            remarks.append(Remark("thinned_table", source=runs.source, rows=len(runs.whole), kept=len(runs)))
+        for first, second, k, apart in conflicts[:1]:
+            column, cells = runs.channels[k].column, {**runs.extras, **runs.columns}
+            others = [c for c, x in runs.extras.items() if x.dtype.kind == "f"]
+            others += [c for c in (LOAD,) if c != column and runs.has(c)]
+            others = [c for c in others if cells[c][first] != cells[c][second]]
+            remark = Remark(
+                "repeats",
+                source=runs.source,
+                rows=(first + 1, second + 1),
+                column=column,
+                values=(float(runs[column][first]), float(runs[column][second])),
+                apart=apart,
+                unused=tuple(others),
+                near=runs.layout.nearest(others[0], runs.columns) if others else "",
+                more=len(conflicts) - 1,
+            )
+            if len(alike) == 1:
+                raise BadData(f"{describe(remark)}; no condition varies")
+            remarks.append(remark)
+        return remarks
 
     @classmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
