@@ -33,6 +33,7 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
+from calibration.data import Columns
 from calibration.inference import linearization
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
@@ -42,6 +43,7 @@ from calibration.inference.shown_states import (
     LogPoints,
     RunWindows,
     StatePlan,
+    join_windows,
     points_and_windows,
     state_plan,
     with_condition,
@@ -333,30 +335,25 @@ def _terms_with_derivatives(
 
     def entering_terms(signals: Signals, angle: Array, memory: list[Array]) -> Array:
         read = dataclasses.replace(signals, angle=angle)
-        each = zip(effects, memory, strict=True)
         terms = [
             linearization.effect_terms(base, read if e.effect.balance == "sensor" else signals, (e,), [m])
-            for e, m in each
+            for e, m in zip(effects, memory, strict=True)
         ]
         return jnp.concatenate([jnp.zeros(0), *terms])
 
     entered = jax.vmap(entering_terms)(signals, angle, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
-    counts = np.array([len(e.at) for e in effects], int)
-    enters = [entering.index(b) if (b := e.effect.balance) in entering else -1 for e in effects]
-    parameter_index = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
-    channel_of_row = np.repeat(
-        np.array([names.index(c) if (c := e.effect.channel) in names else 0 for e in effects], int), counts
-    )
+    instances = [e.effect for e in effects for _ in e.at]
+    enters = np.array([size + entering.index(e.balance) if e.balance in entering else -1 for e in instances], int)
+    channel_of = np.array([names.index(e.channel) if e.channel in names else 0 for e in instances], int)
     first = len(values[0][0]) - len(plan.others)
 
     def of_effects(slope: Array, direct: bool) -> Array:
-        change = -slope[:, :, size + len(probes) :][:, :, channel_of_row]
+        change = -slope[:, :, size + len(probes) :][:, :, channel_of]
         for k, channel in enumerate(plan.others):
-            change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of_row == channel)) * direct)
-        by_term = jnp.where(parameter_index >= 0, slope[:, :, np.maximum(parameter_index, 0)], change)
-        return by_term * entered[:, None]
+            change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of == channel)) * direct)
+        return jnp.where(enters >= 0, slope[:, :, np.maximum(enters, 0)], change) * entered[:, None]
 
     def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
         return part(slopes[0], True), part(slopes[1], False)
@@ -426,66 +423,59 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
     if DELAY not in problem.coordinates.names:
         return file_delay
     rows, course, cut = points_and_windows(problem, plan, across=True)
-    time, since = np.asarray(rows.time), np.asarray(rows.since)
     if not (cut and rows.drift):
         return file_delay
+    time, since = np.asarray(rows.time), np.asarray(rows.since)
     step = float(np.median(since[since > 0]))
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
-    inside = np.unique(np.concatenate([w.rows.ravel() for w in cut]))
+    limit = TENTH * float(np.median([time[w.rows].max() for w in cut]))
+    grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
+    w = join_windows(cut)
+    inside, places = np.unique(w.rows, return_inverse=True)
+    w = dataclasses.replace(w, rows=places.reshape(w.rows.shape))
     rows = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[inside]), rows)
     course = dataclasses.replace(course, cell=course.cell[inside])
-    cut = [dataclasses.replace(w, rows=np.searchsorted(inside, w.rows)) for w in cut]
-    limit = TENTH * float(np.median([time[inside][w.rows].max() for w in cut]))
-    grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
     free = [k for k, name in enumerate(problem.coordinates.names) if name != DELAY]
     z, centre = np.zeros(len(problem.coordinates)), np.asarray(problem.data.centre)
+    prompt = course.at(0.0)[0]
+
+    def terms_with(imposed: Columns) -> np.ndarray:
+        """Terms at z with other imposed quantities, which do not depend on a delay."""
+        conditions = rows.conditions
+        for name, x in imposed.items():
+            conditions = with_condition(conditions, name, jnp.asarray(x))
+        points = dataclasses.replace(rows, conditions=conditions, drift={})
+        return np.asarray(_terms_by_coordinates(problem, plan, points, jnp.asarray(z)))
 
     def profile(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
-        prompt = course.at(0.0)[0]
-        moves = [prompt, *({**prompt, n: x + np.ptp(x)} for n, x in prompt.items())]
-        imposed_points = []
-        for given in moves:  # which do not depend on a delay
-            conditions = rows.conditions
-            for name, x in given.items():
-                conditions = with_condition(conditions, name, jnp.asarray(x))
-            imposed_points.append(dataclasses.replace(rows, conditions=conditions, drift={}))
-        fixed, *others = (
-            np.asarray(_terms_by_coordinates(problem, plan, points, jnp.asarray(z))) for points in imposed_points
-        )
-        change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
+        fixed = terms_with(prompt)
+        change = {n: (terms_with({**prompt, n: x + np.ptp(x)}) - fixed) / np.ptp(x) for n, x in prompt.items()}
         # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
         first = max(change, key=lambda n: float(np.abs(change[n][0, ..., 0]).mean() * np.ptp(prompt[n])))
         factor = change[first][0].mean(0)  # (equations, 1 + z)
         acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
         unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
-        prompt_integrals = np.concatenate([_integrate_terms(plan, w, *fixed) for w in cut], 1)[acts]
-        weighted = {
-            n: [_integrate_terms(plan, w, x[0], x[1], "wk,wk...->wk...")[acts] for w in cut]
-            for n, x in change.items()
-        }
+        prompt_integrals = _integrate_terms(plan, w, *fixed)[acts]
+        weighted = {n: _integrate_terms(plan, w, x[0], x[1], "wk,wk...->wk...")[acts] for n, x in change.items()}
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            all_integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
+            integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
             for n, x in weighted.items():
-                by_run = zip(x, cut, strict=True)
-                all_integrals += np.concatenate(
-                    [np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x) for x, w in by_run], 1
-                )
-            all_integrals[..., 1:] -= all_integrals[..., :1] * growth
-            all_integrals /= unit
-            size = np.sqrt(np.mean(all_integrals[..., 0] ** 2, 1))
+                integrals += np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x)
+            integrals[..., 1:] -= integrals[..., :1] * growth
+            integrals /= unit
+            size = np.sqrt(np.mean(integrals[..., 0] ** 2, 1))
             for _ in range(3):  # the noise of each equation is what the regression leaves
-                scaled = all_integrals / np.maximum(size, 1e-300)[:, None, None]
-                flat = scaled.reshape(-1, all_integrals.shape[2])
+                flat = np.concatenate(integrals / np.maximum(size, 1e-300)[:, None, None])
                 jacobian = np.concatenate([flat[:, 1:][:, free], np.eye(len(free))])
                 target = np.concatenate([flat[:, 0], (z - centre)[free]])
                 move = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
-                remainder = all_integrals[..., 0] + all_integrals[..., 1:][..., free] @ move
+                remainder = integrals[..., 0] + integrals[..., 1:][..., free] @ move
                 size = np.sqrt(np.mean(remainder**2, 1))
-            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * all_integrals.shape[1] * APART)
+            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * len(w.rows) * APART)
             ends.append(z.copy())
             ends[-1][free] += move
         return np.array(costs) - np.min(costs), np.stack(ends)
@@ -559,76 +549,83 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
     sd = np.asarray(rows.sd)
 
     def terms(rows: LogPoints, z: np.ndarray) -> EquationTerms:
-        return jax.device_get(
-            _terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects)
-        )  # one program for all of them
+        return jax.device_get(_terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects))
 
-    def whole(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
+    def whiten(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
         windows = zip(factors, cut, strict=True)
         return np.concatenate([solve_triangular(x, window_errors(plan, w, *given), lower=True) for x, w in windows])
 
-    def of(z: np.ndarray) -> Callable[..., np.ndarray]:
-        """Function of the parameters that returns residuals and their derivatives, and at last signatures.
-
-        The covariance and the noise-free states (`with_smooth_states`) are computed once, at z."""
-        smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
-        terms_there = terms(smooth, z)
-        given, none = terms(rows, z), np.zeros(equations)
-        read = given.f, given.y  # the rest of a long log is large
-        plain = [covariance_factor(plan, w, sd, terms_there, none) for w in cut]
-        whitened_windows = [
-            (
-                window_errors(plan, w, read),
-                np.sum(x**2, 1),
-                np.tile(np.sum(w.weight**2 / w.steps, 1), equations),
-            )
-            for w, x in zip(cut, plain, strict=True)
-        ]
-        by_equation = (
-            np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
-        )
-        unknown = disturbance_intensities(*by_equation)
-        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut] if unknown.any() else plain
-        offset = whole(factors, read) - whole(factors, (terms_there.f, terms_there.y))
-
-        states[:] = [centre, z, smooth, terms_there, read]
-        last: list[tuple[np.ndarray, np.ndarray, tuple[Any, Any]]] = []
-
-        def at(z: np.ndarray, signatures: bool = False) -> np.ndarray:
-            if not last or np.any(last[0][0] != z):
-                given = terms(smooth, z)
-                factored = whole(factors, (given.f[..., None], given.y[..., None]), given.by_z)
-                factored[:, 0] += offset
-                rest = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
-                last[:] = [(z.copy(), np.concatenate([factored, rest]), given.by_effects)]
-            return whole(factors, last[0][2]) if signatures else last[0][1]
-
-        return at
-
-    states: list[Any] = []
     coordinates, centre = problem.coordinates, np.array(problem.data.centre)
     if DELAY in coordinates.names:  # windows without jumps may not show it
         k = coordinates.names.index(DELAY)
         centre[k] = (late - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
+
+    def linearise_about(origin: np.ndarray) -> tuple[Any, ...]:
+        """Function that returns residuals and their derivatives at z, and derivatives of the terms with respect to
+        effects. Then the factors of the covariance, states without noise, and terms there and at the readings, all
+        of which are those of the origin.
+        """
+        smooth = with_smooth_states(problem, plan, rows, jnp.asarray(origin))
+        exact, of_readings = terms(smooth, origin), terms(rows, origin)
+        read = of_readings.f, of_readings.y  # the rest of a long log is large
+        factors = _window_factors(plan, cut, sd, exact, read)
+        offset = whiten(factors, read) - whiten(factors, (exact.f, exact.y))
+        last: dict[bytes, tuple[np.ndarray, tuple[Any, Any]]] = {}
+
+        def at(z: np.ndarray) -> tuple[np.ndarray, tuple[Any, Any]]:
+            if (key := z.tobytes()) not in last:
+                given = terms(smooth, z)
+                errors = whiten(factors, (given.f[..., None], given.y[..., None]), given.by_z)
+                errors[:, 0] += offset
+                priors = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
+                last.clear()
+                last[key] = np.concatenate([errors, priors]), given.by_effects
+            return last[key]
+
+        return at, factors, smooth, exact, read
+
     z = centre
     try:
         for _ in range(ROUNDS):
             return_memory()  # terms of a long log
-            terms_at_fit = of(z)
+            origin = z
+            at, factors, *states = linearise_about(origin)
             regression = least_squares(
-                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1:], method="lm",  # noqa: B023
+                lambda z: at(z)[0][:, 0], z, lambda z: at(z)[0][:, 1:], method="lm",  # noqa: B023
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
             step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
-            z, terms_after_step = z + step, terms_at_fit(z + step)
-            if np.abs(terms_after_step[:, 1:] @ step).max() < SETTLED:
+            z = z + step
+            residuals, by_effects = at(z)
+            if np.abs(residuals[:, 1:] @ step).max() < SETTLED:
                 break
-        signatures = terms_at_fit(z, True)
+        signatures = whiten(factors, by_effects)
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    return WeakFormFit(
-        z, terms_after_step[:, 0], terms_after_step[:, 1:], signatures, len(signatures), plan, cut, *states
+    about_fit = residuals[:, 0], residuals[:, 1:], signatures, len(signatures)
+    return WeakFormFit(z, *about_fit, plan, cut, centre, origin, *states)
+
+
+def _window_factors(
+    plan: StatePlan, cut: list[RunWindows], sd: np.ndarray, exact: EquationTerms, read: tuple[Any, Any]
+) -> list[np.ndarray]:
+    """Cholesky factors of the covariance of each part of the windows, with the disturbances of the equations.
+
+    Args:
+        exact, read: terms at states without noise, and at the readings.
+    """
+    equations = exact.f.shape[1]
+    plain = [covariance_factor(plan, w, sd, exact, np.zeros(equations)) for w in cut]
+    defect, noise, unit = (
+        np.concatenate([x.reshape(equations, -1).T for x in parts])
+        for parts in (
+            [window_errors(plan, w, read) for w in cut],
+            [np.sum(x**2, 1) for x in plain],
+            [np.tile(np.sum(w.weight**2 / w.steps, 1), equations) for w in cut],
+        )
     )
+    unknown = disturbance_intensities(defect, noise, unit)
+    return [covariance_factor(plan, w, sd, exact, unknown) for w in cut] if unknown.any() else plain
 
 
 def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np.ndarray:
