@@ -1,6 +1,6 @@
 """Maximum a posteriori estimation: least squares with exact Jacobians, from many starts at once.
 
-Every search uses the solver of optimistix in `levenberg_marquardt`.
+Every search uses the solver in `levenberg_marquardt`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.levenberg_marquardt import (
     NEAR,
-    Function,
     OneSidedLevenbergMarquardt,
     SearchState,
     half_squares,
-    linear_residual_function,
     one_sided_step,
-    with_derivative,
     zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
@@ -122,21 +118,11 @@ def _evaluate_residuals(problem: Problem, pin: Pin, z: Z) -> tuple[Array, Array,
     return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
 
 
-def residual_function(problem: Problem, pin: Pin) -> Function:
-    """Residual function for optimistix, from `_evaluate_residuals`. Its auxiliary output is the observation."""
-
-    def function(z: Z, args: Any) -> tuple[Array, Observation]:
-        r, jacobian, observation = _evaluate_residuals(problem, pin, jax.lax.stop_gradient(z))
-        return with_derivative(z, r, jacobian), observation
-
-    return function
-
-
 def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver for fits to such data. `long`: True for rollouts."""
     penalties, tolerance = adhesion_penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(
-        tolerance, tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
+        tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
     )
 
 
@@ -170,50 +156,28 @@ def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, 
     return _optimum_at(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
 
 
-def _initial_progress(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
-    """State of a search before its first evaluation.
-
-    Args:
-        size: number of residuals.
-        aux: shapes and dtypes of the auxiliary output of an evaluation.
-    """
-    struct = jax.ShapeDtypeStruct((size,), start.dtype)
-    no_function: Any = None  # it is not called
-    return start, solver.init(no_function, start, None, {}, struct, aux, frozenset())
-
-
-def _solver_step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
-    """One step of a search by the solver."""
-    y, state, _ = solver.step(function, at[0], None, {}, at[1], frozenset())
-    return y, state
-
-
 def _begin_search(problem: Problem, start: Z) -> Progress:
     """State of a problem's search before its first evaluation."""
     data = problem.data
-    size = adhesion_penalty_slice(data).stop + start.shape[0]
-    codes = jnp.zeros(data.measured.shape[0], int)
+    size, codes = adhesion_penalty_slice(data).stop + start.shape[0], jnp.zeros(data.measured.shape[0], int)
     aux = jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
-    return _initial_progress(_least_squares_solver(data, problem.observe.long), start, size, aux)
+    return start, _least_squares_solver(data, problem.observe.long).begin(start, size, aux)
 
 
-def _advance_search(problem: Problem, at: Progress, max_steps: int | Numbers) -> Progress:
+def _advance_search(problem: Problem, pin: Pin, at: Progress, max_steps: int | Numbers) -> Progress:
     """One step of a problem's search.
 
     The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
     the result of the search, with its residuals, Jacobian and observation.
     """
     solver = _least_squares_solver(problem.data, problem.observe.long)
-    function = residual_function(problem, no_pin(at[0].shape[0]))
-    y, state = _solver_step(solver, function, at)
-    done, _ = solver.terminate(function, y, None, {}, state, frozenset())
-    is_over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
+    y, state = solver.step(*at, *_evaluate_residuals(problem, pin, at[1].ahead))
+    is_over = state.over | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
     return y, dataclasses.replace(state, over=is_over)
 
 
 def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
     y, state = at
-    # optimistix takes no step from a start that is not finite.
     r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
     return _optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
 
@@ -222,17 +186,13 @@ def levenberg_marquardt(
     problem: Problem, start: Z, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
     """Optimum of one search, and the observation there. It can be vmapped over problems, starts and pins."""
-    pin = no_pin(start.shape[0]) if pin is None else pin
-    function: Any = residual_function(problem, pin)
-    solution: optx.Solution = optx.least_squares(
-        function,
-        _least_squares_solver(problem.data, problem.observe.long),
-        pin.apply(start),
-        has_aux=True,
-        max_steps=max_steps,
-        throw=False,
-    )
-    return _optimum_of_progress((solution.value, solution.state), problem.data, pin), solution.aux
+    held = no_pin(start.shape[0]) if pin is None else pin
+
+    def advance(at: Progress) -> Progress:
+        return _advance_search(problem, held, at, max_steps)
+
+    at = jax.lax.while_loop(lambda at: ~at[1].over, advance, _begin_search(problem, held.apply(start)))
+    return _optimum_of_progress(at, problem.data, held), at[1].aux
 
 
 class SearchMember(eqx.Module):
@@ -289,7 +249,7 @@ def _continue_searches(
 
     def advance(member: SearchMember, at: Progress) -> Progress:
         member_problem = member.problem(problem)
-        new = _advance_search(member_problem, at, max_steps)
+        new = _advance_search(member_problem, pin, at, max_steps)
         return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
     at = _start_fresh_searches(problem, members, fresh, at)
@@ -319,7 +279,7 @@ def _step_unfinished(
 
     def advance(member: SearchMember, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
         member_problem = dataclasses.replace(member.problem(problem), roots=roots)
-        new = _advance_search(member_problem, at, max_steps)
+        new = _advance_search(member_problem, pin, at, max_steps)
         new = jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
         return new, _optimum_of_progress(new, member_problem.data, pin)
 
@@ -515,7 +475,7 @@ def evaluate_residuals(problem: Problem, z: Z) -> Array:
 
 @eqx.filter_jit
 def _linearised_step(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
-    return _solver_step(solver, linear_residual_function(r, jacobian), at)
+    return solver.step(*at, r, jacobian, None)
 
 
 def search_rollout(
@@ -534,7 +494,7 @@ def search_rollout(
     pin, data = no_pin(start.shape[0]), problem.data
     solver = _least_squares_solver(data, long=True)
     size = adhesion_penalty_slice(data).stop + start.shape[0]
-    progress, first_result, last_result = _initial_progress(solver, start, size, None), None, None
+    progress, first_result, last_result = (start, solver.begin(start, size, None)), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         ahead = progress[1].ahead
@@ -564,7 +524,7 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 @functools.partial(compiled, options=SELDOM)
 def _step_search(at: Progress, found: tuple[Array, Array, Any], data: Data) -> tuple[Progress, Optimum]:
     """Next step of a search, and its best point."""
-    new = _solver_step(_least_squares_solver(data, long=True), linear_residual_function(*found), at)
+    new = _least_squares_solver(data, long=True).step(*at, *found)
     return new, _optimum_of_progress(new, data, no_pin(at[0].shape[-1]))
 
 
@@ -610,7 +570,8 @@ def search_rollouts(
         for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
             found = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
             if k in fresh:
-                searches[k] = jax.device_get(_initial_progress(solver, ahead[k], found[0].size, found[2])), None
+                begun = ahead[k], solver.begin(ahead[k], found[0].size, found[2])
+                searches[k] = jax.device_get(begun), None
             searches[k] = jax.device_get(_step_search(searches[k][0], found, data))
         results = [(s.over, s.steps, s.ahead, s.aux, end) for (_, s), end in searches]
         over, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
