@@ -171,7 +171,8 @@ def _advance_search(problem: Problem, pin: Pin, at: Progress, max_steps: int | N
     the result of the search, with its residuals, Jacobian and observation.
     """
     solver = _least_squares_solver(problem.data, problem.observe.long)
-    y, state = solver.step(*at, *_evaluate_residuals(problem, pin, at[1].ahead))
+    r, jacobian, observation = _evaluate_residuals(problem, pin, at[1].ahead)
+    y, state = solver.step(*at, r, jacobian, observation)
     is_over = state.over | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
     return y, dataclasses.replace(state, over=is_over)
 
