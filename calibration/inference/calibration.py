@@ -303,7 +303,8 @@ def _search(
             f"--population: none of {len(everyone.z)} members runs in every row (ended in: {endings or 'none'}); "
             "begin from another robot, or free fewer parameters"
         )
-    posed, shares = multistart.reestimate_noise_at(posed, known, everyone, best_member)
+    shares = population.most_probable_noise(posed, known, np.asarray(everyone.seen.reading[best_member]))
+    posed = multistart.with_noise_shares(posed, known, shares)
     tell(progress_remark("derivatives"))
     identifiability_there = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
     unreliable = population.unreliable_derivatives(

@@ -16,7 +16,7 @@ from calibration.inference import identifiability, optimizers, scans, series_noi
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.noise import Noise
-from calibration.inference.population import Population, PopulationSearch, most_probable_noise
+from calibration.inference.population import PopulationSearch
 from calibration.inference.problem import Observation, Problem
 from mmrjax.model.robot import Robot
 
@@ -117,7 +117,7 @@ def search_from_starts(posed: Problem, noise: Noise, points: np.ndarray) -> Mult
         if new is None:
             break
         shares = new
-        posed = _with_noise_shares(posed, noise, shares)
+        posed = with_noise_shares(posed, noise, shares)
     return MultistartResult(
         posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
     )
@@ -169,7 +169,7 @@ def search_one_by_one(
             if new is None:
                 break
             shares = new
-            posed = _with_noise_shares(posed, noise, shares)
+            posed = with_noise_shares(posed, noise, shares)
         ends, feasibles = [optima], [feasible]
         for k, point in enumerate(points[1:], 2):
             end, status, _ = step(posed, point[None])
@@ -226,19 +226,15 @@ def optimum_of_population(
     observation = jax.tree.map(lambda x: jnp.asarray(x[searched.at]), searched.found.seen)
     error = np.concatenate([np.asarray(posed.whitened(observation)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
-    best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
+    jacobian = jnp.asarray(np.concatenate([searched.slope, rows, np.eye(len(z))]))
+    pin, point, count = optimizers.no_pin(len(z)), jnp.asarray(z), jnp.asarray(0)
+    best = optimizers.optimum_at(jacobian, jnp.asarray(error), point, posed.data, pin, count, jacobian)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
     start_outcomes = StartOutcomes(
         np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations)
     )
     return MultistartResult(posed, best, start_outcomes, shares, searched)
-
-
-def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
-    """Problem with the most probable noise at a member of the population, and that noise relative to the readings."""
-    shares = most_probable_noise(posed, noise, np.asarray(searched.seen.reading[at]))
-    return _with_noise_shares(posed, noise, shares), shares
 
 
 def initial_noise_shares(noise: Noise) -> np.ndarray:
@@ -276,7 +272,8 @@ def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.n
     return None if np.nanmax(np.abs(new / shares - 1)) < SETTLED_SHARE else new
 
 
-def _with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+def with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+    """Problem with estimated noise, relative to the readings, shape (channels,)."""
     sd = np.where(noise.estimated, noise.sd / noise_room.START * shares, noise.sd)
     return posed.with_data(sd=jnp.asarray(sd))
 

@@ -126,11 +126,8 @@ def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     )
 
 
-def _optimum_at(
-    jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array | None = None
-) -> Optimum:
-    """Optimum record of a point. `slope` is the Jacobian that predicts its decrement, None for `jacobian`."""
-    slope = jacobian if slope is None else slope
+def optimum_at(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array) -> Optimum:
+    """Optimum record of a point. `slope` is the Jacobian that predicts its decrement."""
     held_rows = adhesion_penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
@@ -148,12 +145,6 @@ def _optimum_at(
         jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost),
         steps,
     )
-
-
-def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
-    """Optimum record of a point, from its residuals (misfit, then priors) and their Jacobian."""
-    j, r, point = (jnp.asarray(x, float) for x in (jacobian, residual, z))
-    return _optimum_at(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
 
 
 def _begin_search(problem: Problem, start: Z) -> Progress:
@@ -180,7 +171,7 @@ def _advance_search(problem: Problem, pin: Pin, at: Progress, max_steps: int | N
 def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
     y, state = at
     r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
-    return _optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
+    return optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
 
 
 def levenberg_marquardt(
@@ -474,11 +465,6 @@ def evaluate_residuals(problem: Problem, z: Z) -> Array:
     return jnp.concatenate([problem.whitened(observation), z - problem.data.centre])
 
 
-@eqx.filter_jit
-def _linearised_step(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
-    return solver.step(*at, r, jacobian, None)
-
-
 def search_rollout(
     problem: Problem,
     start: Z,
@@ -492,29 +478,25 @@ def search_rollout(
     Returns:
         The optimum, and the observations at the start and at the end.
     """
-    pin, data = no_pin(start.shape[0]), problem.data
-    solver = _least_squares_solver(data, long=True)
-    size = adhesion_penalty_slice(data).stop + start.shape[0]
-    progress, first_result, last_result = (start, solver.begin(start, size, None)), None, None
+    progress, first = _begin_search(problem, start), None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
-        ahead = progress[1].ahead
+        state = progress[1]
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
-        r = evaluate_residuals(problem, ahead) if progress[1].rejected > 0 else None
+        r = evaluate_residuals(problem, state.ahead) if state.rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, observation = linearise_rollout(problem, ahead)
-        first_result = observation if first_result is None else first_result
-        progress = _linearised_step(solver, progress, r, jacobian)
+            r, jacobian, observation = linearise_rollout(problem, state.ahead)
+        first = observation if first is None else first
+        progress, end = _step_search(progress, (r, jacobian, observation), problem.data)
         done = bool(progress[1].over)
-        if progress[1].rejected == 0:
-            best, last_result = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
-            done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
-        assert best is not None  # the first step only evaluates the start, and accepts it
+        if best is None or progress[1].rejected == 0:  # the first step only evaluates the start
+            best = end
+            done |= bool(end.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * end.cost))
         tell(steps, float(best.cost))
         if done:
             break
-    assert best is not None and first_result is not None and last_result is not None
-    return best, first_result, last_result
+    assert best is not None and first is not None
+    return best, first, progress[1].aux
 
 
 #: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the

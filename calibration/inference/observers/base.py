@@ -20,7 +20,7 @@ from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot
+from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot, search_rollouts
 from calibration.inference.problem import Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
@@ -317,7 +317,6 @@ class Observer(eqx.Module):
         """Number of searches of a problem that run together on a core, see `searches_refilled`."""
         raise NotImplementedError
 
-    @abc.abstractmethod
     def search(
         self,
         problem: Problem,
@@ -337,6 +336,16 @@ class Observer(eqx.Module):
             rivals: True if all members search the same optimum, so that some may be stopped early.
             most: largest number of steps. None: that of the policy.
         """
+
+        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+            parts = []
+            for at, member in zip(z, members, strict=True):
+                member_problem = problem.with_data(weight=jnp.asarray(weights[member]))
+                parts.append(self.at(member_problem, at, None if active is None else active[member]))
+            return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
+
+        steps = self.policy.steps if most is None else most
+        return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         """Simulated observation in each row at z.

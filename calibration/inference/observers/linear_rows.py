@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from calibration.inference.linearization import ScoredEffect
 from calibration.inference.observers.base import Observer, SearchPolicy, with_effects
 from calibration.inference.observers.time_histories import Histories
-from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
+from calibration.inference.optimizers import Numbers
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model.signals import CONVERGED
@@ -76,7 +76,7 @@ class LinearRows(Observer):
 
     # Also for windows, which inherit from settled runs.
     operating_points, at_fit = Observer.operating_points, Observer.at_fit
-    draws, fit_replicate = Observer.draws, Observer.fit_replicate
+    draws, fit_replicate, search = Observer.draws, Observer.fit_replicate, Observer.search
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.zeros(np.shape(status), bool)
@@ -85,26 +85,6 @@ class LinearRows(Observer):
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
     ) -> np.ndarray:
         return np.asarray(self.start)[None]
-
-    def search(
-        self,
-        problem: Problem,
-        starts: Numbers,
-        weights: Numbers,
-        active: Numbers | None = None,
-        *,
-        rivals: bool = False,
-        most: int | None = None,
-    ) -> tuple[Optimum, Observation]:
-        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-            parts = []
-            for at, member in zip(z, members, strict=True):
-                member_problem = problem.with_data(weight=jnp.asarray(weights[member]))
-                parts.append(self.at(member_problem, at, None if active is None else active[member]))
-            return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
-
-        steps = self.policy.steps if most is None else most
-        return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         return _evaluated(self, with_effects(problem, active).coordinates, problem.data, jnp.asarray(z))

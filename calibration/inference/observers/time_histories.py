@@ -215,7 +215,9 @@ class Histories(Observer):
         samples, rig = max(map(len, own_rows)), robot.rig
         rows = np.stack([np.pad(m, (0, samples - len(m)), constant_values=-1) for m in own_rows])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
-        knots = np.stack([_choose_knots(m, most) for m in own_rows])
+        # Evenly spaced rows of each run, including its first and last.
+        spaced = [m[np.unique(np.round(np.linspace(0, len(m) - 1, most)).astype(int))] for m in own_rows]
+        knots = np.stack([np.pad(k, (0, most - len(k)), "edge") for k in spaced])
         if rig.begins is not None:
             order = [rig.begins.names.index(run_grids.initial_state_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
@@ -719,14 +721,6 @@ def _check_signs(runs: Runs) -> None:
                         f"expected negative readings in reverse; or set [instruments.{channel.name}] signed = "
                         "false in the robot's file, if it shows a magnitude"
                     )
-
-
-def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` rows of a run, evenly spaced, including its first and last. The last one is repeated as
-    padding.
-    """
-    knot_rows = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
-    return np.pad(knot_rows, (0, most - len(knot_rows)), "edge")
 
 
 def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
