@@ -144,7 +144,7 @@ def test_time_that_is_out_before_the_verdict_ends_it_there_and_says_so(rig, mmrj
     monkeypatch.setattr(command, "discover", late)
     code, _, err = mmrjax(*rig, "--within", within)
     assert code == 3 and "went on" not in err and "interrupted" not in err
-    said = f"no verdict within {within.removesuffix('s')} s, and no fit of the base model; allow more time, such as --within 5min"
+    said = f"no verdict within {within.removesuffix('s')} s, and no fit of the base model; allow more, such as --within 5min"
     assert said in err
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and not (tmp_path / "found.partial").exists()
 
@@ -155,7 +155,7 @@ def test_a_budget_that_was_too_small_is_answered_by_a_larger_one(rig, mmrjax, mo
 
     monkeypatch.setattr(command, "discover", late)
     assert (
-        "no verdict within 540 s, and no fit of the base model; allow more time, such as --within 18min"
+        "no verdict within 540 s, and no fit of the base model; allow more, such as --within 18min"
         in (mmrjax(*rig, "--within", "9min")[2])
     )
 
