@@ -65,7 +65,7 @@ def seen(runs, clean):
     space, z = clean.space, clean.base.z[: clean.space.free]
     # Without the run that is already known, because robots with other effects are simulated here.
     problem = replace(space.bare, observe=replace(space.bare.observe, known=None))
-    read = jax.jit(lambda r: problem.whitened(problem.observe(r), problem.data)[: problem.data.measured.size])
+    read = jax.jit(lambda r: problem.whitened(problem.observe(r))[: problem.data.measured.size])
     return SimpleNamespace(
         runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=clean.left.linear, read=read
     )
@@ -137,7 +137,7 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     """To the simulated fit."""
     run, scored = oval.traced.run, oval.space.library.scored
     posed, z = run.space.bare, jnp.asarray(run.base.z[: run.space.free])
-    before = posed.observe.linearise(posed, z, posed.data, scored)
+    before = posed.observe.linearise(posed, z, scored)
     curve = fit_discrepancy(run.space, run.base, before, "track", "order 2 of the driving shaft")
     assert (
         curve.converged and curve.effect == "wave_track" and isinstance(curve.robot.effects[0], UNNAMED["wave_track"])
@@ -239,9 +239,9 @@ def test_linear_bootstrap_is_that_of_refits(clean):
     clean_reading = problem.observation(z).reading
 
     def taken(noise_):
-        data = replace(problem.data, measured=clean_reading + problem.data.sd * noise_, centre=z)
-        back = levenberg_marquardt(problem, z, data, max_steps=6)[0].z
-        return jnp.sum(noise_**2) - jnp.sum(problem.misfit(back, data) ** 2) - jnp.sum((back - z) ** 2)
+        drawn = problem.with_data(measured=clean_reading + problem.data.sd * noise_, centre=z)
+        back = levenberg_marquardt(drawn, z, max_steps=6)[0].z
+        return jnp.sum(noise_**2) - jnp.sum(drawn.misfit(back) ** 2) - jnp.sum((back - z) ** 2)
 
     of_refit = np.asarray(jax.jit(lambda d: jax.lax.map(taken, d))(draw))
     assert (of_refit > 0).all() and of_refit.mean() < len(problem.coordinates)
@@ -254,7 +254,7 @@ def test_memory_tells_noise_from_what_remembers(seen):
     def of(x):
         residual = np.zeros(linear.residual.size)
         residual[: 3 * linear.rows] = x.ravel()
-        return float(linear.with_residual(jnp.asarray(residual)).memory())
+        return float(replace(linear, residual=jnp.asarray(residual)).memory())
 
     white = [of(rng.standard_normal((linear.rows, 3))) for _ in range(60)]
     assert -1.0 < np.mean(white) < 2.0 and np.quantile(white, 0.95) < 5.0

@@ -29,7 +29,7 @@ from calibration.discovery.projection import balance_error_by_row
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import fit_smooth_curve
 from calibration.inference.bases import BALANCES, OF_TURNS
-from calibration.inference.held_out import hold_out_blocks
+from calibration.inference.blocks import hold_out_blocks
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.words import loop_words

@@ -234,11 +234,13 @@ def test_a_log_without_a_motion_is_reported_with_what_to_log(robot, runs):
 def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(robot, monkeypatch, levels, converged):
     volts, told, kept = np.repeat(np.linspace(8, 24, levels), 60), [], []
     noise = default_rng(0).standard_normal((2, len(volts)))
-    columns = {"configuration": np.full(len(volts), "bench"), "time_s": 0.01 * np.arange(len(volts)), VOLTS: volts}
-    columns |= {SPEED: 200 * volts + 8 * noise[0], "motor_current_A": 0.5 + volts / 20 + 0.03 * noise[1]}
-    runs = Runs("log.csv", columns | {"slope_deg": 0 * volts, "payload_kg": 0 * volts}).of(robot)
-    base = SimpleNamespace(space=SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(long=True))))
-    base.candidate = SimpleNamespace(converged=converged)
+    runs = Runs("log.csv", {
+        "configuration": np.full(len(volts), "bench"), "time_s": 0.01 * np.arange(len(volts)), VOLTS: volts,
+        SPEED: 200 * volts + 8 * noise[0], "motor_current_A": 0.5 + volts / 20 + 0.03 * noise[1],
+        "slope_deg": 0 * volts, "payload_kg": 0 * volts,
+    }).of(robot)  # fmt: skip
+    bare = SimpleNamespace(observe=SimpleNamespace(long=True))
+    base = SimpleNamespace(space=SimpleNamespace(bare=bare), candidate=SimpleNamespace(converged=converged))
 
     def keep(name, make):
         kept.append(name)
