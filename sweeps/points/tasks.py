@@ -71,13 +71,9 @@ def task_of_configuration(config: Campaign, robot: Robot, turns: bool = False) -
     """Task of a configuration. `turns`: True if its profile drives the sides independently."""
     if config.obstacle is None:
         return run_task(config.model, config.options, robot, config.profile is not None, turns)
-    obstacle = config.obstacle
-    names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
-    attributes: Attributes = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
-    verdicts = {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
-    attributes[VERDICT] = {"long_name": OUTPUTS[VERDICT][1], **verdicts}
+    obstacle, attributes = config.obstacle, climb_attributes(config.obstacle)
     further, run = functools.partial(further_variation, obstacle), functools.partial(compute_climbs, obstacle)
-    return Task("climb", {}, attributes, names, True, AT_ONCE, {SIZE: SIZES[obstacle.kind]}, further, run)
+    return Task("climb", {}, attributes, tuple(attributes), True, AT_ONCE, {SIZE: SIZES[obstacle.kind]}, further, run)
 
 
 def run_task(
@@ -135,6 +131,14 @@ SIZES = {
         ("gap", "width of the trench"),
     )
 }
+
+
+def climb_attributes(obstacle: Obstacle) -> Attributes:
+    """Outputs of a point, by name, with their attributes in a store."""
+    names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
+    attributes: Attributes = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
+    verdicts = {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
+    return attributes | {VERDICT: {"long_name": OUTPUTS[VERDICT][1], **verdicts}}
 
 
 def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: str) -> dict[str, float]:
