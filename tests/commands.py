@@ -2,9 +2,11 @@
 
 import csv
 import json
+import os
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from calibration.data import robot_file
@@ -19,6 +21,7 @@ def command(arguments):
     """Run a command, its first words as one string. Returns its exit code."""
     words, *rest = arguments
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it
         patch.setattr(sys, "argv", ["mmrjax", *str(words).split(), *map(str, rest)])
         cli.main()
     return end.value.code
@@ -28,6 +31,11 @@ def rows(path):
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
+
+
+def columns_of(path):
+    """Columns of a CSV file: numbers, an empty cell NaN, or texts."""
+    return {name: cells.to_numpy() for name, cells in pd.read_csv(path).items()}
 
 
 def ends(run, *said, code=2):

@@ -71,33 +71,6 @@ MANY = (
 # --- against an independent implementation ----------------------------------------------------------
 
 
-def expected(voltages, times, slope, tolerance=1e-10):
-    """SciPy's Radau on the plain rates of `reference`, with heat and energy, a voltage for each stretch of time."""
-    side = paper.Side(voltages[0], np.radians(slope))
-    p = paper.NOMINAL
-    R_wh, R_ha = p["motor.resistance_thermal_winding"], p["motor.resistance_thermal_housing"]
-    C_w, C_h, cold = 16.3 / R_wh, 593.0 / R_ha, side.R
-
-    def rates(t, y):
-        state, (T_w, T_h) = y[:5], y[5:7]
-        side.R = cold * (1 + 0.00393 * (T_w - 25))
-        own = side.rates(t, state)
-        flow = (T_w - T_h) / R_wh
-        heat = [(side.R * y[0] ** 2 - flow) / C_w, (flow - (T_h - 25) / R_ha) / C_h]
-        return [*own, *heat, 2 * side.U * y[0]]
-
-    y = np.array([0, 0, 0, 0, 0, 25.0, 25.0, 0])
-    ends = []
-    for k, voltage in enumerate(voltages):
-        side.U = voltage
-        scale = np.array([10.0, 1000.0, 1.0, 1.0, 10.0, 10.0, 10.0, 100.0])
-        found = solve_ivp(rates, times[k : k + 2], y, method="Radau", rtol=tolerance, atol=1e-11 * scale)
-        assert found.success
-        y = found.y[:, -1]
-        ends.append(y)
-    return np.array(ends)
-
-
 #: Driven, braked to rest, driven backward and to the other side again, the current limited at each start.
 DUTIES, TIMES, LIMIT = [1.0, 0.0, -1.0, 0.8], [0.0, 1.0, 2.0, 3.0, 4.5], 6.0
 EXPLORED = ("6T2A.mass", "motor.torque_constant", "driver.current_limit")
@@ -204,7 +177,6 @@ def test_temperature_follows_the_two_bodies_in_closed_form(robot):
     cool = Start(temperature_winding=25.0, temperature_housing=25.0)
     found = run(held, asked(), p, cool, tolerance=1e-9)
     assert float(found.total.of["path"]) == 0.0
-    motor = robot.motor
     C_w, C_h = 16.3 / 1.7, 593.0 / 6.0
 
     # With copper: C_w T_w' = U² / (R (1 + α (T_w - 25))) - (T_w - T_h) / R_wh at a constant voltage.
@@ -217,7 +189,6 @@ def test_temperature_follows_the_two_bodies_in_closed_form(robot):
     assert float(found.temperature_winding) == pytest.approx(end[0], rel=1e-6)
     assert float(found.temperature_housing) == pytest.approx(end[1], rel=1e-6)
     assert float(found.peaks["temperature"]) == pytest.approx(end[0], rel=1e-6)
-    del motor
 
 
 # --- limits -----------------------------------------------------------------------------------------

@@ -48,6 +48,7 @@ def test_no_temperature_settles_where_every_kelvin_brings_more_than_a_kelvin():
     motor = Motor()
     edge = float((motor.temperature_coefficient * motor.resistance_thermal * motor.resistance) ** -0.5)
     assert np.isfinite(motor.temperature_settled(0.99 * edge)) and np.isinf(motor.temperature_settled(1.01 * edge))
+    assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
     assert float(motor.temperature_settled(3.91)) == pytest.approx(motor.temperature_limit, rel=5e-3)
 
 

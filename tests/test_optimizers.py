@@ -424,6 +424,12 @@ def test_blocks_left_out_are_not_seen(posed, measured, robot):
     assert_allclose(other.reading[rows], held.reading[rows], rtol=1e-4)
 
 
+def nothing_measured(readings, coordinates):
+    """Data of one row, where a test has residuals of its own."""
+    one = jnp.ones((1, readings))
+    return problem.Data(0 * one, one, one, jnp.zeros(coordinates), jnp.asarray(1.0))
+
+
 def test_blocks_of_what_does_not_vary_are_none(measured):
     flat = measured.where(measured["slope_deg"] == 0)
     assert (
@@ -448,8 +454,7 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
         r, jacobian = jax.vmap(residual)(members, z), jax.vmap(jax.jacfwd(residual, 1))(members, z)
         return jax.device_get((r, jacobian, members))
 
-    evaluated, one = [], jnp.ones((1, 3))
-    data = problem.Data(0 * one, one, one, jnp.zeros(2), jnp.asarray(1.0))
+    evaluated, data = [], nothing_measured(3, 2)
     begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
     weights = jnp.ones((6, 1, 3))
     found, _ = fit.search_rollouts(evaluate, begin, data, weights, 40, 2, within=fit.SAME)
@@ -477,8 +482,7 @@ def test_a_rival_that_promises_much_and_brings_nothing_ends():
         )
         return r, slopes[members], members
 
-    one = jnp.ones((1, 2))
-    data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
+    data = nothing_measured(2, 1)
     found, alone = (
         fit.search_rollouts(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, within=distance)[0]
         for distance in (3.0, np.inf)
@@ -494,8 +498,7 @@ def test_a_search_that_hardly_lowers_its_objective_ends(monkeypatch):
         r = np.stack([[(4000 - 0.02 * abs(x)) ** 0.5, 0.0] for x in z[:, 0]])
         return r, np.tile([[-0.01], [0.0]], (len(members), 1, 1)), members
 
-    one = jnp.ones((1, 1))
-    data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
+    data = nothing_measured(1, 1)
     search = lambda: fit.search_rollouts(evaluate, np.zeros((1, 1)), data, np.ones((1, 1, 1)), 40, 1)[0].steps[0]  # noqa: E731
     soon = search()
     monkeypatch.setattr(fit, "STALLED", -1.0)

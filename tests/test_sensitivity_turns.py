@@ -1,7 +1,5 @@
 """Sensitivity of turns: which outputs and inputs they have, and what is refused."""
 
-import csv
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +14,14 @@ from mmrjax.derived import turning_figures
 from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.commands import sensitivity as room
-from tests.commands import ends
+from tests.commands import ends, rows
 
 ROBOT = paper_robots.nominal()
 TURNS = ROBOT.showing_turns()
 
 
-def names(rows):
-    return [row.name for row in rows]
+def names(outputs):
+    return [output.name for output in outputs]
 
 
 def test_turns_have_outputs_of_both_sides_of_the_yaw_and_of_the_radius():
@@ -96,5 +94,4 @@ def test_the_yaw_rate_of_a_turn_is_studied(mmrjax, tmp_path):
     told = "--configurations", "6T2A", "--voltages", "24", "--payloads", "0", "--vary", "duty_left=0.4:0.8"
     more = "--method", "local", "--outputs", "yaw_rate,turning_radius", "--no-report", "--out", str(tmp_path / "s")
     ends(mmrjax("sensitivity", *told, *more), "yaw rate", "turning radius", code=0)
-    with (tmp_path / "s/points.csv").open() as file:
-        assert any(row["input"] == "6T2A.turning.lateral" for row in csv.DictReader(file))
+    assert any(row["input"] == "6T2A.turning.lateral" for row in rows(tmp_path / "s/points.csv"))

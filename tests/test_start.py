@@ -1,7 +1,5 @@
 """Runs from standstill as they are written: by the clock of the rig, with the slip over the stages of the start."""
 
-import csv
-
 import jax
 import jax.numpy as jnp
 import jsonschema
@@ -17,16 +15,10 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import Signals
 from sweeps.commands import simulate
-from tests.commands import read_json, schema_of
+from tests.commands import columns_of, read_json, schema_of
 
 VOLTAGE, V_S = 33.0, 0.02
 SCHEMA = schema_of("simulate")
-
-
-def table(path):
-    with path.open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(r[name]) for r in rows]) for name in rows[0] if name != "run_id"}
 
 
 @pytest.fixture
@@ -37,7 +29,7 @@ def written(mmrjax, tmp_path):
         (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
         asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
         assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
-        return table(tmp_path / "d/history.csv"), read_json(tmp_path / "d/result.json")
+        return columns_of(tmp_path / "d/history.csv"), read_json(tmp_path / "d/result.json")
 
     return left
 
@@ -123,7 +115,7 @@ def test_a_history_is_written_by_the_rigs_clock(written, delay):
     prompt, _ = written()
     late, result = written(f"[rig]\ndelay = {delay}\n")
     assert late["time_s"][0] == 0 and (late["time_s"] >= 0).all()
-    for name in set(late) - {"time_s", "voltage_V"}:
+    for name in set(late) - {"time_s", "voltage_V", "run_id"}:
         expected = np.interp(late["time_s"] - delay, prompt["time_s"], prompt[name])
         assert_allclose(late[name], expected, rtol=1e-6, atol=1e-6 * np.abs(prompt[name]).max())
     if delay > 0:  # the peak of the inrush is kept

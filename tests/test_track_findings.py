@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mmrjax.fidelities.track import _simulate_batch, track_batch
+from mmrjax.fidelities.steady import steady
+from mmrjax.fidelities.track import PARTS, _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
@@ -39,8 +40,6 @@ def runs(robot):
     wheeled, slope, payload, voltage = np.array(RUNS, float).T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
     # Not through the door's check of the step, whose own compilation test_track_bad_input pays.
-    from mmrjax.fidelities.track import _simulate_batch
-
     return jax.tree.map(np.asarray, _simulate_batch(robot, commands, 1.5, 1e-4, 1e-3, False))
 
 
@@ -220,10 +219,6 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     What is left is ripple: friction is not linear in the load and the sliding speed that fluctuate.
     `drive` ends on `steady` (test_drive).
     """
-    from mmrjax.fidelities.steady import steady
-    from mmrjax.fidelities.track import _simulate_batch
-    from mmrjax.model import params
-
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
@@ -242,8 +237,6 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
 
 def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
-    from mmrjax.fidelities.track import _simulate_batch
-
     two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     twin = jax.tree.map(lambda x: x[::-1], two)
     a = _simulate_batch(robot, two, 0.05, 1e-4, 1e-3, False)
@@ -262,8 +255,6 @@ def test_batch_compiles_once(robot, compilations):
 
 def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
-    from mmrjax.fidelities.track import PARTS, _simulate_batch
-
     two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     shares = []
     whole = _simulate_batch(robot, two, 0.047, 1e-4, 1e-3, False)

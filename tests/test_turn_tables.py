@@ -9,7 +9,6 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.data.inferred_facts import with_inferred_instruments
 from calibration.data.input_errors import BadData
-from calibration.inference.calibration import calibrate
 from calibration.inference.ranges import check_ranges
 from mmrjax.model import balances
 from mmrjax.model.quantities import RPM
@@ -339,37 +338,6 @@ def test_sound_tables_of_turns_are_not_refused(rig, table):
     assert len(table(f"supply_voltage_V,duty_left,duty_right,{SPEEDS},{READ}", *rows, robot=rig(DRIVEN))) == len(
         SOUND
     )
-
-
-@pytest.mark.nightly
-def test_width_or_ratio_of_a_kinematic_robot_is_calibrated(rig, table):
-    robot = rig(KINEMATIC)
-    speeds = [
-        (1000, 2000),
-        (2000, 1200),
-        (1500, 1500),
-        (-1200, 1500),
-        (1500, -800),
-        (200, 1500),
-        (1800, 1500),
-        (900, 0),
-    ]
-    left, right = RPM * np.array(speeds).T
-    true = mm.replace(robot, {"rover.turning.lateral": jnp.asarray(0.9)})
-    seen = mm.simulate(
-        true, mm.Conditions(["rover"] * len(speeds), motor_speed=0.0, motor_speed_left=left, motor_speed_right=right)
-    ).reading
-    random, sds = np.random.default_rng(5), (0.05, 0.05, 0.005)
-    noisy = [
-        np.asarray(seen[n]) + sd * random.normal(size=len(speeds))
-        for n, sd in zip(robot.rig.channels, sds, strict=True)
-    ]
-    runs = table(f"{SPEEDS},{READ}", *zip(*np.array(speeds).T, *noisy, strict=True), robot=robot)
-    noise = "motor_current_left=0.05A,motor_current_right=0.05A,yaw_rate=0.005rad/s"
-    found = calibrate(runs, robot, free=["rover.turning.lateral", "rover.ground.friction.static"], noise=noise)
-    ratio = found.parameters["rover.turning.lateral"]
-    assert found.converged and abs(ratio.value - 0.9) < 3 * ratio.sd < 0.1
-    assert found.held_out["turn"].errors["yaw_rate"].rms_sigma < 3
 
 
 def test_gearbox_loses_though_no_inertia_is_stated(rig):

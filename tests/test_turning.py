@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 from worlds import turning as world
 
 import mmrjax as mm
-from mmrjax.fidelities import drive
 from mmrjax.model import balances, energy, paper_robots, params
 from mmrjax.model.contact import Friction
 from mmrjax.model.signals import STATUSES
@@ -130,6 +129,26 @@ def flat(m):
 PLANE = ("speed", "speed_lateral", "yaw_rate", "heading", "place_x", "place_y", "discharge")
 
 
+def powers(robot, run, motion):
+    """Power that each sink takes [W]. With the growth of what is stored it is what the sources give."""
+
+    def stored(m):
+        return energy.stored_energy_turning(robot, balances.turning_signals(robot, run, m), m)
+
+    @jax.jit
+    def at(m):
+        rate = turning.motion_of_unknowns(robot, turning.turning_rates(robot, run, flat(m)))
+        # What is stored in shafts and windings changes with their rates; inductance and inertias do not.
+        _, change = jax.jvp(stored, (m,), (rate,))
+        travel = balances.turning_signals(robot, run, m)
+        source = jnp.mean(jax.vmap(lambda c, s: energy.source_power(robot, c, s))(run.of_sides(), travel.signals))
+        return source, energy.sink_powers_turning(robot, run, travel), change
+
+    source, sinks, change = at(motion)
+    assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
+    return sinks
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
@@ -139,22 +158,7 @@ def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
     motion = turning.PlaneMotion(
         *(jnp.asarray(x) for x in ([2.0, -0.7], [900.0, -150.0], 0.3, 0.05, -1.1, 0.7, 0.0, 0.0, 0.0))
     )
-
-    def stored(m):
-        return energy.stored_energy_turning(robot, balances.turning_signals(robot, run, m), m)
-
-    @jax.jit
-    def powers(m):
-        rate = turning.motion_of_unknowns(robot, turning.turning_rates(robot, run, flat(m)))
-        # What is stored in shafts and windings changes with their rates; inductance and inertias do not.
-        _, change = jax.jvp(stored, (m,), (rate,))
-        travel = balances.turning_signals(robot, run, m)
-        source = jnp.mean(jax.vmap(lambda c, s: energy.source_power(robot, c, s))(run.of_sides(), travel.signals))
-        return source, energy.sink_powers_turning(robot, run, travel), change
-
-    source, sinks, change = powers(motion)
-    assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
-    assert float(sinks["sliding"]) > 0
+    assert float(powers(robot, run, motion)["sliding"]) > 0
 
 
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
@@ -172,25 +176,6 @@ def test_rates_are_those_of_a_second_implementation(robot, configuration):
         place = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]  # in the other's order
         theirs = world.rates(other, inputs, 0.0, (y * size)[place])
         assert_allclose(mine[place][:10], theirs[:10], rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.nightly
-def test_run_over_time_is_that_of_a_second_implementation(robot):
-    times = np.array([0.0, 0.05, 0.3, 0.8])
-    run = mm.Conditions(
-        ["6T2A"], voltage=24.0, duty_left=[1.0], duty_right=[0.4], slope_deg=8.0, heading_deg=60.0
-    ).resolved(robot)
-    mine = drive.drive_batch(robot, run, jnp.asarray(times), tolerance=1e-9)
-    inputs = world.Inputs(1.0, 0.4, kind="duty", slope=np.radians(8.0), supply=24.0)
-    begin = np.zeros(len(world.STATES))
-    begin[2] = np.radians(60.0)
-    other = world.simulate(of_world(robot, "6T2A"), inputs, times, begin)
-    signals = jax.tree.map(lambda x: np.asarray(x)[0], mine.signals)
-    expected = np.asarray(other.states)
-    for k, name in ((0, "place_x"), (1, "place_y"), (2, "heading"), (4, "speed_lateral"), (5, "yaw_rate")):
-        assert_allclose(getattr(signals, name)[:, 0], expected[:, k], rtol=1e-6, atol=1e-6, err_msg=name)
-    assert_allclose(signals.current, expected[:, 6:8], rtol=1e-5, atol=1e-6)
-    assert_allclose(signals.speed_motor, expected[:, 8:10], rtol=1e-6, atol=1e-4)
 
 
 def test_turning_numbers_are_those_of_the_paper(robot):
