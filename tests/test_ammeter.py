@@ -29,7 +29,7 @@ def families(imposed, *shown):
 
 
 @pytest.mark.parametrize(
-    ("shown", "listed"),
+    "shown, listed",
     [
         ([("total_current", 1.0)], True),
         ([("total_current", 1.0), ("speed", 0.1)], True),

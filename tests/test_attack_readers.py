@@ -26,11 +26,12 @@ from pyarrow import feather, parquet
 from test_more_formats import sysid_log, wpilog, write_xlsx
 from test_sources import COLUMNS, RIG
 
-from calibration.data import contents, input_files, robot_file
-from calibration.data import runs as records
+from calibration.data import input_files, robot_file
+from calibration.data.contents import inspect_source
 from calibration.data.input_errors import InputError
+from calibration.data.runs import read_runs
 from mmrjax.errors import LONGEST
-from sweeps.commands import rig_new
+from sweeps.commands.rig_new import joint_numbers, new_rig_text
 from tests.commands import text_file
 
 #: Most processor time of one answer [s], wall-clock time after which it hangs [s], and memory that it may take [bytes].
@@ -95,10 +96,10 @@ def doors(source, robot):
     """Both ways into the readers: a list of what is in a file, and its columns as runs."""
 
     def inspect():
-        json.dumps(contents.inspect_source(source).to_json(), ensure_ascii=False).encode()
+        json.dumps(inspect_source(source).to_json(), ensure_ascii=False).encode()
 
     def read():
-        table = records.read_runs(source, robot, columns=COLUMNS)
+        table = read_runs(source, robot, columns=COLUMNS)
         "".join(note for note in table.notes).encode()
 
     return inspect, read
@@ -314,7 +315,7 @@ def test_sizes_that_a_file_declares_are_refused_before_they_are_read(tmp_path, r
     wrong, refused = asked(inspect)
     assert not wrong, wrong
     if not refused:  # the signal alone is refused
-        facts = contents.inspect_source(tmp_path / name).signals
+        facts = inspect_source(tmp_path / name).signals
         assert any(fact.refused for fact in facts) or name in ("paths.h5", "lists.parquet", "negative.npy")
     wrong, refused = asked(read)
     assert not wrong and refused, (wrong, refused)
@@ -380,7 +381,7 @@ def test_a_unit_that_is_not_in_utf8_is_shown_with_question_marks(tmp_path):
         file["volts"].attrs.create("unit", np.array(b"\xff\xfe", dtype=h5py.string_dtype("utf-8", 2)))
 
     hdf5(fill)(tmp_path / "log.h5")
-    assert contents.inspect_source(tmp_path / "log.h5").signals[0].unit == 2 * "\ufffd"
+    assert inspect_source(tmp_path / "log.h5").signals[0].unit == 2 * "\ufffd"
 
 
 @pytest.mark.parametrize("name", ["rpm", "motor_speed_rpm"])  # by a mapping, and by itself
@@ -396,7 +397,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path, robot, kind, name):
         source = tmp_path / "log.parquet"
     columns = {**COLUMNS, "motor_speed_rpm": name} if name == "rpm" else {**COLUMNS, "motor_speed_rpm": None}
     with pytest.raises(InputError, match=f"{name}: (has the same name as another signal|the name fits 2 signals)"):
-        records.read_runs(source, robot, columns={k: v for k, v in columns.items() if v})
+        read_runs(source, robot, columns={k: v for k, v in columns.items() if v})
 
 
 @pytest.mark.parametrize("text", ['{"t": [1], "t": [2]}', '[{"t": 1, "t": 2}]', '{"t": 1}\n{"t": 1, "t": 2}'])
@@ -466,7 +467,7 @@ def test_a_masked_reading_is_missing_in_every_container(tmp_path, robot):
         columns = COLUMNS if "matrix" not in kind else matrix
         if kind == "MDF":
             columns = columns | {"time_s": "time_s"}
-        found = records.read_runs(source, robot, columns=columns)["motor_speed_rpm"]
+        found = read_runs(source, robot, columns=columns)["motor_speed_rpm"]
         sound = np.flatnonzero(np.isfinite(found))
         if not np.array_equal(sound, np.delete(np.arange(len(found)), lost)):
             failures.append(f"{kind}: {np.flatnonzero(np.isnan(found))}")
@@ -493,7 +494,7 @@ def test_complex_numbers_are_refused_by_every_reader(tmp_path, robot):
         _, read = doors(source, robot)
         wrong, refused = asked(read)
         assert not wrong and "rpm: holds complex numbers" in refused[0], source
-        facts = {s.path.strip("/"): s for s in contents.inspect_source(source).signals}
+        facts = {s.path.strip("/"): s for s in inspect_source(source).signals}
         assert "complex numbers" in facts["rpm"].refused
 
 
@@ -520,7 +521,7 @@ def test_times_without_a_date_are_listed_and_refused(tmp_path):
 
     times = [datetime.time(0, 0, k) for k in range(4)]
     parquet.write_table(pa.table({"t": times, "rpm": [1.0, 2, 3, 4]}), tmp_path / "log.parquet")
-    found = contents.inspect_source(tmp_path / "log.parquet").signals
+    found = inspect_source(tmp_path / "log.parquet").signals
     assert found[0].refused == "holds time64[us]; expected numbers or words" and found[1].greatest == 4
 
 
@@ -576,7 +577,7 @@ def test_models_that_mujoco_does_not_end_with_are_refused(tmp_path, monkeypatch,
         os.mkfifo(tmp_path / pipe)
     (tmp_path / "model.xml").write_text(MODELS[kind])
     before = set(os.listdir())
-    wrong, refused = asked(lambda: rig_new.joint_numbers(tmp_path / "model.xml", None))
+    wrong, refused = asked(lambda: joint_numbers(tmp_path / "model.xml", None))
     assert not wrong and refused and set(os.listdir()) == before, wrong
 
 
@@ -584,7 +585,7 @@ def test_a_sound_model_is_read_and_leaves_no_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.xml").write_text('<mujoco><option timestep="0.001"/></mujoco>')
     assert (
-        rig_new.joint_numbers(
+        joint_numbers(
             text_file(
                 tmp_path / "model.xml", MODEL % ('<size njmax="5000" nconmax="2000"/><include file="part.xml"/>', "")
             ),
@@ -603,7 +604,7 @@ def test_mutated_models_are_read_or_refused_in_a_sentence(tmp_path, monkeypatch,
     rng, failures = np.random.default_rng([70, len(kind)]), []
     for k in range(4 * EACH):
         (tmp_path / kind).write_bytes(mutated(text.encode(), rng))
-        wrong, _ = asked(lambda: rig_new.new_rig_text(None, tmp_path / kind, None, None))
+        wrong, _ = asked(lambda: new_rig_text(None, tmp_path / kind, None, None))
         failures += [f"{k}: {each}" for each in wrong]
     assert not failures, "\n".join(failures)
     assert os.listdir() == [kind]
@@ -622,5 +623,5 @@ def test_many_joints_are_named_in_a_short_sentence(tmp_path):
         for k in range(200)
     )
     (tmp_path / "robot.urdf").write_text(URDF.replace("</robot>", f"{joints}</robot>"))
-    wrong, refused = asked(lambda: rig_new.joint_numbers(tmp_path / "robot.urdf", None))
+    wrong, refused = asked(lambda: joint_numbers(tmp_path / "robot.urdf", None))
     assert not wrong and refused[0].endswith("expected the name of one joint")

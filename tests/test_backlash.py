@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from test_shaft import DRIVE
 
-from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.robot_file import load_robot
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
@@ -128,7 +128,7 @@ backlash = "0.08 ± 30 %"
 
 
 @pytest.mark.parametrize(
-    ("stated", "got"),
+    "stated, got",
     [
         ('backlash = "0.08 ± 30 %"', r"backlash: got 0\.08 rad"),
         ('stiffness = "20 ± 5"\ndamping = "0.01 ± 0.005"', "stiffness: got 20 N·m/rad"),
@@ -136,9 +136,9 @@ backlash = "0.08 ± 30 %"
 )
 def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path, stated, got):
     path, text = tmp_path / "rig.toml", FILE.replace('backlash = "0.08 ± 30 %"', stated)
-    assert robot_file.load_robot(text_file(path, text)).loose
+    assert load_robot(text_file(path, text)).loose
     with pytest.raises(BadConfiguration, match=rf"bench\.{got}; .* motor\.inertia and bench\.inertia"):
-        robot_file.load_robot(text_file(path, text.replace("inertia = 2e-6\n", "")))
+        load_robot(text_file(path, text.replace("inertia = 2e-6\n", "")))
 
 
 @pytest.mark.nightly

@@ -5,13 +5,20 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.inference import bases
 from calibration.inference.bases import (
+    BALANCES,
     COLLINEAR,
+    CONDITIONS,
+    FEWEST,
+    LEVELS,
+    ORDERS,
+    VARIABLES,
+    CurveScope,
     Window,
     curve_families,
     family_names,
     order_collinearity,
+    wave_families,
     window_families,
     window_from_name,
 )
@@ -76,7 +83,7 @@ def test_order_of_a_sorted_table_is_no_driver(driven):
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
         "total_current_A": RNG.uniform(1, 5, 30), driven: level / level[-1],
     }  # fmt: skip
-    scope = bases.CurveScope(("electrical", "track"), ("supply_voltage_V",))
+    scope = CurveScope(("electrical", "track"), ("supply_voltage_V",))
     assert "order" not in variables(curve_families(columns, np.ones(30), scope=scope))
     assert not [v for v in variables(window_families(columns, np.ones(30), scope=scope)) if v.startswith("order")]
     for seed in range(5):
@@ -86,7 +93,7 @@ def test_order_of_a_sorted_table_is_no_driver(driven):
 def test_time_of_a_single_ramp_is_no_driver():
     time = np.arange(40.0)
     columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
-    scope = bases.CurveScope(("electrical",), ("supply_voltage_V",))
+    scope = CurveScope(("electrical",), ("supply_voltage_V",))
     stairs = np.repeat(np.arange(4.0), 10)  # they tell 0.93 of the time
     for voltage, expected in (
         (time / 4, False),
@@ -131,21 +138,21 @@ def test_curves_over_the_order_where_it_says_something_new():
 def test_a_window_is_read_from_its_name():
     for of in (Window("time", 0.6, 0.75), Window("order", 12.0, 19.0), Window("time", 1e-05, 12345.0)):
         assert window_from_name(str(of)) == of
-    for word in ("time", "order", bases.CONDITIONS, "speed_motor", *bases.ORDERS):
+    for word in ("time", "order", CONDITIONS, "speed_motor", *ORDERS):
         assert window_from_name(word) is None
 
 
 def test_windows_cover_the_order_and_overlap_by_half():
     basis, shown = window_families(shuffled(table()), COUNTS)
     assert [v for _, v in shown.names[:4]] == [v for _, v in basis.names[:4]]
-    assert {n[0] for n in basis.names} == set(bases.BALANCES) and {n[0] for n in shown.names} == set(channels.USUAL)
+    assert {n[0] for n in basis.names} == set(BALANCES) and {n[0] for n in shown.names} == set(channels.USUAL)
     assert basis.columns.shape[2] == 1 and set(np.unique(basis.columns)) == {0.0, 1.0}
     order = shuffled(table())["order"]
     mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window_from_name(n[1]).axis == "order"]
     for k in mine:
         of, inside = window_from_name(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
         assert_array_equal(inside, of.holds(order))
-        assert bases.FEWEST <= inside.sum() <= ROWS / 2
+        assert FEWEST <= inside.sum() <= ROWS / 2
     shapes = np.asarray(basis.columns)[mine, :, 0]
     assert (shapes.sum(0) >= 1).all()
     # something that happens within half a window of the smallest share lies in one
@@ -193,7 +200,7 @@ def test_levels_of_conditions_are_windows():
     assert_allclose([w.low for w in mine], np.radians(slopes), rtol=1e-4, atol=1e-6)
     for w in found:
         k = basis.names.index(("slip", str(w)))
-        x = columns[bases.VARIABLES[w.axis]] * bases.LEVELS[w.axis][0]
+        x = columns[VARIABLES[w.axis]] * LEVELS[w.axis][0]
         assert_array_equal(np.asarray(basis.columns)[k, :, 0] > 0, w.holds(x))
     assert mine[-1].words == f"{slopes[-1]:g} deg of slope"
 
@@ -214,8 +221,8 @@ def test_a_table_without_order_or_levels_has_no_windows():
 def test_an_order_that_the_only_condition_tells_has_no_curves():
     order = np.arange(1.0, ROWS + 1)
     columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
-    alone = bases.CurveScope(("electrical", "track"), ("motor_current_A",))
-    assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
+    alone = CurveScope(("electrical", "track"), ("motor_current_A",))
+    assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {CONDITIONS}
 
 
 # --- sizes ----------------------------------------------------------------------------------------------
@@ -267,7 +274,7 @@ def back_and_forth(turn, runs=3, samples=100):
 def waves_of(turn):
     """Order of the shaft → columns of its wave in one balance, of runs that turn so far [rad] and come back."""
     angle, rows = back_and_forth(turn)
-    (basis,) = bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows)
+    (basis,) = wave_families(np.zeros(angle.size, bool), angle, rows, rows)
     every = {n: np.asarray(c) for n, c in zip(basis.names, basis.columns, strict=True)}
     return angle, rows, {v: c for (place, v), c in every.items() if place == "track"}
 
@@ -293,4 +300,4 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
 
 def test_a_shaft_that_stands_has_no_waves():
     angle, rows = back_and_forth(0.0)
-    assert bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows) == ()
+    assert wave_families(np.zeros(angle.size, bool), angle, rows, rows) == ()

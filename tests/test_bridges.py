@@ -10,10 +10,11 @@ from numpy.testing import assert_allclose
 from worlds import bridges, paper
 
 import mmrjax as mm
-from mmrjax.derived import requirements
+from mmrjax.derived.requirements import EnvelopePoint, ratings, travel_quantities
 from mmrjax.fidelities import drive
 from mmrjax.fidelities.steady import steady_outputs
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
+from mmrjax.model.paper_robots import blank_robot, nominal
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STATUSES
@@ -40,7 +41,7 @@ def bench():
     }  # fmt: skip
     values = {name: DYNO[symbol] for name, symbol in names.items()}
     values |= {"motor.inertia": 1e-5, "motor.inductance": 1e-3}
-    return params.replace(paper_robots.blank_robot(Configurations({"dyno": shaft}), sides=1.0), values)
+    return params.replace(blank_robot(Configurations({"dyno": shaft}), sides=1.0), values)
 
 
 def drawn(kind, one_way, number, seed=0):
@@ -57,7 +58,7 @@ def drawn(kind, one_way, number, seed=0):
         load = {"dry": 0.05, "viscous": 0.002, "constant": torque, "demand": 0.0 * torque}
         conditions = mm.Conditions(voltage=volts, duty=duty, load_torque=torque)
     else:
-        robot, motor = paper_robots.nominal(), VEHICLE
+        robot, motor = nominal(), VEHICLE
         of = [bridges.vehicle(c, payload, np.radians(slope)) for c in ("6T2A", "4W2T")]
         wheeled = rng.random(number) < 0.5
         load = {key: np.where(wheeled, of[1][key], of[0][key]) for key in of[0]}
@@ -135,7 +136,7 @@ def test_derivatives_in_each_mode_are_differences_of_the_bisection(one_way):
 def test_requirements_behind_a_limit_or_a_diode_are_those_of_a_bisection(one_way):
     """At points of an envelope as `check` and `size` evaluate them, limits from 1 to 3 A."""
     rng = np.random.default_rng(1)
-    robot, number = paper_robots.nominal(), 100
+    robot, number = nominal(), 100
     robot = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=not one_way))
     volts, limits, payload, slope, which = (
         rng.uniform(10, 33, number), np.exp(rng.uniform(0, 1.1, number)), rng.uniform(0, 8, number), rng.uniform(-15, 15, number),
@@ -148,9 +149,9 @@ def test_requirements_behind_a_limit_or_a_diode_are_those_of_a_bisection(one_way
     @jax.jit
     @jax.vmap
     def values(limit, which, volts, slope, payload):
-        point = requirements.EnvelopePoint(which, 1.0, 1.0, 0.0, volts, 0.0, 1.0, slope, payload, 25.0, 0.0)
+        point = EnvelopePoint(which, 1.0, 1.0, 0.0, volts, 0.0, 1.0, slope, payload, 25.0, 0.0)
         mine = params.replace(robot, {"driver.current_limit": limit})
-        found, outcome = requirements.travel_quantities(mine, point, requirements.ratings(robot))
+        found, outcome = travel_quantities(mine, point, ratings(robot))
         return found["current"], found["motor_speed_rpm"], outcome
 
     found = values(*map(jnp.asarray, (limits, which, volts, slope, payload)))
@@ -168,7 +169,7 @@ def turned(one_way, number):
     duties, volts = rng.uniform(-1, 1, (2, number)), rng.uniform(12, 33, number)
     limits, which = np.exp(rng.uniform(np.log(0.3), np.log(5), number)), rng.choice(["4W2T", "6T2A"], number).tolist()
     duties[:, 0], volts[0], limits[0], which[0] = (0.5, 0.8), 24.0, 1.0, "4W2T"
-    robot = paper_robots.nominal()
+    robot = nominal()
     robot = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=not one_way))
     robot = params.replace(robot, {"driver.current_limit": jnp.asarray(limits)})
     runs = mm.Conditions(which, voltage=volts, duty_left=duties[0], duty_right=duties[1]).resolved(robot)

@@ -15,21 +15,24 @@ from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import calibrated
 
 import calibration
-from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.robot_file import load_robot, read_robot
 from calibration.discovery.result import DiscoveryResult
-from calibration.inference import noise, observers, priors
+from calibration.inference import observers
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
+from calibration.inference.noise import noise_from_table, parse_noise
 from calibration.inference.observers import SettledRuns
+from calibration.inference.priors import default_names, parameter_coordinates
 from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOutErrors
 from calibration.inference.simulation_errors import relative_error, root_mean_square
 from mmrjax.fidelities.results import Results
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import channels, paper_robots
-from sweeps.report import calibration_report
+from mmrjax.model import channels
+from mmrjax.model.paper_robots import nominal
+from sweeps.report.calibration_report import calibration_document
 from sweeps.report.terminal_renderer import print_document
 from tests.commands import read_json, schema_of
 from tests.commands import rows as rows_of
@@ -45,7 +48,7 @@ def measured():
 @pytest.fixture(scope="module", params=["few starts", pytest.param("all of it", marks=pytest.mark.slow)])
 def found(request, measured):
     """Of the packaged table: as quick as it goes, and as the command does it."""
-    return calibrated() if request.param == "few starts" else calibrate(measured, paper_robots.nominal())
+    return calibrated() if request.param == "few starts" else calibrate(measured, nominal())
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +62,7 @@ def changed(runs, **columns):
 
 def quick(runs, robot=None, **keywords):
     """Only what is wrong with the data matters: few starts, no profiles, no blocks."""
-    return calibrate(
-        runs, robot or paper_robots.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords}
-    )
+    return calibrate(runs, robot or nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords})
 
 
 def test_packaged_data_figures_are_what_they_were(found, document):
@@ -94,7 +95,7 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
     files = ["posterior.nc", "result.json", "robot.toml", "rows.csv"]
     assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == files
     jsonschema.validate(read_json(tmp_path / "fitted/result.json"), SCHEMA)
-    again = robot_file.read_robot(tmp_path / "fitted/robot.toml")
+    again = read_robot(tmp_path / "fitted/robot.toml")
     answer = steady_batch(again, measured.conditions(again))
     assert_array_equal(answer.status, 0)
     assert_allclose(answer.speed, found.readings["speed"].after, rtol=1e-9)
@@ -111,7 +112,7 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     kinds = ("voltage_configuration", "slope", "voltage", "payload")
     found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
     assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}
-    print_document(calibration_report.calibration_document(found, "nominal"))
+    print_document(calibration_document(found, "nominal"))
     shown = capsys.readouterr().out
     table = [line for line in shown.splitlines() if line.startswith("after, held out")]
     assert [" by slope " in line or " by voltage and configuration " in line for line in table] == [True, True]
@@ -119,7 +120,7 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
 
 def test_a_terminal_has_few_lines_of_a_calibration(found, capsys):
     """The answer, the verdict, what moved most, errors of rows left out, and what to check."""
-    print_document(calibration_report.calibration_document(found, "nominal"), brief=True)
+    print_document(calibration_document(found, "nominal"), brief=True)
     answer, verdict, moved, *_, check = capsys.readouterr().out.splitlines()
     farthest = max((p for p in found.parameters.values() if not p.held_by_prior), key=lambda p: abs(p.shift))
     assert len(_) <= 1 and answer.startswith("The fit is") and verdict == f"{found.adequacy.statement}."
@@ -145,17 +146,17 @@ def test_rows_have_every_row(found):
 def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured):
     with_sd = changed(measured, total_current_sd_A=np.full(20, 0.05), speed_sd_mm_s=np.full(20, 4.0))
     sizes = observers.observer_kind(with_sd).sizes(with_sd)
-    made = noise.noise_from_table(with_sd, sizes, "current=2%")
+    made = noise_from_table(with_sd, sizes, "current=2%")
     assert made.source == ("stated", "estimated", "columns") and made.estimated.tolist() == [False, True, False]
     current = measured["total_current_A"]
     assert_allclose(made.sd[:, 0], 0.02 * np.maximum(current, np.sqrt(np.mean(current**2)) / 5))
     assert_allclose(made.sd[:, 2], 4e-3)
-    assert noise.noise_from_table(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
+    assert noise_from_table(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
 
 
 def test_noise_is_in_any_unit_of_its_channel():
     shown = tuple(channels.find_channel(name) for name in ("total_current", "yaw_rate"))
-    found = noise.parse_noise("current=40mA,yaw_rate=0.6deg/s", shown)
+    found = parse_noise("current=40mA,yaw_rate=0.6deg/s", shown)
     assert found == {0: (pytest.approx(0.04), False), 1: (pytest.approx(np.radians(0.6)), False)}
 
 
@@ -186,7 +187,7 @@ def test_repeats_that_differ_are_said_and_no_error(measured):
     current[20] = 5.2
     other = changed(twice, total_current_A=current)
     for stated, apart in ((None, "40%"), ("current=2%,motor_speed=1%,speed=1%", "14 sd")):
-        known = noise.noise_from_table(other, SettledRuns.sizes(other), stated)
+        known = noise_from_table(other, SettledRuns.sizes(other), stated)
         assert SettledRuns.check(other, known) == [
             Remark(
                 "repeats",
@@ -209,7 +210,7 @@ def test_repeats_are_not_measured_by_noise_that_is_their_own_scatter(measured):
         current = twice["total_current_A"].copy()
         current[20] = factor * current[3]
         other = changed(twice, total_current_A=current)
-        known = noise.noise_from_table(other, SettledRuns.sizes(other), "current=6%,motor_speed=1%,speed=1%")
+        known = noise_from_table(other, SettledRuns.sizes(other), "current=6%,motor_speed=1%,speed=1%")
         assert SettledRuns.check(other, known) == []
         known = dataclasses.replace(known, source=("series", *known.source[1:]))
         assert [note.apart for note in SettledRuns.check(other, known)] == said
@@ -220,7 +221,7 @@ def test_a_column_that_varies_where_no_condition_does_is_named(measured):
     speeds = {"motor_speed_rpm": np.linspace(4000.0, 5000.0, 6)}
     extras = {"torque_mNm": np.arange(6.0), "who": np.array(list("abcdef"))}
     dyno = dataclasses.replace(alike, columns=alike.columns | speeds, extras=extras)
-    known = noise.noise_from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
+    known = noise_from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
     with pytest.raises(BadData, match=r". torque_mNm varies from row to row and is not used. .*; no condition"):
         SettledRuns.check(dyno, known)
 
@@ -229,7 +230,7 @@ def test_thousands_of_rows_are_compared_at_once(measured):
     long = measured.where(np.tile(np.arange(20), 250))
     long = changed(long, payload_kg=long["payload_kg"] + 1e-3 * np.arange(5000))  # no two alike but by the last
     long.columns["payload_kg"][-1] = long["payload_kg"][19]
-    known = noise.noise_from_table(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
+    known = noise_from_table(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
     began = time.monotonic()
     assert SettledRuns.check(long, known) == []
     long.columns["speed_mm_s"][-1] *= 2
@@ -304,7 +305,7 @@ def gaps(measured):
 
 @pytest.fixture(scope="module")
 def found_with_gaps(gaps):
-    return calibrate(gaps, paper_robots.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
+    return calibrate(gaps, nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
 
 
 @pytest.mark.slow
@@ -315,8 +316,8 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
 
 
 def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps, robot):
-    coordinates = priors.parameter_coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
-    sd = noise.noise_from_table(gaps, observers.observer_kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
+    coordinates = parameter_coordinates(robot, default_names(["6T2A", "4W2T"], robot))
+    sd = noise_from_table(gaps, observers.observer_kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
     posed = observers.pose_problem(gaps, robot, coordinates, sd)
     starts = 0.3 * jnp.ones((5, len(coordinates)))  # as many as `found_with_gaps` compiled
     lost = jnp.isnan(gaps.measured())
@@ -350,7 +351,7 @@ def test_a_calibration_is_the_same_where_jax_is_single(measured):
     stated = {"noise": "current=9%,motor_speed=6%,speed=4%", "blocks": True}
     double = quick(measured, **stated)
     with jax.enable_x64(False):
-        single = quick(measured, robot_file.load_robot("nominal"), **stated)
+        single = quick(measured, load_robot("nominal"), **stated)
         resistance = single.robot.motor.friction_coulomb
     assert isinstance(resistance, np.ndarray) and resistance == double.robot.motor.friction_coulomb
     assert json.dumps(single.to_json()) == json.dumps(double.to_json())

@@ -5,7 +5,9 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import paper
 
-from mmrjax.model import balances, chassis, params
+from mmrjax.model import params
+from mmrjax.model.balances import begin_signals, moving_signals
+from mmrjax.model.chassis import inertia_reduced, normal_load
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 
@@ -15,14 +17,14 @@ RNG = np.random.default_rng(31)
 def test_chassis_inertias_match_reference():
     for _ in range(100):
         J_d, i, eta, J_w = RNG.uniform((0, 5, 0.3, 0), (1e-5, 100, 1, 1e-2))
-        rotating = chassis.inertia_reduced(J_d, i, eta, J_w)
+        rotating = inertia_reduced(J_d, i, eta, J_w)
         assert_allclose(rotating, paper.rotating_inertia(J_d, i, eta, J_w), rtol=1e-9)
 
 
 def test_normal_load_matches_reference():
     for mass, alpha in RNG.uniform((5, -0.7), (40, 0.7), (50, 2)):
         expected = paper.rolling_force(mass / 2, alpha, 1.0)
-        assert_allclose(chassis.normal_load(mass, alpha, paper.G, 2), expected, rtol=1e-9)
+        assert_allclose(normal_load(mass, alpha, paper.G, 2), expected, rtol=1e-9)
 
 
 @pytest.mark.quick(1)
@@ -36,7 +38,7 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     for _ in range(80):
         middle = 0.5 * (low + high)
         state = State(1.5, 300.0, 300.0 / robot.gearbox.ratio * body.radius - middle, 0.0)
-        s = balances.moving_signals(robot, run, state)
+        s = moving_signals(robot, run, state)
         if float(s.acceleration) < float(body.radius * s.acceleration_wheel):
             low = middle
         else:
@@ -52,8 +54,8 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
 
 def test_total_mass_stated_overrides_robot_and_payload(robot):
     state = State(0.0, 0.0, 0.0, 0.0)
-    assert float(balances.begin_signals(robot, Conditions(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
-    assert float(balances.begin_signals(robot, Conditions(payload=3.0, total_mass=20.0), state).mass) == 20.0
+    assert float(begin_signals(robot, Conditions(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
+    assert float(begin_signals(robot, Conditions(payload=3.0, total_mass=20.0), state).mass) == 20.0
 
 
 def test_table7_motor_side_is_the_reflected_rotor(robot):

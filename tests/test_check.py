@@ -11,9 +11,10 @@ import jsonschema
 import numpy as np
 import pytest
 
-from calibration.data import requirements_file, robot_file
+from calibration.data import requirements_file
 from calibration.data.input_errors import BadConfiguration
-from calibration.sizing import sheet
+from calibration.data.robot_file import change_robot
+from calibration.sizing.sheet import check_requirements, fill_in_ratings, reject_impossible
 from mmrjax.climbing import resting_posture
 from mmrjax.derived.requirements import CUT_OFF, QUANTITIES, EnvelopePoint, evaluate_requirement, ratings, with_cells
 from mmrjax.fidelities.steady import steady_batch
@@ -122,8 +123,8 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
     for k, r in enumerate(result["requirements"]):
         assert bool(r["change"]) <= (not r["met"])
         for c in r["change"]:
-            outcomes = sheet.check_requirements(
-                robot_file.change_robot(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False
+            outcomes = check_requirements(
+                change_robot(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False
             )
             assert outcomes[k].met, (r["name"], c)
             before = [x["met"] for x in result["requirements"]]
@@ -133,9 +134,7 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, resu
                 1 if c["parameter"] == "battery.cells" else 0.002 * c["to"]
             )
             alone = dataclasses.replace(asked, each=(asked.each[k],))
-            (short,) = sheet.check_requirements(
-                robot_file.change_robot(robot, {c["parameter"]: near}, "test"), alone, changes=False
-            )
+            (short,) = check_requirements(change_robot(robot, {c["parameter"]: near}, "test"), alone, changes=False)
             assert not short.met, (r["name"], c, near)
             tried += 1
     assert tried > (8 if len(names) > 5 else 1)
@@ -167,7 +166,7 @@ def test_a_robot_slides_or_tips_across_a_slope(robot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "left"), [("turn_in_place_rad_s", -1.0), ("turning_radius_mm", 0.0)])
+@pytest.mark.parametrize("name, left", [("turn_in_place_rad_s", -1.0), ("turning_radius_mm", 0.0)])
 def test_turns_that_are_asked_for_are_those_that_settle(robot, name, left):
     value, outcome = evaluate_requirement(robot, point(battery=0.0, charge=24.0, payload=3.0), ratings(robot), name)
     runs = Conditions([0], voltage=24.0, payload=3.0, duty_left=left, duty_right=1.0).resolved(robot)
@@ -294,15 +293,15 @@ def test_wrong_file_is_refused_in_a_sentence(text):
 
 
 def test_a_surface_that_holds_the_robot_is_let_pass(robot):
-    sheet.reject_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
+    reject_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
 
 
 def test_rated_is_what_the_parts_permit(robot):
-    asked = sheet.fill_in_ratings(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
+    asked = fill_in_ratings(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
     assert [r.limit for r in asked.each] == pytest.approx([125.0, 12000.0])
     robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, torque_limit=None))
     with pytest.raises(BadConfiguration, match=r"^r.toml, gearbox_Nm: the robot states no rating; state a number$"):
-        sheet.fill_in_ratings(robot, read("gearbox_Nm = 'rated'"))
+        fill_in_ratings(robot, read("gearbox_Nm = 'rated'"))
 
 
 def test_contradictions_are_those_of_one_use():
@@ -326,7 +325,7 @@ payload_kg = [0, 8]
 @pytest.fixture(scope="module")
 def of_posture(robot):
     asked = requirements_file.parse_requirements(OF_POSTURE, "posture.toml")
-    return {o.requirement.name: o for o in sheet.check_requirements(robot, asked, changes=False)}
+    return {o.requirement.name: o for o in check_requirements(robot, asked, changes=False)}
 
 
 @pytest.mark.slow
@@ -342,12 +341,12 @@ def test_steps_and_sizes_of_section_2_2(of_posture):
 @pytest.mark.slow
 def test_longer_levers_would_get_over_the_step(robot):
     alone = requirements_file.parse_requirements("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
-    (found,) = sheet.check_requirements(robot, alone)
+    (found,) = check_requirements(robot, alone)
     (longer,) = (c for c in found.change if c.parameter == "running_gear.lever_length")
     assert longer.before == pytest.approx(0.205) and longer.after == pytest.approx(0.259, abs=0.002)
     assert longer.gradient > 0 and longer.breaks == ()
     changed = params.replace(robot, {"running_gear.lever_length": longer.after})
-    assert sheet.check_requirements(changed, alone, changes=False)[0].met
+    assert check_requirements(changed, alone, changes=False)[0].met
 
 
 @pytest.mark.slow
@@ -356,7 +355,7 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
     text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'
 
     def rise(surface):
-        (found,) = sheet.check_requirements(
+        (found,) = check_requirements(
             robot, requirements_file.parse_requirements(text.format(surface), "stairs.toml"), changes=False
         )
         assert found.at["tread_mm"] == 290 and not found.met
@@ -378,4 +377,4 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     gear = tuple(p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file has no running_gear"):
-        sheet.reject_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))
+        reject_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))

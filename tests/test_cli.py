@@ -14,8 +14,9 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
-from sweeps import cli, config, options
-from sweeps.points import scale
+from sweeps import cli, options
+from sweeps.config import Calibrate, Compare, Loop, Sweep, as_toml, resolve_configuration
+from sweeps.points.scale import Compiled, share_counter
 from tests.commands import ends, read_json
 from tests.commands import rows as table
 from tests.pages import recorded
@@ -47,7 +48,7 @@ def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
 
 def test_shares_of_a_batch_add_up_to_its_runs():
     told = []
-    share = scale.share_counter(told.append, 180)
+    share = share_counter(told.append, 180)
     for k in range(21):
         share(k / 20)
     share(1.0)
@@ -114,7 +115,7 @@ def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch)
 
 def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --voltages 24 --configurations 6T2A --no-report"
-    simulated, honest = [], scale.Compiled.__call__
+    simulated, honest = [], Compiled.__call__
 
     def interrupted(compiled, values, *told):
         if len(simulated) == 3:
@@ -124,13 +125,13 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
         simulated.append(len(values))
         return honest(compiled, values, *told)
 
-    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
+    monkeypatch.setattr(Compiled, "__call__", interrupted)
     ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resumes the sweep after its last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
     kept = len(list((tmp_path / "s.partial/chunks").glob("*.stage")))
     assert 0 < kept <= 3
     simulated.clear()
-    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
+    monkeypatch.setattr(Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
     assert mmrjax(f"{arguments} --chunk 10 --out s")[0] == 0
     assert simulated == [fidelities.FEW] * (6 - kept)  # filled up, and none twice
     resumed = (tmp_path / "s/runs.csv").read_text()
@@ -141,7 +142,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
 
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = "sweep --slopes 0:9:1 --chunk 60 --no-report --out"
-    honest, calls = scale.Compiled.__call__, []
+    honest, calls = Compiled.__call__, []
     kept = tmp_path / "s.partial/chunks/chunk-000000.stage"
 
     def interrupted(*call):
@@ -152,9 +153,9 @@ def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeyp
         calls.append(call)
         return honest(*call)
 
-    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
+    monkeypatch.setattr(Compiled, "__call__", interrupted)
     assert mmrjax(arguments, "s")[0] == 130 and kept.exists()
-    monkeypatch.setattr(scale.Compiled, "__call__", honest)
+    monkeypatch.setattr(Compiled, "__call__", honest)
     ends(mmrjax(arguments, "s", "--set", "motor.resistance=0.9"), "--force")
     assert kept.exists()
     mmrjax(arguments, "s", "--set", "motor.resistance=0.9", "--force")
@@ -190,7 +191,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     monkeypatch.setenv("XLA_FLAGS", given or "")  # so that it is put back
     if given is None:
         monkeypatch.delenv("XLA_FLAGS")
-    resolved = config.resolve_configuration(config.Sweep, None, {"model": model})
+    resolved = resolve_configuration(Sweep, None, {"model": model})
     cli._prepare_environment(resolved)
     ours = "--xla_cpu_multi_thread_eigen=false" if model == "track" else None
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
@@ -198,7 +199,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "flags"),
+    "arguments, flags",
     [
         ("sweep --config grid.toml", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
         ("compare --model track", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
@@ -276,28 +277,28 @@ def test_axis_takes_values_and_ranges():
 
 
 def test_configuration_has_what_applies_to_its_command_alone():
-    told = {kind: set(kind.model_fields) for kind in (config.Loop, config.Calibrate, config.Compare, config.Sweep)}
-    assert not told[config.Loop] & {"duration_s", "step_s", "battery", "chunk", "voltages_V"}
-    assert "model" in told[config.Calibrate] and not told[config.Calibrate] & {"duration_s", "battery", "chunk"}
-    assert not told[config.Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
-    assert "duration_s" not in config.as_toml(config.resolve_configuration(config.Loop, None, {"seed": 1}))
+    told = {kind: set(kind.model_fields) for kind in (Loop, Calibrate, Compare, Sweep)}
+    assert not told[Loop] & {"duration_s", "step_s", "battery", "chunk", "voltages_V"}
+    assert "model" in told[Calibrate] and not told[Calibrate] & {"duration_s", "battery", "chunk"}
+    assert not told[Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
+    assert "duration_s" not in as_toml(resolve_configuration(Loop, None, {"seed": 1}))
     with pytest.raises(BadConfiguration, match=r"^duration_s: no such key"):
-        config.resolve_configuration(config.Loop, None, {"duration_s": 1.0})
+        resolve_configuration(Loop, None, {"duration_s": 1.0})
 
 
 @pytest.mark.parametrize("model, expected", [("steady", {}), ("drive", {"duration_s": 30.0}),
                                              ("track", {"duration_s": 1.5, "step_s": 1e-4})])  # fmt: skip
 def test_resolved_configuration_states_the_options_of_its_fidelity(tmp_path, model, expected):
-    written = config.as_toml(config.resolve_configuration(config.Sweep, None, {"model": model}))
+    written = as_toml(resolve_configuration(Sweep, None, {"model": model}))
     stated = tomllib.loads(written)
     assert {key: stated[key] for key in ("duration_s", "step_s") if key in stated} == expected
     (tmp_path / "again.toml").write_text(written)
-    assert config.as_toml(config.resolve_configuration(config.Sweep, tmp_path / "again.toml", {})) == written
+    assert as_toml(resolve_configuration(Sweep, tmp_path / "again.toml", {})) == written
 
 
 def test_configurations_of_former_versions_are_read(tmp_path):
     (tmp_path / "old.toml").write_text('model = "steady"\nstep_s = 0.0001\nrobot = "sm1"\n')
-    assert config.resolve_configuration(config.Sweep, tmp_path / "old.toml", {}).robot == "sm1"
+    assert resolve_configuration(Sweep, tmp_path / "old.toml", {}).robot == "sm1"
 
 
 # --- what ends a command from outside -------------------------------------------------------------------------------
@@ -310,7 +311,7 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
     def short(*_, **__):
         raise ended
 
-    monkeypatch.setattr(scale.Compiled, "__call__", short)
+    monkeypatch.setattr(Compiled, "__call__", short)
     code, _, err = mmrjax(command, "--no-report", "--out", "x")
     assert code == 2 and err.endswith(
         "mmrjax: out of memory; use fewer points at a time (--chunk), fewer rows, or more memory\n"
@@ -346,7 +347,7 @@ def test_an_effects_file_cannot_end_the_command_as_if_it_were_done(mmrjax, tmp_p
     def later(*_, **__):
         raise SystemExit(0)
 
-    monkeypatch.setattr(scale.Compiled, "__call__", later)
+    monkeypatch.setattr(Compiled, "__call__", later)
     ends(mmrjax("simulate --no-report --out x"), "the code in an effects file ended the program")
     assert [p.name for p in tmp_path.iterdir()] == ["own.py"]
 
@@ -355,7 +356,7 @@ def test_a_file_that_ends_too_early_is_no_interrupt(mmrjax, monkeypatch):
     def short(*_, **__):
         raise EOFError("No data left in file")
 
-    monkeypatch.setattr(scale.Compiled, "__call__", short)
+    monkeypatch.setattr(Compiled, "__call__", short)
     _, _, err = ends(mmrjax("simulate --no-report --out x"), "internal error: No data left in file", code=1)
     assert "interrupted" not in err
 

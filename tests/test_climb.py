@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mmrjax.climbing import climb_simulation as climb
-from mmrjax.climbing import footing, resting_posture, static_limits, terrain
+from mmrjax.climbing import resting_posture, terrain
 from mmrjax.climbing.climb_simulation import (
     LOSSES,
     SOURCES,
@@ -21,6 +21,8 @@ from mmrjax.climbing.climb_simulation import (
     climb_batch,
     constant_angles,
 )
+from mmrjax.climbing.footing import contacts_with_terrain
+from mmrjax.climbing.static_limits import find_highest_step, flush_lever_angle
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -92,7 +94,7 @@ def test_a_margin_is_of_contacts_that_carry_the_robot():
     assert_allclose(shown, [0.1, -0.1, jnp.nan, jnp.nan])
 
 
-@pytest.mark.parametrize(("duration", "step"), [(20.0, 1e-4), (2.5, 1e-4), (2.0, 3e-4), (0.3, 7e-4), (0.05, 1e-3)])
+@pytest.mark.parametrize("duration, step", [(20.0, 1e-4), (2.5, 1e-4), (2.0, 3e-4), (0.3, 7e-4), (0.05, 1e-3)])
 def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, duration, step):
     parts = []
 
@@ -312,7 +314,7 @@ def test_steps_across_a_corner_are_those_of_mujoco_until_contacts_first_differ()
     run, ours, theirs = beside_mujoco(0.0, ground, ((45.0, 45.0), (-8.4, -8.4)), 24.0, 0.01)
 
     def touching(q):
-        at = footing.contacts_with_terrain(run.shape, run.terrain, q, 0 * q)
+        at = contacts_with_terrain(run.shape, run.terrain, q, 0 * q)
         return at.force > 0, jnp.any((at.force > 0) & (at.place == 0.0))  # the corner is at 0
 
     touch = jax.jit(jax.vmap(touching))
@@ -362,9 +364,9 @@ def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
     v = jnp.array([0.3, -0.2, 0.7, 2.0, 0.4, -0.5])
 
     def gaps(t):
-        return footing.contacts_with_terrain(run.shape, run.terrain, q + t * v, v).gap
+        return contacts_with_terrain(run.shape, run.terrain, q + t * v, v).gap
 
-    rates = np.asarray(footing.contacts_with_terrain(run.shape, run.terrain, q, v).gap_rate)
+    rates = np.asarray(contacts_with_terrain(run.shape, run.terrain, q, v).gap_rate)
     numeric = np.asarray((gaps(1e-6) - gaps(-1e-6)) / 2e-6)
     near = np.abs(np.asarray(gaps(0.0))) < 0.5
     off = np.abs(rates - numeric)[near]
@@ -417,7 +419,7 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
     def driven(motion, first):
         def one(motion, k):
             after, _, passed = climb.advance_climb(run, motion, first + k * run.step, none)
-            at = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
+            at = contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
             load = jnp.stack([jnp.sum(at.guided * at.force), jnp.sum(at.force)])
             return after, (motion.q[3], passed.current, motion.v[0], load)
 
@@ -447,7 +449,7 @@ def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometr
         assert float(belt.length) == pytest.approx(teeth * PITCH_TOOTH, abs=1e-3)
         pairs[name] = count * belt.grousers, count * 2 * teeth
     assert sum(pairs["main"]) == 720 and sum(pairs["main"]) + sum(pairs["lever"]) == 1680
-    at = footing.contacts_with_terrain(run.shape, run.terrain, climb.stand_before_obstacle(run).q, jnp.zeros(6))
+    at = contacts_with_terrain(run.shape, run.terrain, climb.stand_before_obstacle(run).q, jnp.zeros(6))
     # grousers of one side, then what corners of a terrain and wheels meet
     tips = (pairs["main"][0] + pairs["lever"][0]) // 2
     near = np.abs(np.asarray(at.gap)) < 1.0
@@ -457,7 +459,7 @@ def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometr
 @jax.jit
 def lowest(run, q):
     """Least gap of all contacts [m]."""
-    return jnp.min(footing.contacts_with_terrain(run.shape, run.terrain, q, 0 * q).gap)
+    return jnp.min(contacts_with_terrain(run.shape, run.terrain, q, 0 * q).gap)
 
 
 def leant(run, pitch):
@@ -497,15 +499,15 @@ def nose_up():
 def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     """Slow, on a ground that holds. A robot that leans on a step with its rear levers flush gets over where the centre
     of mass comes over the edge: under the tips of grousers at the least, between two of them at the most."""
-    flush = float(np.degrees(static_limits.flush_lever_angle(ROBOT)))
+    flush = float(np.degrees(flush_lever_angle(ROBOT)))
     runs, starts = [], []
     for payload in (0.0, 8.0):
         of = HOLDS | {"payload": payload}
         side = resting_posture.side_outline(
             ROBOT, Conditions(0, payload=payload, levers_front_deg=180.0, levers_rear_deg=flush).resolved(ROBOT)
         )
-        low = static_limits.find_highest_step(side)
-        high = static_limits.find_highest_step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
+        low = find_highest_step(side)
+        high = find_highest_step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
         assert 1e3 * float(low.height) == pytest.approx({0.0: 232, 8.0: 203}[payload], abs=1)
         for height in (float(low.height) - 0.004, float(high.height) + 0.006):
             ground = terrain.single_step(height, size=POINTS)

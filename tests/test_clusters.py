@@ -5,7 +5,7 @@ import pytest
 
 from calibration.discovery import outliers
 from calibration.discovery.outliers import find_cluster
-from calibration.words import loop_words as words
+from calibration.words.loop_words import cluster_sentence
 
 ERROR = 0.01
 RNG = np.random.default_rng(0)
@@ -65,7 +65,7 @@ def test_outliers_on_a_stretch_are_found_there(case):
     assert got.low <= x.min() and got.high >= x.max() and got.inside >= len(inside)
     assert got.high - got.low <= max(outliers.WINDOWS) * np.ptp(AXES[axis])
     assert got.of == len(np.union1d(inside, alone))
-    assert words.cluster_sentence(got).startswith(
+    assert cluster_sentence(got).startswith(
         f"{got.inside} of {got.of} outlying rows cluster at {axis} {got.low:.3g} to"
     )
 
@@ -76,7 +76,7 @@ def test_outliers_of_one_level_are_found_there():
     # 10 of 10 from a quarter of the rows, at one of four levels, in one of five columns
     expected = np.prod([(60 - k) / (ROWS - k) for k in range(10)]) * 4 * (len(AXES) + len(LEVELS))
     assert got.p == pytest.approx(expected, rel=1e-9)
-    assert "cluster at supply_voltage_V 24.0" in words.cluster_sentence(got)
+    assert "cluster at supply_voltage_V 24.0" in cluster_sentence(got)
 
 
 def test_the_least_probable_cluster_is_told():

@@ -17,8 +17,8 @@ from calibration.discovery import candidates, loop_input, scales
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
-from mmrjax import effects
 from mmrjax.compile.compiling import compiled, for_equations
+from mmrjax.effects import BY_NAME
 from mmrjax.effects.base import scaled_effect
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
@@ -32,7 +32,7 @@ def space_of(world, folder):
     robot = robot_file.read_robot(folder / "rig.toml")
     runs = records.read_runs(folder / "table.csv", robot=robot)
     observer = observers.observer_kind(runs)
-    library = scales.scale_library(robot, runs.conditions(robot), effects.BY_NAME)
+    library = scales.scale_library(robot, runs.conditions(robot), BY_NAME)
     sd = noise.noise_from_table(runs, observer.sizes(runs)).sd
     return loop_input.build_candidate_space(runs, robot, sd, settings_for(observer), library=library)
 
@@ -81,7 +81,7 @@ def test_what_equations_read_keeps_programs_apart():
 
 
 def test_an_effect_of_another_size_is_the_same_to_equations():
-    kind = effects.BY_NAME["churning"]
+    kind = BY_NAME["churning"]
     wide = scaled_effect(kind, (3.0, 1.0, 3.0))
     one = wide(amplitude=jnp.asarray(2e-4))
     assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))

@@ -12,8 +12,16 @@ from numpy.testing import assert_allclose
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
-from mmrjax.undercarriage import contact_sums, half_robot, mjcf, side_contacts
-from mmrjax.undercarriage.half_robot import HalfRobotState, advance, build_system, generalized_forces, instant
+from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
+from mmrjax.undercarriage.half_robot import (
+    HalfRobotState,
+    _implicit_step,
+    advance,
+    axle_height,
+    build_system,
+    generalized_forces,
+    instant,
+)
 from mmrjax.undercarriage.mjcf import mjx
 from mmrjax.undercarriage.running_gear import BeltPath
 
@@ -49,7 +57,7 @@ def motion_of(robot, run, k):
     """In mid-run, no two parts alike. Which of the contacts slip beyond V_s differs with `k`."""
     draw = np.random.default_rng(k)
     setup = build_system(robot, run, STEP)
-    low = float(half_robot.axle_height(setup))
+    low = float(axle_height(setup))
     q = jnp.asarray([0.1, low - 2e-4, 1e-3 * draw.normal(), 0.3 + draw.random(), 0.0])
     q = q.at[4].set(q[3] - 1e-4)
     turning = [0.7, 25.0, 30.0][k % 3]
@@ -130,7 +138,7 @@ def _stepped(robot, run, motion, step, forward):
 
 
 def _as_computed(run, motion):
-    step = half_robot._implicit_step(run, motion)
+    step = _implicit_step(run, motion)
     return step.after, step.signals, step.guided
 
 

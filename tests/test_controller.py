@@ -9,13 +9,14 @@ from numpy.testing import assert_allclose
 from worlds import servo
 
 import mmrjax as mm
-from calibration.data import robot_file
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.robot_file import read_robot, write_robot
+from calibration.data.runs import read_runs
 from calibration.inference import foresight
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.time_histories import Histories
-from mmrjax.fidelities import drive, histories
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.model import params
 from tests.commands import read_rig
 
@@ -33,12 +34,12 @@ def actuator(tmp_path):
 
 
 #: Angle over time. One program serves all robots and goals of the same kinds and numbers of rows.
-ANGLE = jax.jit(lambda robot, conditions, grid: histories.history_signals(robot, conditions, grid).angle)
+ANGLE = jax.jit(lambda robot, conditions, grid: history_signals(robot, conditions, grid).angle)
 
 
 def angles(robot, goal, times, parts=1):
     """Simulated angles of the output [rad] for a goal held from each of its instants."""
-    grid = histories.time_grid(times, goal[0], parts=parts)
+    grid = time_grid(times, goal[0], parts=parts)
     held = goal[1][np.searchsorted(goal[0], grid + 1e-9, side="right") - 1]
     conditions = mm.Conditions(voltage=servo.TRUE["supply"], goal=0.0)
     conditions = eqx.tree_at(lambda c: c.goal, conditions, jnp.asarray(held))
@@ -67,7 +68,7 @@ SLOWER = {**servo.TRUE, "kp": 2.0, "ki": 3.0}
 
 def test_a_sampled_controller_follows_as_an_own_simulation(actuator):
     times = np.linspace(0.0, 0.4, 17)  # between samples too
-    rows = np.searchsorted(histories.time_grid(times, WAVES[0], parts=12), times)
+    rows = np.searchsorted(time_grid(times, WAVES[0], parts=12), times)
     prompt, late = (
         np.asarray(angles(actuator(SLOWER, "kp = ", text), WAVES, times, parts=12)[0])[rows] for text in SAMPLED
     )
@@ -84,7 +85,7 @@ def test_runs_of_drive_and_steps_follow_a_sampled_controller(actuator):
     own = servo.simulate((np.zeros(1), np.full(1, 0.5)), times, values, period=PERIOD, late=True)[0]
     conditions = mm.Conditions(voltage=7.4, goal=0.5)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], conditions)
-    assert_allclose(drive.drive_batch(robot, batch, jnp.asarray(times), 1e-9).signals.angle[0], own, atol=1e-6)
+    assert_allclose(drive_batch(robot, batch, jnp.asarray(times), 1e-9).signals.angle[0], own, atol=1e-6)
     state = mm.initial_state(robot, conditions)
     step = jax.jit(lambda s: mm.step(robot, s, {"goal": 0.5}, 0.005, conditions))
     for _ in range(80):
@@ -100,7 +101,7 @@ def test_a_run_of_drive_follows_as_an_own_simulation(actuator):
     times = np.linspace(0.0, 0.5, 11)
     own, states = servo.simulate((np.zeros(1), np.ones(1)), times, SMOOTH)
     one = jax.tree.map(lambda x: jnp.asarray(x)[None], mm.Conditions(voltage=7.4, goal=1.0))
-    run = drive.drive_batch(actuator(SMOOTH), one, jnp.asarray(times), 1e-9, 20_000)
+    run = drive_batch(actuator(SMOOTH), one, jnp.asarray(times), 1e-9, 20_000)
     assert_allclose(run.signals.angle[0], own, atol=1e-6)
     assert 50 * np.abs(states[:, 3]).max() > 0.1, "the integral acts"
 
@@ -128,14 +129,14 @@ def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, rate):
         assert_allclose(slope, differences, atol=1e-6 * np.abs(differences).max())
 
 
-@pytest.mark.parametrize(("goal", "value", "gains", "signal"), [
+@pytest.mark.parametrize("goal, value, gains, signal", [
     ("goal_speed", 3.0, {"kp": 0.5, "ki": 5.0, "kd": 0.0}, "speed_output"),
     ("goal_current", 0.4, {"kp": 1.0, "ki": 5e3, "kd": 0.0}, "current"),
 ])  # fmt: skip
 def test_an_integral_brings_speed_and_current_to_their_goals(actuator, goal, value, gains, signal):
     robot = actuator({**servo.TRUE, **gains}, "goal_angle", goal)
     one = jax.tree.map(lambda x: jnp.asarray(x)[None], mm.Conditions(voltage=24.0, goal=value))
-    run = drive.drive_batch(robot, one, jnp.asarray([0.0, 0.1, 1.0]))
+    run = drive_batch(robot, one, jnp.asarray([0.0, 0.1, 1.0]))
     row = 1 if signal == "current" else 2  # a shaft without a load soon turns too fast for its current
     assert_allclose(getattr(run.signals, signal)[0, row], value, rtol=5e-3)
 
@@ -154,7 +155,7 @@ def test_a_motor_that_is_off_coasts(actuator):
     log = {"time_s": np.arange(4) * 0.1, "goal_angle_deg": [0.0, 30, 30, 30], "output_angle_deg": [0.0, 0, 5, 20],
            "mode": ["voltage", "voltage", "coast", "voltage"]}  # fmt: skip
     robot = actuator()
-    held = records.read_runs(log, robot).conditions(robot)
+    held = read_runs(log, robot).conditions(robot)
     assert_allclose(held.goal, np.radians(log["goal_angle_deg"]))
     assert_allclose(held.open, [0, 0, 1, 0])
     assert_allclose(held.voltage, 7.4)
@@ -164,7 +165,7 @@ def test_a_current_limit_holds_the_motor_of_a_controller_and_coasting_releases_i
     """A start at the limited torque, and one without any."""
     robot = actuator(old="[motor]", new="[driver]\ncurrent_limit = 0.3\n[motor]")
     each = mm.Conditions(voltage=7.4, goal=np.ones(2), open=np.array([0.0, 1.0]))
-    run = drive.drive_batch(robot, each, jnp.asarray([0.0, 0.01, 0.02]))
+    run = drive_batch(robot, each, jnp.asarray([0.0, 0.01, 0.02]))
     v, currents = servo.TRUE, np.asarray(run.signals.current)
     assert_allclose(currents[0, 1:], 0.3, rtol=5e-3)  # the limit is a steep slope of the voltage
     rate = (v["ratio"] * v["constant"] * 0.3 - v["coulomb"]) / (v["load"] + v["ratio"] ** 2 * v["rotor"])
@@ -176,16 +177,16 @@ def test_a_table_states_the_supply_where_the_file_does_not(actuator):
     robot = actuator(old="supply_voltage = 7.4\n")
     log = {"time_s": [0.0, 0.1], "goal_angle_rad": [0.0, 1.0], "output_angle_deg": [0.0, 1.0]}
     with pytest.raises(BadData, match="supply_voltage_V is missing"):
-        records.read_runs(log, robot)
-    held = records.read_runs({**log, "supply_voltage_V": [7.0, 6.5]}, robot).conditions(robot)
+        read_runs(log, robot)
+    held = read_runs({**log, "supply_voltage_V": [7.0, 6.5]}, robot).conditions(robot)
     assert_allclose(held.voltage, [7.0, 6.5])
     assert_allclose(held.goal, [0.0, 1.0])
 
 
 def test_a_robot_file_keeps_its_controller(actuator, tmp_path):
     robot = actuator(old="kp = 8.0", new='kp = "8.0 ± 10 %"')
-    robot_file.write_robot(robot, tmp_path / "again.toml")
-    again = robot_file.read_robot(tmp_path / "again.toml")
+    write_robot(robot, tmp_path / "again.toml")
+    again = read_robot(tmp_path / "again.toml")
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), again.controller, robot.controller))
     assert again.rig.priors == robot.rig.priors == (("controller.kp", 8.0, pytest.approx(0.8)),)
 
@@ -250,7 +251,7 @@ def test_the_missing_column_that_separates_a_gain_is_named_and_does(tmp_path):
 
     def foreseen(channels):
         robot = read_rig(tmp_path, text.replace('["output_angle"]', channels))
-        return foresight.predict_identifiability(records.read_runs(log, robot), robot)
+        return foresight.predict_identifiability(read_runs(log, robot), robot)
 
     alone = foreseen('["output_angle"]')
     by_pair = {frozenset(each[:2]): names for each, names in zip(alone.alike, alone.separating, strict=True)}
@@ -280,10 +281,10 @@ def test_a_log_at_the_rate_of_its_controller_gives_the_gain(tmp_path, late):
     goal = np.where(t < 3, 0.8 * (-1.0) ** (t // 0.75), np.sin(5 * t) * np.minimum(t - 3, 1))
     log = servo_log(goal, every=PERIOD, values=slower, period=PERIOD, late=late)[0]
     robot = read_rig(tmp_path, text)
-    found = calibrate(records.read_runs(log, robot), robot, starts=2, profiles=False, blocks=False)
+    found = calibrate(read_runs(log, robot), robot, starts=2, profiles=False, blocks=False)
     kp = found.parameters["controller.kp"]
     assert abs(kp.value - slower["kp"]) < 2 * kp.sd < 0.2
-    shown = np.asarray(Histories.of(records.read_runs(log, robot), found.robot)(found.robot).reading)[:, 0]
+    shown = np.asarray(Histories.of(read_runs(log, robot), found.robot)(found.robot).reading)[:, 0]
     error = np.sqrt(np.mean((shown - np.radians(log["output_angle_deg"])) ** 2))
     assert error < 1.2 * 2 * np.pi / 4096 * np.sqrt(0.5**2 + 1 / 12)
 
@@ -299,7 +300,7 @@ def test_goal_and_angle_alone_give_a_servos_parameters(tmp_path):
     swings = np.where(t < 3, 0.6 * np.sin(3 * np.pi * (t - 1.6)), np.where(t < 3.8, np.sin(6 * np.pi * t), -0.9))
     goal = np.where(t < 0.2, 0.0, np.where(t < 0.9, 0.8, np.where(t < 1.6, -0.5, swings)))
     fitted = servo_log(goal)[0]
-    found = calibrate(records.read_runs(fitted, robot), robot, starts=2, profiles=False, blocks=False)
+    found = calibrate(read_runs(fitted, robot), robot, starts=2, profiles=False, blocks=False)
     names = ("controller.kp", "controller.kd", "motor.torque_constant", "horn.inertia", "horn.loss_coulomb")
     truth = (8.0, 0.1, 0.006, 5e-4, 0.02)
     for name, true in zip(names, truth, strict=True):
@@ -307,7 +308,7 @@ def test_goal_and_angle_alone_give_a_servos_parameters(tmp_path):
         assert abs(estimate.value - true) < 3 * estimate.sd, name
         assert abs(estimate.value / true - 1) < 0.1, name
     unseen = servo_log(-0.7 * goal[::-1] + 0.7 * goal[-1], seed=2)[0]
-    runs = records.read_runs(unseen, found.robot)
+    runs = read_runs(unseen, found.robot)
     shown = np.asarray(Histories.of(runs, found.robot)(found.robot).reading)[:, 0]
     error = np.sqrt(np.mean((shown - np.radians(unseen["output_angle_deg"])) ** 2))
     floor = 2 * np.pi / 4096 * np.sqrt(0.5**2 + 1 / 12)

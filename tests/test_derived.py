@@ -95,7 +95,7 @@ def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_h
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("static", "voltage"), [(0.32, 24.0), (2.5, 2.0)])
+@pytest.mark.parametrize("static, voltage", [(0.32, 24.0), (2.5, 2.0)])
 def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltage):
     """As users' programs are compiled, and as those that run a few times are."""
     tuned = changed(robot, **{"6T2A__ground__friction__static": static})

@@ -22,7 +22,7 @@ def posterior(correlation, kinds, spread=(1.0, 1.0), value=(3.0, 5.0)):
 
 
 @pytest.mark.parametrize(
-    ("correlation", "kinds", "spread", "form", "weight"),
+    "correlation, kinds, spread, form, weight",
     [
         (0.99, (LOG, LOG), (0.1, 0.1), "ratio", -3 / 5),
         (-0.99, (LOG, LOG), (0.1, 0.11), "product", 3 / 5 / 1.1),

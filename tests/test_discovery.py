@@ -16,7 +16,7 @@ from worlds import settled, tables
 from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import scales
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
-from calibration.inference import bases
+from calibration.inference.bases import Basis
 from calibration.inference.held_out import hold_out_blocks
 from calibration.inference.linearization import PROBED, amplitude_of, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import SettledRuns
@@ -213,8 +213,8 @@ def toy():
     signatures[:, 3] = 2 * signatures[:, 0] + 1e-3 * signatures[:, 3]  # look-alikes
     defects = rng.standard_normal((len(PROBED), rows, 3))
     columns = rng.standard_normal((2, rows, 3))
-    basis = bases.Basis.of(columns, (("electrical", "a"), ("track", "b")))
-    shown = bases.Basis.of(columns, (("speed", "a"), ("total_current", "b")))
+    basis = Basis.of(columns, (("electrical", "a"), ("track", "b")))
+    shown = Basis.of(columns, (("speed", "a"), ("total_current", "b")))
     scale = rng.uniform(0.5, 2.0, (rows, 3))
     linear = SettledLinearization(
         *map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None, channels=channels.USUAL

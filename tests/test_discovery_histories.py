@@ -20,7 +20,8 @@ from calibration.discovery.discrepancy import fit_discrepancy, locate_discrepanc
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.standing import judge_names
-from calibration.inference import bases, noise
+from calibration.inference import noise
+from calibration.inference.bases import BALANCES, Basis
 from calibration.inference.linearization import PROBED, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
@@ -199,7 +200,7 @@ def test_signatures_are_differences_of_runs(seen):
 
 
 @pytest.mark.parametrize(
-    "balance", [b if b == "track" else pytest.param(b, marks=pytest.mark.slow) for b in bases.BALANCES]
+    "balance", [b if b == "track" else pytest.param(b, marks=pytest.mark.slow) for b in BALANCES]
 )
 def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
     """A defect over time, laid through the samples, against the curve effect that is the same over time."""
@@ -226,7 +227,7 @@ def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
 def test_bootstrap_leaves_what_noise_leaves(seen):
     """χ² of tables drawn from the fit and fitted again linearly."""
     share = np.asarray(seen.linear.time) / 0.8
-    over_time = bases.Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
+    over_time = Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
     effects = seen.space.library.scored
     null = bootstrap_statistics(seen.problem, np.asarray(seen.z), seen.linear, effects, (over_time,), 100, 0)
     readings = 3 * len(seen.runs)

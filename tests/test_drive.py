@@ -14,7 +14,8 @@ from mmrjax.effects.voltage_effects import ThermalDrift
 from mmrjax.fidelities.base import movers_slip
 from mmrjax.fidelities.drive import _status_of_run, drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.model import balances, params
+from mmrjax.model import params
+from mmrjax.model.balances import moving_signals
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, STATUSES, State
 
@@ -43,7 +44,7 @@ def test_rates_match_reference_at_random_states(robot, grid):
         configuration=rows[:, 0],
         battery=on_battery,
     )
-    moving = jax.jit(jax.vmap(balances.moving_signals, in_axes=(None, 0, 0)))
+    moving = jax.jit(jax.vmap(moving_signals, in_axes=(None, 0, 0)))
     s = moving(robot, runs, State(*jnp.asarray(states.T), distance=jnp.zeros(n)))
     inductance, ratio = 0.000119, 48.0
     for k in range(n):
@@ -69,7 +70,7 @@ def expected_runs(grid):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tolerance", "error"), [(1e-6, 2e-6), pytest.param(1e-9, 5e-9, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("tolerance, error", [(1e-6, 2e-6), pytest.param(1e-9, 5e-9, marks=pytest.mark.slow)])
 def test_drive_matches_solve_ivp(robot, grid, expected_runs, tolerance, error):
     """To `error` of each state's largest value in the run, at every instant. SciPy's Radau at 1e-10."""
     w, s, p, v = grid[list(ROWS)].T
@@ -239,7 +240,7 @@ def small(robot):
 
 
 @pytest.mark.parametrize(
-    ("gain", "sliding", "status"),
+    "gain, sliding, status",
     [
         (0.0, 0.03, "converged"),
         (-0.1, 0.03, "slides"),
@@ -255,7 +256,7 @@ def small(robot):
 def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
     """One that slips beyond V_s on average and holds its speed has settled, with a flag that it slips."""
     run = Conditions()
-    end = balances.moving_signals(robot, run, State(1.0, 900.0, 0.7, 0.0))
+    end = moving_signals(robot, run, State(1.0, 900.0, 0.7, 0.0))
     end = dataclasses.replace(end, speed_sliding=jnp.asarray(sliding), acceleration=jnp.asarray(gain))
     assert STATUSES[int(_status_of_run(robot, run, end, jnp.asarray(False), jnp.asarray(True)))] == status
     assert bool(movers_slip(robot, end)) is (sliding > 0.02)

@@ -8,9 +8,11 @@ from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import balances, energy, paper_robots, params
+from mmrjax.model import paper_robots, params
+from mmrjax.model.balances import begin_signals, driven_signals, moving_signals, supply
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.driver import FAST, SLOW, STEEPNESS, Driver
+from mmrjax.model.energy import sink_powers, source_power
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import State
@@ -19,7 +21,7 @@ LIMITED = Driver(current_limit=5.0)
 
 
 @pytest.mark.parametrize(
-    ("duty", "current", "limited"),
+    "duty, current, limited",
     [
         (0.6, 4.9, 0.6),
         (0.6, -4.9, 0.6),
@@ -41,9 +43,7 @@ def test_limit_and_diode_act_alike_on_a_supply_of_either_sign(robot, volts):
     limited = dataclasses.replace(robot, driver=bridge)
     state = State(np.sign(volts) * 1.001, 0.0, 0.0, 0.0)
     signals = [
-        balances.moving_signals(
-            limited, Conditions(voltage=volts), dataclasses.replace(state, current=way * state.current)
-        )
+        moving_signals(limited, Conditions(voltage=volts), dataclasses.replace(state, current=way * state.current))
         for way in (1, -1)
     ]
     assert float(signals[0].voltage) == pytest.approx(0.5 * volts)
@@ -87,9 +87,9 @@ def test_supply_gives_the_duty_of_its_voltage_and_of_the_current(robot):
     sagging = params.replace(BY_NAME["supply_sag"](), {"amplitude": 0.5})
     robot = dataclasses.replace(robot, effects=(sagging,))
     run = Conditions(voltage=24.0, duty=0.25)
-    signals = balances.begin_signals(robot, run, State(3.0, 500.0, 0.4, 0.0))
+    signals = begin_signals(robot, run, State(3.0, 500.0, 0.4, 0.0))
     assert float(signals.total_current) == pytest.approx(2 * 3.0 * 0.25)
-    assert float(balances.supply(robot, run, signals).voltage) == pytest.approx(0.25 * (24.0 - 0.5 * 1.5))
+    assert float(supply(robot, run, signals).voltage) == pytest.approx(0.25 * (24.0 - 0.5 * 1.5))
 
 
 def bench(decay, **load):
@@ -142,17 +142,17 @@ def test_power_of_the_supply_is_what_goes_into_heat_and_motion(decay, duty):
         current = 0.0 if decay == FAST and duty == 0 else state.current
         state = dataclasses.replace(state, current=current)
         run = Conditions(voltage=8.0, duty=duty)
-        signals = balances.moving_signals(robot, run, state)
-        goes = sum(float(x) for x in energy.sink_powers(robot, run, signals).values())
+        signals = moving_signals(robot, run, state)
+        goes = sum(float(x) for x in sink_powers(robot, run, signals).values())
         stored = float(signals.voltage_left * signals.current)  # in the inductance
         inertia = robot.motor.inertia + 1e-3
         stored += float(inertia * signals.acceleration_wheel * signals.speed_wheel)
-        assert float(energy.source_power(robot, run, signals)) == pytest.approx(goes + stored, abs=1e-9)
+        assert float(source_power(robot, run, signals)) == pytest.approx(goes + stored, abs=1e-9)
 
 
-@pytest.mark.parametrize(("opened", "current"), [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
+@pytest.mark.parametrize("opened, current", [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
 def test_fast_decay_coasts_without_pulses_and_brakes_where_it_is_told_to(opened, current):
     run = Conditions(voltage=8.0, duty=0.0, open=opened)
     robot = bench(FAST)
-    signals = balances.driven_signals(robot, run, State(current, 40.0, 40.0, 0.0), None)
+    signals = driven_signals(robot, run, State(current, 40.0, 40.0, 0.0), None)
     assert float(signals.voltage_left) == pytest.approx(0.0, abs=1e-12)

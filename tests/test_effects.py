@@ -28,8 +28,10 @@ from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.base import Periodic, scaled_effect
 from mmrjax.fidelities.drive import drive, drive_rates, drive_start, state_of_unknowns
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model import channels, params
+from mmrjax.model.balances import BALANCES, effects_sum, moving_signals, sensor
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import blank_robot, nominal
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.rig import Instrument, RunStart, RunStarts
 from mmrjax.model.robot import Configurations
@@ -96,12 +98,12 @@ def factor(unit, change):
 
 
 def balance_unit(effect):
-    return SENSOR_UNITS[effect.channel] if effect.balance == "sensor" else balances.BALANCES[effect.balance][0]
+    return SENSOR_UNITS[effect.channel] if effect.balance == "sensor" else BALANCES[effect.balance][0]
 
 
 # --- what the laws are tried on -----------------------------------------------------------------------
 
-NOMINAL = paper_robots.nominal()
+NOMINAL = nominal()
 AMPLITUDES = (0.37, 1.9)  # of the prior's standard deviation
 #: Speed or current that a balance's term multiplies to a power.
 CONJUGATE = {
@@ -133,7 +135,7 @@ def random_states(n=400):
     motor[:40] *= 1e-4  # through rest
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
-    moving = jax.jit(jax.vmap(balances.moving_signals, in_axes=(None, 0, 0)))
+    moving = jax.jit(jax.vmap(moving_signals, in_axes=(None, 0, 0)))
     straight = moving(
         NOMINAL,
         run,
@@ -171,13 +173,13 @@ def with_effects(*present, robot=None):
 def terms(effect, robot=None, signals=STATES):
     """What it adds to its balance in each of the states."""
     robot = with_effects(effect, robot=robot)
-    added = jax.vmap(lambda s: balances.effects_sum(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
+    added = jax.vmap(lambda s: effects_sum(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
     return np.asarray(added(signals))
 
 
 def readings(robot, signals):
     """What the instruments show, channels last, in their order."""
-    shown = balances.sensor(robot, signals)
+    shown = sensor(robot, signals)
     return jnp.stack([shown[name] for name in channels.USUAL], -1)
 
 
@@ -230,7 +232,7 @@ def law_declared(effect):
     assert effect.name.isidentifier() and effect.name == effect.name.lower()
     assert effect.movers in ("", "tracks", "wheels")
     assert not effect.settles_to or (effect.settles_to in BY_NAME and effect.settles_to != effect.name)
-    assert effect.balance in balances.BALANCES
+    assert effect.balance in BALANCES
     assert bool(effect.channel) == (effect.balance == "sensor")
     assert not effect.channel or effect.channel in channels.channel_names(channels.EVERY)
     declared = {p.name: p for p in params.walk_parameters(effect())}
@@ -383,7 +385,7 @@ def law_readable(effect):
         if effect.memory_size is not None and instant != "settled":
             signals = dataclasses.replace(signals, memory={effect.name: jnp.asarray(0.3 * effect.memory_size)})
         term, slopes = eqx.filter_value_and_grad(
-            lambda both, effect=effect: jnp.sum(balances.effects_sum(*both, effect.balance, effect.channel))
+            lambda both, effect=effect: jnp.sum(effects_sum(*both, effect.balance, effect.channel))
         )((robot, signals))
         assert np.isfinite(term), f"no number: {instant}"
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes)), f"no derivative: {instant}"
@@ -474,15 +476,15 @@ def metered(signed, gain=0.05, offset=0.18):
     return dataclasses.replace(with_effects(*(effects.OF_CHANNELS[n](amplitude=a) for n, a in off.items())), rig=rig)
 
 
-@pytest.mark.parametrize(("signed", "expected"), [(True, WITH_A_SIGN), (False, MAGNITUDE)])
+@pytest.mark.parametrize("signed, expected", [(True, WITH_A_SIGN), (False, MAGNITUDE)])
 def test_an_instruments_errors_are_added_to_what_it_shows(signed, expected):
     """So that what an effect changes of a reading is its term, to which the loop's scores hold."""
     robot, without = metered(signed), metered(signed, 0.0, 0.0)
     for current, shown in zip((2.0, -2.0, 0.0), expected, strict=True):
         signals = jax.tree.map(lambda x: x[0], dataclasses.replace(STATES, current=jnp.full(400, current)))
-        read, ideal = (float(balances.sensor(r, signals)["motor_current"]) for r in (robot, without))
+        read, ideal = (float(sensor(r, signals)["motor_current"]) for r in (robot, without))
         assert read == pytest.approx(shown, rel=1e-12)
-        assert read - ideal == pytest.approx(float(balances.effects_sum(robot, signals, "sensor", "motor_current")))
+        assert read - ideal == pytest.approx(float(effects_sum(robot, signals, "sensor", "motor_current")))
 
 
 @pytest.mark.quick(1)
@@ -601,7 +603,7 @@ def test_units_of_signals_are_all_known():
 def test_units_of_parameters_and_balances_are_all_known(free):
     for p in free:
         dimensions(p.spec.unit)
-    for unit, _ in balances.BALANCES.values():
+    for unit, _ in BALANCES.values():
         dimensions(unit)
 
 
@@ -814,7 +816,7 @@ def test_presliding_is_dahls_friction_in_place_of_coulombs():
     assert (terms(settled, signals=dataclasses.replace(STATES, memory={})) == 0).all()
 
 
-@pytest.mark.parametrize(("bend", "way"), [(0.4, 1.0), (-0.9, 1.0), (0.7, -1.0)])
+@pytest.mark.parametrize("bend, way", [(0.4, 1.0), (-0.9, 1.0), (0.7, -1.0)])
 def test_load_lost_through_a_bristle_is_its_mean_and_its_difference(bend, way):
     """μ_avg |τ| z + μ_dif τ z² with μ_avg = a + b/2 and μ_dif = -b/2, whichever way the load acts."""
     average, difference = 0.12, -0.05
@@ -862,7 +864,7 @@ def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
 def test_friction_by_the_position_begins_where_a_history_does():
     names = ("position_friction", "angle_friction", "presliding")
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
-    robot = paper_robots.blank_robot(Configurations({"bench": load}))
+    robot = blank_robot(Configurations({"bench": load}))
     begins = RunStarts({"begin_a": RunStart(angle=1.5), "begin_b": RunStart(angle=-2.0)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
@@ -913,7 +915,7 @@ def test_settled_travel_cannot_tell_an_effect_from_the_one_it_settles_to():
 
 
 @pytest.mark.parametrize(
-    ("name", "configurations", "acts"),
+    "name, configurations, acts",
     [
         ("churning", (), (1, 1)),
         ("churning", ("4W2T",), (0, 1)),

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from test_events import NAMES, SAMPLES
 from worlds.events import Bench, through
 
-from calibration.data import runs as records
+from calibration.data.runs import read_runs
 from calibration.discovery import discover, loop_input
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import BY_NAME
@@ -148,7 +148,7 @@ loss_viscous = "0.02 ± 0.02"
 def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(log, joint):
     folder, bench = log
     robot = read_rig(folder, RIG + joint)
-    runs = records.read_runs(folder / "log.csv", robot=robot)
+    runs = read_runs(folder / "log.csv", robot=robot)
     fit = calibrate(runs, robot, model="drive", starts=1, blocks=False, profiles=False)
     friction = fit.parameters["bench.loss_coulomb"]
     if not joint:
@@ -166,7 +166,7 @@ def test_the_loop_names_no_effect_for_a_joint_that_twists(log):
     """The strongest effect of the library passes every threshold (117 of 3 σ) and explains a tenth of the misfit."""
     folder, _ = log
     robot = read_rig(folder, RIG)
-    runs = records.read_runs(folder / "log.csv", robot=robot)
+    runs = read_runs(folder / "log.csv", robot=robot)
     names = ("bristle_load_loss", "stick_slip", "directional_friction", "series_resistance")
     given = loop_input.prepare_loop(runs, robot, library={n: BY_NAME[n] for n in names})
     traced = discover.trace_verdict(dataclasses.replace(given, settings=dataclasses.replace(given.settings, slots=1)))

@@ -16,7 +16,7 @@ from mmrjax import effects
 from mmrjax.model import channels
 from mmrjax.model.signals import Signals
 from sweeps.commands import loop as page
-from sweeps.pages import loop_figures
+from sweeps.pages.loop_figures import _defect_variable, conditions_and_readings, draw_defects, driving_variable
 
 ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
 #: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.
@@ -105,7 +105,7 @@ def turns():
 
 
 @pytest.mark.parametrize(
-    ("change", "label"),
+    "change, label",
     [
         (lambda t: t["supply_voltage_V"] ** 2, "supply voltage [V]"),
         (lambda t: np.abs(t["motor_current_right_A"]), "motor current, right [A]"),
@@ -118,29 +118,29 @@ def test_what_was_found_is_drawn_over_what_it_depends_on(change, label):
     table = turns()
     y = change(table)
     y[3] = np.nan  # a row that does not count
-    x, said = loop_figures.driving_variable(table, y)
+    x, said = driving_variable(table, y)
     assert said == label and x.shape == y.shape
 
 
 def test_voltage_of_a_side_is_its_share_of_the_supply():
     table = turns()
     given = table["supply_voltage_V"] * table["duty_left"]
-    assert np.array_equal(loop_figures.conditions_and_readings(table)["voltage, left [V]"], given)
+    assert np.array_equal(conditions_and_readings(table)["voltage, left [V]"], given)
 
 
 def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
     duty = RANDOM.uniform(-1, 1, 8)
     table = {"configuration": np.full(8, "rig"), "supply_voltage_V": np.full(8, 48.0), "duty": duty}
     for x, label in (
-        loop_figures.driving_variable(table, duty**3),
-        loop_figures._defect_variable(table, "slope_deg", "slope [deg]"),
+        driving_variable(table, duty**3),
+        _defect_variable(table, "slope_deg", "slope [deg]"),
     ):
         assert np.array_equal(x, 48.0 * duty) and label == "voltage given to the motors [V]"
 
 
 def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
     table = turns()
-    fig = loop_figures.draw_defects(table, "none", crosses_zero=True)
+    fig = draw_defects(table, "none", crosses_zero=True)
     for axes, column in zip(
         fig.axes, ("motor_current_{}_A", "motor_speed_{}_rpm", "motor_speed_{}_rpm"), strict=True
     ):

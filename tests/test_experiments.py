@@ -13,13 +13,21 @@ from synthetic import SETTLED, table
 from test_worlds_tables import SHAPES
 from worlds import laws, settled, tables
 
-from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.robot_file import change_robot
 from calibration.described import describe
-from calibration.discovery import assembly, experiments, menu, predicted
+from calibration.discovery import assembly, experiments, menu
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
 from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.predicted import (
+    batch_experiments,
+    map_over_runs,
+    predict_readings,
+    reading_count,
+    reading_sds,
+    reading_spans,
+)
 from calibration.discovery.reach import reach_of_table
 from calibration.inference.fit_notes import Remark
 from mmrjax.effects import BY_NAME, OF_CHANNELS
@@ -27,7 +35,7 @@ from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
-from sweeps import stage_files
+from sweeps.stage_files import read_stage, write_stage
 from tests.commands import read_rig
 
 PAIRS = {
@@ -47,12 +55,12 @@ def conditions(made):
 CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
 REACH = reach_of_table(CLIMBING, conditions(settled.table8()), channels.USUAL)
 MENU = menu.experiment_menu(REACH)
-SPANS, BY = predicted.reading_spans(MENU), {e.name: e for e in MENU}
+SPANS, BY = reading_spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
 
 
 def foreseen(robot, batch):
-    return predicted.predict_readings(robot, batch, *predicted.map_over_runs(IMPLICIT.solve, robot, batch))[1]
+    return predict_readings(robot, batch, *map_over_runs(IMPLICIT.solve, robot, batch))[1]
 
 
 # --- what the menu foresees -------------------------------------------------------------------------
@@ -62,7 +70,7 @@ def foreseen(robot, batch):
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
     full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in laws.LIBRARY))
-    read, batch = eqx.filter_jit(foreseen), predicted.batch_experiments(MENU, channels.USUAL)
+    read, batch = eqx.filter_jit(foreseen), batch_experiments(MENU, channels.USUAL)
 
     def of(p, term=None):
         values = dict(p)
@@ -92,9 +100,7 @@ def test_menu_agrees_with_the_generators_own_physics(name, shown):
 
 def test_menu_and_generator_have_the_same_instruments():
     case = tables.Case({}, {}, None, settled.conditions(0, 1, 0, 0), settled.CLIMBING, (), settled.Instruments())
-    sd = predicted.reading_sds(
-        MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True))
-    )
+    sd = reading_sds(MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True)))
     for name, at in SPANS.items():
         assert_allclose(case.carry_out(BY[name], 0)["sd"], sd[at], err_msg=name)
 
@@ -175,7 +181,7 @@ FAR = [9.0 * k for k in range(1, 7)]
 
 
 @pytest.mark.parametrize(
-    ("sigma", "chosen", "settles", "expected"),
+    "sigma, chosen, settles, expected",
     [
         (
             {"weigh": [0, 6.0], "stall": [0, 40.0]},
@@ -361,7 +367,7 @@ def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
 
 @pytest.mark.slow
 def test_higher_voltage_needs_a_rating_and_is_watched(rover):
-    rated = robot_file.change_robot(rover, {"motor.voltage_limit": 18.0}, where="test")
+    rated = change_robot(rover, {"motor.voltage_limit": 18.0}, where="test")
     within = reach_of_table(rated, ROVERS_TABLE, channels.USUAL)
     run = next(r for r in runs_of(menu.experiment_menu(within)) if r.name == "other voltages, rover")
     assert max(run.voltage) == 18.0
@@ -370,7 +376,7 @@ def test_higher_voltage_needs_a_rating_and_is_watched(rover):
 
 
 @pytest.mark.parametrize(
-    ("imposed", "limits", "highest"),
+    "imposed, limits, highest",
     [
         ("voltage", {"voltage": 24.0}, 24.0),
         ("voltage", {"voltage": 28.6}, 28.0),
@@ -410,7 +416,7 @@ def test_the_zero_of_a_meter_is_read_at_rest_as_well_as_its_table_is(rover):
         if "zero reading" in e.kinds
     )
     assert np.asarray(zero.reading(robot, jnp.asarray(zero.at))) == pytest.approx([0.18])
-    assert predicted.reading_sds([zero], {"motor_current": 0.1}) == pytest.approx([0.1 / np.sqrt(zero.repeats)])
+    assert reading_sds([zero], {"motor_current": 0.1}) == pytest.approx([0.1 / np.sqrt(zero.repeats)])
 
 
 def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
@@ -422,7 +428,7 @@ def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
 
 @pytest.mark.slow
 def test_voltages_without_load_stay_below_the_permissible_speed():
-    slow = robot_file.change_robot(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
+    slow = change_robot(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
     within = reach_of_table(slow, conditions(settled.table8(voltages=(12.0,))), channels.USUAL)
     runs = {r.name: r for r in runs_of(menu.experiment_menu(within))}
     seen = within.motor_speed  # the table went there itself
@@ -452,7 +458,7 @@ def test_only_levels_that_the_robot_manages_are_left():
 @pytest.mark.slow
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    found = eqx.filter_jit(foreseen)(slippery, predicted.batch_experiments(MENU, channels.USUAL))
+    found = eqx.filter_jit(foreseen)(slippery, batch_experiments(MENU, channels.USUAL))
     first = 0
     for run in runs_of(MENU):
         rows = slice(first, first := first + len(run.voltage))
@@ -463,7 +469,7 @@ def test_steepest_slope_is_one_that_the_robot_climbs():
 
 
 @pytest.mark.parametrize(
-    ("name", "temperature", "speed", "watch"),
+    "name, temperature, speed, watch",
     [
         (
             "stall",
@@ -503,7 +509,7 @@ def test_every_kind_is_on_the_packaged_menu_and_no_other():
 def test_runs_against_a_brake_have_its_torque():
     within = dataclasses.replace(REACH, has_ground=False, measured=("motor_speed",), torques=(0.0, 0.1, 0.5))
     made = menu.experiment_menu(within)
-    batch = predicted.batch_experiments(made, within.measured)
+    batch = batch_experiments(made, within.measured)
     torque = np.asarray(batch.conditions.load_torque)
     assert torque.tolist() == [m for r in made if isinstance(r, menu.ProposedRuns) for m in r.torque]
     assert torque.max() == 0.5 and (torque * np.asarray(batch.conditions.voltage) >= 0).all()  # it brakes either way
@@ -512,7 +518,7 @@ def test_runs_against_a_brake_have_its_torque():
     kept = menu.restrict_run(run, menu.possible_runs(run, done), *plain(run)[1:], within)
     assert set(kept.torque) == set(run.torque) - {0.5} and len(kept.voltage) == len(kept.torque)
     assert (
-        predicted.batch_experiments(
+        batch_experiments(
             menu.experiment_menu(dataclasses.replace(within, torques=())), ("motor_speed",)
         ).conditions.load_torque
         is None
@@ -534,7 +540,7 @@ def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
     left = experiments.predict_menu(space, fitted, barred)
     assert not {"stall", "one motor", "4W2T"} & {k for e in left.experiments for k in e.kinds}
     assert {e.name for e in left.experiments} < {e.name for e in free.experiments}
-    assert left.value.shape[1] == sum(predicted.reading_count(e) for e in left.experiments) == len(left.sd)
+    assert left.value.shape[1] == sum(reading_count(e) for e in left.experiments) == len(left.sd)
     everything = dataclasses.replace(SETTINGS, forbidden=menu.KINDS)
     nothing = experiments.choose_experiment(experiments.predict_menu(space, fitted, everything))
     assert nothing.name == experiments.NONE and nothing.instruction == Remark("nothing_possible")
@@ -552,8 +558,8 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
 
 
 def test_every_experiment_is_kept_in_a_stage(tmp_path):
-    stage_files.write_stage(tmp_path / "menu", MENU)
-    assert stage_files.read_stage(tmp_path / "menu") == MENU
+    write_stage(tmp_path / "menu", MENU)
+    assert read_stage(tmp_path / "menu") == MENU
     assert {type(e) for e in MENU} == {menu.CalibrationAct, menu.ProposedRuns}
 
 

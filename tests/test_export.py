@@ -23,17 +23,38 @@ from numpy.testing import assert_allclose
 from worlds import servo
 
 import mmrjax as mm
-from calibration.data import posterior_file, robot_file
+from calibration.data import posterior_file
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.robot_file import find_robot_file
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import effects
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.model import balances, paper_robots, params
+from mmrjax.model import balances, paper_robots
+from mmrjax.model.params import walk_parameters
 from mmrjax.model.signals import Signals
-from sweeps.commands import rig_new
-from sweeps.export import comparison, expressions, feed_forward, formats, jax_actuator, law_source, mujoco
-from sweeps.export import joint as joints
+from sweeps.commands.rig_new import joint_numbers, new_rig_text, rig_template
+from sweeps.export import comparison, law_source, mujoco
+from sweeps.export.expressions import (
+    ZERO,
+    Dialect,
+    Symbol,
+    apply_operation,
+    constant_symbol,
+    lines_of,
+    trace_function,
+)
+from sweeps.export.feed_forward import fates_in_tables, map_of_drive, table_files, table_law_function
+from sweeps.export.formats import draw_parameters, export_format, middle_run, randomization_files
+from sweeps.export.jax_actuator import (
+    actuator_law_function,
+    difference_from_jax,
+    fates_in_actuator,
+    jax_files,
+    onnx_files,
+    settled_actuator,
+)
+from sweeps.export.joint import INSIDE, channels_of, joint_of_robot
 from tests.commands import ends, read_json
 
 WHEELS, TRACKS = "4W2T", "6T2A"
@@ -46,13 +67,13 @@ def of_effects(amplitudes):
     known = {**effects.BY_NAME, **effects.BESIDE}
     having = tuple(known[name](amplitude=a) for name, a in amplitudes.items())
     return dataclasses.replace(
-        robot_file.find_robot_file("nominal"), robot=dataclasses.replace(paper_robots.nominal(), effects=having)
+        find_robot_file("nominal"), robot=dataclasses.replace(paper_robots.nominal(), effects=having)
     )
 
 
 def compared(file):
     """A drive on wheels and the native model over Table 8."""
-    drive = joints.joint_of_robot(file, WHEELS)
+    drive = joint_of_robot(file, WHEELS)
     runs = comparison.situation_of_joint(drive, None)
     return drive, runs, law_source.law_constants(drive, runs.signals, None)
 
@@ -95,12 +116,10 @@ def apart(a, b):
 def test_text_of_every_effect_computes_what_the_balances_do():
     """Values, slopes and rates of all parts of the law as written, at random signals, against the model's code."""
     kinds = {
-        name: kind
-        for name, kind in effects.BY_NAME.items()
-        if kind.balance in joints.INSIDE and not kind.needs_battery
+        name: kind for name, kind in effects.BY_NAME.items() if kind.balance in INSIDE and not kind.needs_battery
     }
     kinds |= {n: effects.UNNAMED[n] for n in ("curve_track_speed", "wave_electrical")}
-    drive = joints.joint_of_robot(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
+    drive = joint_of_robot(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
     assert {p.effect for p in drive.parts} - {""} == set(kinds)
     text = expressions_text(drive)
     rng = np.random.default_rng(1)
@@ -211,7 +230,7 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
 
 def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
     drive, runs, known = with_effects
-    law = jax_actuator.actuator_law_function(runs, known)(drive, {})
+    law = actuator_law_function(runs, known)(drive, {})
     current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert_allclose(current, runs.inside.current, rtol=1e-9)
     assert_allclose(speed, runs.inside.speed, rtol=1e-9)
@@ -235,7 +254,7 @@ def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
     drive, _, known = with_effects
     module = law_source.module_from_source(law_source.jax_source(drive, known))
     speed = jnp.asarray([3.0, 8.0, -5.0])
-    torque, info = jax_actuator.settled_actuator(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
+    torque, info = settled_actuator(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
     lost = sum(info[name] for name in info if name.startswith("lost"))
     assert_allclose(info["power"], torque * speed + lost, rtol=1e-9)
 
@@ -267,7 +286,7 @@ def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig,
 
 def test_serialised_actuator_computes_what_its_source_does(with_effects):
     drive, _, known = with_effects
-    files = jax_actuator.jax_files(drive, known, [])
+    files = jax_files(drive, known, [])
     assert b".py" not in files["actuator.jaxexport"]  # no path of this machine
     module = law_source.module_from_source(files["actuator.py"])
     with jax.enable_x64(False):
@@ -281,15 +300,15 @@ def test_serialised_actuator_computes_what_its_source_does(with_effects):
 
 def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     drive, runs, known = with_effects
-    found = feed_forward.map_of_drive(runs, known)
-    files = feed_forward.table_files(drive, found, [])
+    found = map_of_drive(runs, known)
+    files = table_files(drive, found, [])
     rows = list(csv.DictReader(io.StringIO(files["feed_forward.csv"])))
     assert len(rows) == len(found.speed) * len(found.torque)
     row = next(r for r in rows if float(r["joint_speed_rad_s"]) > 5 and float(r["joint_torque_Nm"]) > 0.5)
     given = {n: float(v) for n, v in row.items()}
     lost = sum(v for n, v in given.items() if n.startswith("lost"))
     assert given["power_W"] == pytest.approx(given["joint_speed_rad_s"] * given["joint_torque_Nm"] + lost, rel=1e-5)
-    law = feed_forward.table_law_function(runs, known)(drive, {})
+    law = table_law_function(runs, known)(drive, {})
     current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert (
         apart(np.asarray(speed), runs.inside.speed) < 2e-3 and apart(np.asarray(current), runs.inside.current) < 1e-2
@@ -312,15 +331,15 @@ def test_onnx_model_is_the_step_of_jax(with_effects):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
     drive, _, known = with_effects
-    files = jax_actuator.onnx_files(drive, known)
-    assert jax_actuator.difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
+    files = onnx_files(drive, known)
+    assert difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
 
 
 def test_missing_onnx_library_names_the_extra(with_effects, monkeypatch):
     drive, _, known = with_effects
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(BadConfiguration, match=r'jax2onnx is not installed; pip install "mmrjax\[export\]"'):
-        jax_actuator.onnx_files(drive, known)
+        onnx_files(drive, known)
 
 
 def stand_in(monkeypatch):
@@ -400,19 +419,19 @@ def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain):
     law = mujoco.translate_law(drive, normal)
     refitted = dict(zip(law.names, map(float, law.start), strict=True))
     refitted[mujoco.RESISTANCE] *= 1.1  # as if a refit had found more
-    found = formats.draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
+    found = draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
     resistance, friction = found["actuator/motor.resistance"], found["actuator/motor.friction_coulomb"]
     assert_allclose(found["mujoco/resistance"], 1.1 * resistance / 0.74, rtol=1e-9)
     assert np.corrcoef(resistance, friction)[0, 1] == pytest.approx(-0.8, abs=0.06)
     assert np.corrcoef(found["mujoco/resistance"], found["mujoco/frictionloss"])[0, 1] == pytest.approx(
         -0.8, abs=0.06
     )
-    files = formats.randomization_files(found)
+    files = randomization_files(found)
     kept = np.load(io.BytesIO(files["draws.npz"]))
     assert set(kept) == set(found)
     assert len(kept["mujoco/motorconst"]) == 400
     with pytest.raises(BadConfiguration, match=f"no {posterior_file.FILE} next to"):
-        formats.draw_parameters(drive, None, known, refitted, normal, 4, 0)
+        draw_parameters(drive, None, known, refitted, normal, 4, 0)
 
 
 RIG = """
@@ -456,7 +475,7 @@ def rig(tmp_path):
 
 def xml_of(file):
     """MJCF of a rig by translation alone."""
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(file)))
+    drive = joint_of_robot(find_robot_file(str(file)))
     law = mujoco.translate_law(drive, 0.0)
     motor = mujoco.mjcf_motor(drive, dict(zip(law.names, map(float, law.start), strict=True)))
     about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
@@ -469,11 +488,11 @@ def xml_of(file):
 def test_current_limit_of_a_driver_is_a_saturation_that_comes_back(tmp_path):
     """Its attribute was one that `<dcmotor>` rejects, so such a drive could not be exported to MuJoCo."""
     rig = tmp_path / "rig.toml"
-    rig.write_text(rig_new.rig_template("bench") + "\n[driver]\ncurrent_limit = 5.0\n")
+    rig.write_text(rig_template("bench") + "\n[driver]\ncurrent_limit = 5.0\n")
     for name, text in xml_of(rig).items():
         (tmp_path / name).write_text(text)
-    back = rig_new.joint_numbers(tmp_path / "scene.xml", "drive").drive
-    efficiency = float(robot_file.find_robot_file(str(rig)).robot.gearbox.efficiency_load)
+    back = joint_numbers(tmp_path / "scene.xml", "drive").drive
+    efficiency = float(find_robot_file(str(rig)).robot.gearbox.efficiency_load)
     assert back["driver.current_limit"].value == pytest.approx(5.0 * efficiency, rel=1e-6)
 
 
@@ -491,7 +510,7 @@ amplitude = 0.004
 """
 
 
-@pytest.mark.parametrize(("voltage", "torque"), [(12.0, 0.2), (2.0, -2.0)])
+@pytest.mark.parametrize("voltage, torque", [(12.0, 0.2), (2.0, -2.0)])
 def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, voltage, torque):
     """A start, and a load that drives the motor, in a simulator with Euler's steps.
 
@@ -499,8 +518,8 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     """
     arm = RIG.split("[effects")[0].replace("torque_gravity = 0.6", f"torque_constant = {torque}")
     rig.write_text(arm + LOSSES)
-    file = robot_file.find_robot_file(str(rig))
-    drive = joints.joint_of_robot(file)
+    file = find_robot_file(str(rig))
+    drive = joint_of_robot(file)
     module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None)))
     step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
 
@@ -528,20 +547,20 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     for name, text in first.items():
         (tmp_path / name).write_text(text)
     again = tmp_path / "again.toml"
-    again.write_text(rig_new.new_rig_text(None, tmp_path / "scene.xml", "drive", None))
+    again.write_text(new_rig_text(None, tmp_path / "scene.xml", "drive", None))
     second = xml_of(again)
     lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
     assert lines[0] == lines[1]
-    before, after = (robot_file.find_robot_file(str(f)).robot for f in (rig, again))
-    numbers = {p.name: float(p.value) for p in params.walk_parameters(after)}
-    for p in params.walk_parameters(before):
+    before, after = (find_robot_file(str(f)).robot for f in (rig, again))
+    numbers = {p.name: float(p.value) for p in walk_parameters(after)}
+    for p in walk_parameters(before):
         name = p.name
         if not name.startswith(("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")):
             assert numbers[name] == pytest.approx(float(p.value), rel=1e-8), name
 
 
 @pytest.mark.parametrize(
-    ("source", "joint", "message"),
+    "source, joint, message",
     [
         ("scene.xml", "drve", r"--joint: got drve; .* has no such joint; did you mean drive\?"),
         ("scene.obj", None, r"scene.obj: not a readable XML file \(.*\); expected URDF or MuJoCo's XML"),
@@ -562,7 +581,7 @@ def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, 
     bodies = "".join(map(body.format, ("name='drive'", "name='other'", "name='slide' type='slide'")))
     (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(BadConfiguration, match=message):
-        rig_new.new_rig_text(None, tmp_path / source, joint, None)
+        new_rig_text(None, tmp_path / source, joint, None)
 
 
 def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig):
@@ -570,11 +589,11 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 
     monkeypatch.setattr(library, "__version__", "3.6.0")
     with pytest.raises(BadConfiguration, match=r"got MuJoCo 3.6.0, which has no <dcmotor>; expected 3.7 or later"):
-        formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
+        export_format(find_robot_file(str(rig)), "mujoco")
 
 
 @pytest.mark.parametrize(
-    ("amplitudes", "configuration", "message"),
+    "amplitudes, configuration, message",
     [
         (
             {"side_friction": 1e-3},
@@ -586,17 +605,17 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 )
 def test_drives_that_are_no_joint_are_refused_in_a_sentence(amplitudes, configuration, message):
     with pytest.raises(BadConfiguration, match=message):
-        joints.joint_of_robot(of_effects(amplitudes), configuration)
+        joint_of_robot(of_effects(amplitudes), configuration)
 
 
 def test_rig_with_another_command_is_refused(rig):
     rig.write_text(RIG.replace('imposed = "voltage"', 'imposed = "motor_current"'))
     with pytest.raises(BadConfiguration, match=r"\[rig\] imposed: got motor_current; expected voltage"):
-        joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+        joint_of_robot(find_robot_file(str(rig)))
 
 
 @pytest.mark.parametrize(
-    ("header", "row", "message"),
+    "header, row, message",
     [
         ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,total_current_A", f"{WHEELS},24,11.5,0,0,1,0.5,3", "differently"),
         ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,lever_front_deg,lever_rear_deg",
@@ -606,7 +625,7 @@ def test_rig_with_another_command_is_refused(rig):
 )  # fmt: skip
 def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path):
     (tmp_path / "runs.csv").write_text(f"{header}\n{row}\n")
-    drive = joints.joint_of_robot(of_effects({}), TRACKS if message == "levers" else WHEELS)
+    drive = joint_of_robot(of_effects({}), TRACKS if message == "levers" else WHEELS)
     with pytest.raises(BadData, match=message):
         comparison.situation_of_joint(drive, str(tmp_path / "runs.csv"))
 
@@ -614,20 +633,20 @@ def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path)
 def test_a_rig_without_a_limit_of_the_voltage_needs_runs(rig):
     rig.write_text(RIG.replace("voltage_limit = 12.0\n", ""))
     with pytest.raises(BadConfiguration, match=r"--data: not given, and rig\.toml has no motor\."):
-        comparison.situation_of_joint(joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm"), None)
+        comparison.situation_of_joint(joint_of_robot(find_robot_file(str(rig)), "arm"), None)
 
 
 def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
     rig.write_text(RIG.replace('["total_current", "motor_speed"]', '["output_angle"]'))
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm")
-    assert {c.name for c in joints.channels_of(drive)} == {"motor_speed", "motor_current"}
+    drive = joint_of_robot(find_robot_file(str(rig)), "arm")
+    assert {c.name for c in channels_of(drive)} == {"motor_speed", "motor_current"}
 
 
 def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
     """The grid was three runs forward without load: the stated 0.01 % of current was 28 % backward."""
     losses = "[effects.gear_quadratic_loss]\namplitude = 0.05\n[effects.directional_viscous]\namplitude = 0.0012\n"
     rig.write_text(RIG.split("torque_gravity")[0].replace("efficiency_load = 1.0", "efficiency_load = 0.81") + losses)
-    found = formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
+    found = export_format(find_robot_file(str(rig)), "mujoco")
     seen = found.comparison.situation
     for way in (-1, 1):
         assert {(v, m > 0) for v, m in zip(way * seen.command, way * seen.load, strict=True) if v > 0} >= {
@@ -680,22 +699,20 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
 def test_a_key_frame_of_runs_in_both_directions_moves():
     """It was at the mean of all commands, which is rest."""
     command, load = np.array([-24.0, -12.0, 12.0, 24.0, 6.0]), np.array([-2.0, -1.0, 1.0, 2.0, 0.5])
-    chosen, torque = formats.middle_run(command, load)
+    chosen, torque = middle_run(command, load)
     assert abs(chosen) == 12.0 and torque == chosen / 12
 
 
 def test_symbols_fold_numbers_and_keep_the_order_of_operations():
-    a, b = (expressions.Symbol.of("name", (), n) for n in "ab")
-    two = expressions.constant_symbol(2.0)
-    assert expressions.apply_operation("mul", a, expressions.ZERO) is expressions.ZERO
-    assert expressions.apply_operation("add", a, expressions.ZERO) is a
-    difference = expressions.apply_operation("sub", a, expressions.apply_operation("sub", b, two))
-    text = expressions.lines_of(
-        expressions.apply_operation("mul", difference, difference), expressions.Dialect("np"), str
-    )
+    a, b = (Symbol.of("name", (), n) for n in "ab")
+    two = constant_symbol(2.0)
+    assert apply_operation("mul", a, ZERO) is ZERO
+    assert apply_operation("add", a, ZERO) is a
+    difference = apply_operation("sub", a, apply_operation("sub", b, two))
+    text = lines_of(apply_operation("mul", difference, difference), Dialect("np"), str)
     assert text == ["    x1 = a - (b - 2.0)", "    return x1 * x1"]
     with pytest.raises(BadConfiguration, match="mine: its equation uses"):
-        expressions.trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")
+        trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")
 
 
 #: Servos and drives whose load turns apart: text of the file, the control, and the allowed error of the angle [rad] in
@@ -729,8 +746,8 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
     """A start from rest under one goal or voltage: MJCF in MuJoCo C, and the law in JAX beside a simulator's steps."""
     text, in_mujoco, in_jax = APART[name]
     rig.write_text(text)
-    file = robot_file.find_robot_file(str(rig))
-    drive, goal = joints.joint_of_robot(file), "servo" in name
+    file = find_robot_file(str(rig))
+    drive, goal = joint_of_robot(file), "servo" in name
     command, times = 0.5 if goal else 6.0, np.linspace(0, 0.5, 26)
     given = {"voltage": 7.4, "goal": command} if goal else {"voltage": command}
     run = drive_batch(file.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], mm.Conditions(**given)), times, 1e-8, 20_000)  # fmt: skip
@@ -754,30 +771,30 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
 
 def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    drive = joint_of_robot(find_robot_file(str(rig)))
     known = law_source.law_constants(drive, None, None)
     verdicts = [
         {f.name: f for f in fates}
-        for fates in (mujoco.fates_in_mujoco(drive, 0.0), jax_actuator.fates_in_actuator(drive), feed_forward.fates_in_tables(drive, known))
+        for fates in (mujoco.fates_in_mujoco(drive, 0.0), fates_in_actuator(drive), fates_in_tables(drive, known))
     ]  # fmt: skip
     held, near, lost = comparison.HELD, comparison.APPROXIMATED, comparison.DROPPED
     assert [v[mujoco.PLAY].verdict for v in verdicts] == [held, held, lost]
     assert [v[mujoco.CONTROLLER].verdict for v in verdicts] == [near, held, lost]
     assert "lag of 0.005 s is dropped" in verdicts[0][mujoco.CONTROLLER].how
     rig.write_text(APART["servo at 50 Hz"][0])
-    sampled = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    sampled = joint_of_robot(find_robot_file(str(rig)))
     fates = {f.name: f for f in mujoco.fates_in_mujoco(sampled, 0.0)}
     assert "acts at each step, not at 50 Hz" in fates[mujoco.CONTROLLER].how
     assert "0.03 rad of play" in verdicts[2][mujoco.PLAY].how
     rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
     with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; the exported controller"):
-        joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+        joint_of_robot(find_robot_file(str(rig)))
 
 
 def test_mjlab_actuator_of_a_servo_with_play_is_that_of_jax(monkeypatch, rig):
     stand_in(monkeypatch)
     rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    drive = joint_of_robot(find_robot_file(str(rig)))
     known = law_source.law_constants(drive, None, None)
     ours, theirs = (
         law_source.module_from_source(f(drive, known)) for f in (law_source.jax_source, law_source.torch_source)

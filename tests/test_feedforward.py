@@ -12,7 +12,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
 from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
-from sweeps.commands import calibrate as feedforward_fit
+from sweeps.commands.calibrate import voltage_fit
 from sweeps.report import calibration_report
 from tests.commands import read_json
 
@@ -89,7 +89,7 @@ def test_constants_are_those_of_an_independent_least_squares(seed):
     assert not found.remarks
 
 
-@pytest.mark.parametrize(("fault", "code"), [
+@pytest.mark.parametrize("fault, code", [
     ("sign", "feedforward_sign"), ("unit", "feedforward_unit"), ("sag", "feedforward_sag"),
     ("limit", "feedforward_limit"), ("delay", "feedforward_delay"), ("skid", "feedforward_skid"),
     ("filter", "feedforward_filter"), ("missing", "feedforward_missing"),
@@ -107,7 +107,7 @@ def test_seeded_faults_are_named(seed, fault, code):
     assert all(sentences(found.remarks))
 
 
-@pytest.mark.parametrize(("mechanism", "arm"), [("elevator", False), ("arm", True)])
+@pytest.mark.parametrize("mechanism, arm", [("elevator", False), ("arm", True)])
 def test_weight_of_a_lift_and_of_an_arm(mechanism, arm):
     log, true = simulated(3, kG=0.5, arm=arm)
     found = fit_feedforward(dataclasses.replace(log, unit="degree"), mechanism)
@@ -152,14 +152,14 @@ def test_a_log_of_voltage_and_speed_has_two_plots_on_any_page():
     log, _ = simulated(1)
     columns = {"run_id": log.run, "time_s": log.time, "supply_voltage_V": log.voltage}
     runs = records.Runs("log.csv", columns | {"output_speed_rpm": 60.0 * log.velocity})
-    found = feedforward_fit.voltage_fit(runs)
+    found = voltage_fit(runs)
     direct = fit_feedforward(dataclasses.replace(log, position=None))
     assert found.constants == pytest.approx(direct.constants, rel=1e-6)
     quasistatic, dynamic, constants = calibration_report.voltage_section(found).blocks
     assert (quasistatic.name, dynamic.name) == ("quasistatic", "dynamic")
     assert [row[1] for row in constants.rows] == list(found.constants.values())
     rest = records.Runs("rest.csv", columns | {"output_speed_rpm": 0.0 * log.velocity})
-    assert feedforward_fit.voltage_fit(rest) is feedforward_fit.voltage_fit(records.read_runs("measured")) is None
+    assert voltage_fit(rest) is voltage_fit(records.read_runs("measured")) is None
 
 
 def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):

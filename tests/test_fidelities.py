@@ -86,7 +86,7 @@ CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, chec
 
 @pytest.mark.quick(3)
 @pytest.mark.parametrize(
-    ("name", "law"),
+    "name, law",
     [
         pytest.param(n, law, marks=pytest.mark.slow)
         # a program of its own; what drive keeps is looked at by test_drive, test_start and test_cli
@@ -117,7 +117,7 @@ def _from_the_middle(robot, conditions, options, progress=None):
 
 
 @pytest.mark.parametrize(
-    ("law", "of", "change"),
+    "law, of, change",
     [
         (knows_itself, "steady", {"histories": _from_the_middle}),
         (settles_traceably, "steady", {"settled": _one_row}),
@@ -177,7 +177,7 @@ def test_new_fidelity_is_a_file_and_a_line(toy, robot):
 
 
 @pytest.mark.parametrize(
-    ("code", "absent"),
+    "code, absent",
     [
         (
             "from mmrjax import fidelities; fidelities.NAMES, fidelities.fidelity_facts('track').resolved()",
@@ -208,7 +208,7 @@ def test_facts_state_what_the_command_line_needs():
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "message"),
+    "name, given, message",
     [
         ("steady", {"duration": 5.0}, "duration: got 5.0; this fidelity has the options: none"),
         ("drive", {"step": 1e-4}, "step: got 0.0001; this fidelity has the options: duration"),

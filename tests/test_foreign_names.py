@@ -17,14 +17,18 @@ import pytest
 import samples
 from rich.table import Table as RichTable
 
-from calibration.data import delimited, robot_file, writing
+from calibration.data import delimited
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.robot_file import find_robot_file, write_robot
+from calibration.data.writing import cell_text, json_text, toml_value, write_table
 from mmrjax.errors import UsageError, printable
 from mmrjax.model.robot import Configurations
-from sweeps import config as configuration
-from sweeps import console
-from sweeps.export import feed_forward, law_source, mujoco
+from sweeps.config import Simulate, as_toml
+from sweeps.console import print_json, print_message, print_output
+from sweeps.export import feed_forward
 from sweeps.export import joint as joints
+from sweeps.export.law_source import LawConstant, jax_source, mjlab_files, module_from_source
+from sweeps.export.mujoco import mjcf_fragment, mjcf_motor, mjcf_scene, translate_law
 from sweeps.report import export_report, page_renderer
 from sweeps.report.document import Column, Document, Note, Section, Table
 
@@ -46,12 +50,12 @@ def obeyed(text):
 @pytest.fixture(scope="module")
 def drive():
     """The packaged robot as a joint, its file and its load called by all names, and its numbers."""
-    file = robot_file.find_robot_file("nominal")
+    file = find_robot_file("nominal")
     robot = file.robot
     named = dataclasses.replace(robot, configurations=Configurations({ALL: robot.configurations.members[0]}))
     joint = joints.joint_of_robot(dataclasses.replace(file, robot=named, source=f"{ALL.replace('/', '')}.toml"), ALL)
     known = [
-        law_source.LawConstant(n, x, ALL, ALL, ALL)
+        LawConstant(n, x, ALL, ALL, ALL)
         for n, x in {
             **{n: float(p.value) for n, p in joint.parameters().items()},
             **dict.fromkeys(joint.surroundings(), 0.7),
@@ -66,12 +70,12 @@ def test_generated_source_has_names_as_words_and_runs_none(drive, monkeypatch):
 
     monkeypatch.setattr(builtins, "boom", boom, raising=False)
     joint, known = drive
-    jax_text = law_source.jax_source(joint, known, [ALL])
-    for text in (jax_text, law_source.mjlab_files(joint, known, [ALL])["mjlab_actuator.py"]):
+    jax_text = jax_source(joint, known, [ALL])
+    for text in (jax_text, mjlab_files(joint, known, [ALL])["mjlab_actuator.py"]):
         tree = ast.parse(text)
         assert "boom" not in {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
         assert not obeyed(text) and "boom" in ast.get_docstring(tree)
-    module = law_source.module_from_source(jax_text)
+    module = module_from_source(jax_text)
     assert set(module.PARAMS) == {c.name for c in known} and any(ALL in n for n in module.PARAMS)
 
 
@@ -82,16 +86,16 @@ def test_generated_source_has_names_as_words_and_runs_none(drive, monkeypatch):
 )  # fmt: skip
 def test_source_that_would_do_more_than_state_a_law_is_not_executed(drive, line):
     with pytest.raises(BadConfiguration, match="not executed"):
-        law_source.module_from_source(f"{law_source.jax_source(*drive)}\n{line}\n")
+        module_from_source(f"{jax_source(*drive)}\n{line}\n")
 
 
 def test_models_headers_and_pages_of_an_export_have_names_as_words(drive):
     joint = drive[0]
-    law = mujoco.translate_law(joint, 0.0)
-    motor = mujoco.mjcf_motor(joint, dict(zip(law.names, map(float, law.start), strict=True)))
+    law = translate_law(joint, 0.0)
+    motor = mjcf_motor(joint, dict(zip(law.names, map(float, law.start), strict=True)))
     about = dict.fromkeys(("gear", "frictionloss", "damping", "armature"), ALL)
-    fragment = mujoco.mjcf_fragment(joint, motor, about, [ALL], f"{joint.name}_drive", "drive", 12.0)
-    for text in (fragment, mujoco.mjcf_scene(joint, 1.0, f"{joint.name}_drive", "drive", 12.0, 0.1)):
+    fragment = mjcf_fragment(joint, motor, about, [ALL], f"{joint.name}_drive", "drive", 12.0)
+    for text in (fragment, mjcf_scene(joint, 1.0, f"{joint.name}_drive", "drive", 12.0, 0.1)):
         assert "boom" not in {node.tag for node in ElementTree.fromstring(text).iter()}
         assert not obeyed(text)
     points = feed_forward.SteadyMap(
@@ -107,20 +111,18 @@ def test_models_headers_and_pages_of_an_export_have_names_as_words(drive):
 @pytest.mark.parametrize("name", NAMES)
 def test_toml_and_json_keep_every_name(name):
     shown = name.encode("utf-8", "replace").decode()
-    assert tomllib.loads(f"a = {writing.toml_value({name: [name]})}")["a"] == {shown: [shown]}
-    given = configuration.Simulate.model_construct(robot=shown)
-    assert tomllib.loads(configuration.as_toml(given))["robot"] == shown
-    text = writing.json_text({name: name})
+    assert tomllib.loads(f"a = {toml_value({name: [name]})}")["a"] == {shown: [shown]}
+    given = Simulate.model_construct(robot=shown)
+    assert tomllib.loads(as_toml(given))["robot"] == shown
+    text = json_text({name: name})
     assert json.loads(text) == {name: name} and not obeyed(text)
 
 
 def test_robot_files_keep_names_of_columns(tmp_path):
-    robot = robot_file.find_robot_file("nominal").robot
+    robot = find_robot_file("nominal").robot
     columns = tuple((f"column_{k}", n.encode("utf-8", "replace").decode(), 1.0) for k, n in enumerate(NAMES))
     rig = dataclasses.replace(robot.rig, columns=columns)
-    robot_file.write_robot(
-        dataclasses.replace(robot, rig=rig), tmp_path / "robot.toml", note=ALL.replace("\ud800", "")
-    )
+    write_robot(dataclasses.replace(robot, rig=rig), tmp_path / "robot.toml", note=ALL.replace("\ud800", ""))
     content = (tmp_path / "robot.toml").read_text("utf-8")
     assert list(tomllib.loads(content)["columns"].values()) == [theirs for _, theirs, _ in columns]
 
@@ -128,7 +130,7 @@ def test_robot_files_keep_names_of_columns(tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 def test_csv_has_no_formulas_and_its_reader_gives_the_words_back(name, tmp_path):
     table = Table("t", (Column(name), Column("b")), [(name, "x"), ("y", -1.5)])
-    writing.write_table(tmp_path / "t.csv", {"b": np.array([-1.5, 2.0]), name: np.array([name, "y"])})
+    write_table(tmp_path / "t.csv", {"b": np.array([-1.5, 2.0]), name: np.array([name, "y"])})
     for text in ((tmp_path / "t.csv").read_text("utf-8"), table.csv):
         cells = [cell for row in csv.reader(text.splitlines()) for cell in row]
         assert not obeyed(text) and [c for c in cells if re.match(r"[=+@\t\r]|-(?!1\.5$)", c)] == []
@@ -140,7 +142,7 @@ def test_csv_has_no_formulas_and_its_reader_gives_the_words_back(name, tmp_path)
 
 
 def test_cells_that_are_numbers_get_no_apostrophe():
-    assert [writing.cell_text(x) for x in ("-1", "+2e3", "-inf", -3.0, "a=b", "-x", "'-x")] == [
+    assert [cell_text(x) for x in ("-1", "+2e3", "-inf", -3.0, "a=b", "-x", "'-x")] == [
         "-1", "+2e3", "-inf", "-3", "a=b", "'-x", "''-x",
     ]  # fmt: skip
 
@@ -175,10 +177,10 @@ def test_terminals_get_nothing_that_they_obey(capsys):
     table = RichTable(title="t")
     table.add_column(ALL)
     table.add_row(ALL)
-    console.print_output(ALL)
-    console.print_output(table)
-    console.print_message(ALL)
-    console.print_json({ALL: ALL})
+    print_output(ALL)
+    print_output(table)
+    print_message(ALL)
+    print_json({ALL: ALL})
     out, err = capsys.readouterr()
     assert "boom" in out and "boom" in err and not obeyed(out + err)
     for error in (BadConfiguration(ALL), BadData(ALL), UsageError(ALL)):

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 from test_shaft import DRIVE, bench
 
 import mmrjax as mm
-from calibration.data import rig_facts
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.rig_facts import doubtful_current
+from calibration.data.runs import read_runs
 from calibration.discovery import scales
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import Histories, SettledRuns
@@ -121,7 +121,7 @@ def table(held=True, **more):
 def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     noise = "motor_voltage=0.01V,output_torque=0.01Nm"
-    found = calibrate(records.read_runs(table(), robot=robot), robot, free=FREED, noise=noise, profiles=False)
+    found = calibrate(read_runs(table(), robot=robot), robot, free=FREED, noise=noise, profiles=False)
     for name, right in (("resistance", 0.25), ("torque_constant", 0.12), ("friction_coulomb", 0.03)):
         p = found.parameters[f"motor.{name}"]
         assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)
@@ -141,7 +141,7 @@ def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
     robot = rig(tmp_path, "voltage", '"motor_current"')
     columns = table()
     rows = {"supply_voltage_V": columns["motor_voltage_V"], "motor_current_A": columns["motor_current_A"]}
-    runs = records.read_runs({**rows, "held": columns["held"]}, robot=robot)
+    runs = read_runs({**rows, "held": columns["held"]}, robot=robot)
     found = mm.calibrate(runs, robot, free=("motor.resistance",))
     assert found.parameters["motor.resistance"].value == pytest.approx(0.25, rel=0.01)
 
@@ -149,7 +149,7 @@ def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
 def test_a_clamp_with_another_model_is_refused(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     with pytest.raises(BadConfiguration, match="held: got model drive; expected steady"):
-        SettledRuns.of(records.read_runs(table(), robot=robot), robot, "drive")
+        SettledRuns.of(read_runs(table(), robot=robot), robot, "drive")
 
 
 def test_rows_of_a_clamp_in_tables(tmp_path):
@@ -157,22 +157,22 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     with pytest.raises(
         BadData, match=r"row 1, load_torque_Nm: got 1 although held is 1; expected 0, .* output_torque"
     ):
-        records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
+        read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
     with pytest.raises(BadData, match=r"row 16, held: got 0\.5; expected 1 if a clamp holds the output, otherwise 0"):
-        records.read_runs({**table(), "held": np.r_[np.ones(15), 0.5]}, robot=held)
+        read_runs({**table(), "held": np.r_[np.ones(15), 0.5]}, robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
     with pytest.raises(
         BadData, match=r'nothing drives the motors; .* if the shaft is locked, set imposed = "motor_current"'
     ):
-        records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
+        read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
     rows = table(held=False, motor_speed_rpm=np.zeros(16), load_torque_Nm=np.r_[np.ones(15), 0.0])
-    assert len(records.read_runs(rows, robot=speed)) == 15
+    assert len(read_runs(rows, robot=speed)) == 15
     rows = table()
     strong = {**rows, "motor_current_A": 5 * rows["motor_current_A"]}
-    assert rig_facts.doubtful_current(records.read_runs(strong, robot=held), held) == ""
+    assert doubtful_current(read_runs(strong, robot=held), held) == ""
     strong["held"] = np.r_[np.zeros(15), 1.0]
-    assert "80 A, although by the file's numbers the load turns" in rig_facts.doubtful_current(
-        records.read_runs(strong, robot=held), held
+    assert "80 A, although by the file's numbers the load turns" in doubtful_current(
+        read_runs(strong, robot=held), held
     )
 
 
@@ -180,14 +180,14 @@ def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
     """Windings settle within a millisecond."""
     rows = {"output_torque_Nm": table()["output_torque_Nm"], "motor_voltage_V": table()["motor_voltage_V"]}
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    log = records.read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)
+    log = read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)
     assert not log.sampled and any("held in every row, so each row is read as a settled run" in n for n in log.notes)
-    same = records.read_runs(table(), robot=held)
+    same = read_runs(table(), robot=held)
     assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
     speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
     columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}
     columns |= {"motor_speed_rpm": np.zeros(16), "load_torque_Nm": rows["output_torque_Nm"]}
-    log = records.read_runs({**columns, "time_s": 0.02 * np.arange(16.0)}, robot=speed)
+    log = read_runs({**columns, "time_s": 0.02 * np.arange(16.0)}, robot=speed)
     assert not log.sampled and len(log) == 16
 
 
@@ -203,7 +203,7 @@ def test_a_clamp_holds_a_part_of_a_log(tmp_path):
     robot = rig(tmp_path, "voltage", '"motor_current", "motor_speed", "output_torque"')
     robot = params.replace(robot, {"motor.inertia": 4e-4, "motor.inductance": 2e-4})
     names = ("motor_current_A", "motor_speed_rpm", "output_torque_Nm")
-    runs = records.read_runs({**log, **dict.fromkeys(names, np.ones(20))}, robot=robot)
+    runs = read_runs({**log, **dict.fromkeys(names, np.ones(20))}, robot=robot)
     assert runs.sampled and len(runs) == 20 and runs["held"].sum() == held.sum() == 10
     observe = Histories.of(runs, robot)
 
@@ -226,7 +226,7 @@ def test_a_clamp_holds_a_part_of_a_log(tmp_path):
     assert not slopes[rests, 0].any()
     ends = [np.asarray(both(at + np.array([d, 0.0]))[1]) for d in (1e-6, -1e-6)]
     assert_allclose(slopes[..., 0], (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-3)
-    free = records.read_runs({**log, "held": 0 * held, **dict.fromkeys(names, np.ones(20))}, robot=robot)
+    free = read_runs({**log, "held": 0 * held, **dict.fromkeys(names, np.ones(20))}, robot=robot)
     assert not free.has("held")
 
 
@@ -235,7 +235,7 @@ def test_a_log_of_a_locked_rotor_shows_its_inductance(tmp_path):
     robot = params.replace(rig(tmp_path, "voltage", '"motor_current"'), {"motor.inductance": 3e-3})
     time = 1e-3 * np.arange(30)
     log = {"time_s": time, "supply_voltage_V": np.full(30, 3.0), "motor_current_A": np.ones(30), "held": np.ones(30)}
-    runs = records.read_runs(log, robot=robot)
+    runs = read_runs(log, robot=robot)
     assert runs.sampled
     observe = Histories.of(runs, robot)
     current = np.asarray(jax.jit(lambda robot: observe(robot).reading)(robot))[:, 0]
@@ -246,7 +246,7 @@ def test_a_clamp_in_a_log_of_an_elastic_joint_is_refused(tmp_path):
     text = RIG_HELD.format(imposed="voltage", channels='"motor_current"') + 'stiffness = "50 ± 5"\n'
     robot = read_rig(tmp_path, text.replace("[gearbox]", "inertia = 4e-4\n[gearbox]"))
     log = {"time_s": 1e-3 * np.arange(9), "supply_voltage_V": np.ones(9), "motor_current_A": np.ones(9)}
-    runs = records.read_runs({**log, "held": np.r_[np.zeros(4), np.ones(5)]}, robot=robot)
+    runs = read_runs({**log, "held": np.r_[np.zeros(4), np.ones(5)]}, robot=robot)
     with pytest.raises(BadConfiguration, match="a clamp on a load with backlash or an elastic joint"):
         Histories.of(runs, robot)
 

@@ -9,8 +9,8 @@ from synthetic import FEW, SETTLED, table
 from test_stated_values import LOOKS
 from worlds import laws, settled, tables
 
-from calibration.discovery import findings
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.findings import _alternative, found_effects, listed_alternatives
 from calibration.discovery.search import search_effects, single_p_value
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.linearization import amplitude_of
@@ -65,7 +65,7 @@ def hot(looks):
 
 def listed(traced, cost):
     space, base = traced.screened.base.space, traced.screened.base.candidate
-    return findings.listed_alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
+    return listed_alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
 
 
 def test_heating_of_a_plausible_size_is_named():
@@ -97,7 +97,7 @@ def test_companions_that_explain_nothing_are_not_listed(hot):
     assert len(pairs) > 3  # there were some
     space = hot.screened.base.space
     for c in pairs:
-        why = {r.name for r in findings._alternative(space, c, 0.0, SETTLED.settings).reasons}
+        why = {r.name for r in _alternative(space, c, 0.0, SETTLED.settings).reasons}
         for name, size in zip(c.effects, c.size, strict=False):
             if 0 < size < 0.3 and not (space.library[name].dissipative and c.amplitude[c.active.index(name)] <= 0):
                 assert name not in why
@@ -118,7 +118,7 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
         of("supply_sag", cost=101.0), of("churning", "load_slip", cost=99.0), of("churning", "mass_offset", cost=90.0),
         of("supply_sag", "load_slip", cost=100.5), of("series_resistance", cost=98.0, plausible=False), best,
     )  # fmt: skip
-    plausible, ruled_out = findings.listed_alternatives(space, best, best.cost, ladder, SETTLED.settings)
+    plausible, ruled_out = listed_alternatives(space, best, best.cost, ladder, SETTLED.settings)
     assert [(tuple(a.effects), a.rise_chi2) for a in plausible] == [
         (("churning", "mass_offset"), -20.0),
         (("supply_sag",), 2.0),
@@ -138,7 +138,7 @@ def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
 
 
 @pytest.mark.parametrize(
-    ("names", "sigmas"),
+    "names, sigmas",
     [(["stribeck_track", "gear_load_loss"], 9.0), (["churning", "mass_offset"], 9.0), (["series_resistance"], 25.0)],
 )
 def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
@@ -149,7 +149,7 @@ def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
         if found.alike is None:
             continue
         space, base = found.screened.base.space, found.screened.base.candidate
-        told = findings.found_effects(space, base, found.best, found.alike, found.left.test, SETTLED.settings)
+        told = found_effects(space, base, found.best, found.alike, found.left.test, SETTLED.settings)
         for e in told:
             amplitude = e.parameters["amplitude"]
             assert e.p_value <= SETTLED.settings.family_wise_error, e.name

@@ -8,15 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import rig_facts, robot_file, unused_readings
+from calibration.data import unused_readings
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.rig_facts import doubtful_current
+from calibration.data.robot_file import read_robot, write_robot
 from calibration.discovery import loop_input
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import time_histories
-from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.histories import history_signals
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.balances import absent_balances
@@ -98,11 +100,11 @@ def test_a_thinned_log_of_a_varying_current_turns_the_load_as_its_rows_do(tmp_pa
     assert np.abs(simulated - runs.measured()[:, 0]).max() < 1e-4
 
 
-@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True), (1e-3, True)])
+@pytest.mark.parametrize("factor, doubted", [(1.0, False), (1e3, True), (1e-3, True)])
 def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path, robot, factor, doubted):
     """It is 0.67 A that turns the load slowly."""
     rows = "".join(f"{0.1 * k},{factor * current},0\n" for k, current in enumerate((1.5, 2.0, -1.5)))
-    said = rig_facts.doubtful_current(
+    said = doubtful_current(
         read_table(tmp_path, f"time_s,motor_current_A,motor_speed_rpm\n{rows}", robot),
         robot,
     )
@@ -118,11 +120,11 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
 def test_a_large_current_without_a_measured_speed_may_be_that_of_a_held_shaft(tmp_path, robot, reading):
     robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=(reading.rpartition("_")[0],)))
     table = read_table(tmp_path, f"motor_current_A,{reading}\n200,1\n400,2\n700,3.5\n", robot)
-    assert ("add a column held" in rig_facts.doubtful_current(table, robot)) == (reading == "motor_voltage_V")
+    assert ("add a column held" in doubtful_current(table, robot)) == (reading == "motor_voltage_V")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True)])
+@pytest.mark.parametrize("factor, doubted", [(1.0, False), (1e3, True)])
 def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor, doubted, monkeypatch):
     current = np.array([1.0, 1.5, 2.0, -1.0, -1.5, -2.0, 1.2, 1.8])
     rows = [f"{factor * i},{x * 9.549}\n" for i, x in zip(current, settles(current), strict=True)]
@@ -140,8 +142,8 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert robot.rig.imposed == "motor_current"
     assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
-    robot_file.write_robot(robot, tmp_path / "again.toml")
-    assert robot_file.read_robot(tmp_path / "again.toml").rig == robot.rig
+    write_robot(robot, tmp_path / "again.toml")
+    assert read_robot(tmp_path / "again.toml").rig == robot.rig
     with pytest.raises(BadConfiguration, match="motor_current is imposed, so it cannot be a reading"):
         read_rig(tmp_path, RIG.replace('["motor_speed"]', '["motor_current"]'), "bad.toml")
     with pytest.raises(BadConfiguration, match=r"motor\.torque_constant \[N·m/A\] is missing"):
@@ -189,7 +191,7 @@ def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_pat
 
     def ours(dry):
         changed = params.replace(robot, {"bench.loss_coulomb": dry, "motor.inductance": 1e-9})
-        found = integrator.history_signals(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
+        found = history_signals(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
         return found.speed_motor, found.speed_motor
 
     slope, shown = map(np.asarray, jax.jit(jax.jacfwd(ours, has_aux=True))(DRY))
@@ -209,9 +211,7 @@ def test_derivatives_are_those_of_the_steps_where_a_lagging_current_stops_a_shaf
     @jax.jit
     def ours(values):
         changed = params.replace(robot, {"bench.loss_coulomb": values[0], "bench.inertia": values[1]})
-        found = integrator.history_signals(
-            changed, Conditions(motor_current=jnp.asarray(current)), jnp.asarray(times)
-        )
+        found = history_signals(changed, Conditions(motor_current=jnp.asarray(current)), jnp.asarray(times))
         return found.speed_motor
 
     at = np.array([DRY, INERTIA])
@@ -229,7 +229,7 @@ def test_a_current_just_above_the_friction_hardly_turns_a_shaft(robot, excess):
     robot = params.replace(robot, {"motor.inductance": 1e-3, "motor.resistance": 1.0})
     level = DRY * (1 + excess) / (RATIO * ETA * K)
     times = jnp.arange(0.0, 0.05, 2.5e-3)
-    found = integrator.history_signals(robot, Conditions(motor_current=jnp.full(times.shape, level)), times)
+    found = history_signals(robot, Conditions(motor_current=jnp.full(times.shape, level)), times)
     speed, most = np.asarray(found.speed_motor), RATIO * DRY * excess / (INERTIA + ETA * ROTOR * RATIO**2) * 0.05
     assert 0.5 * most < speed[-1] < most
 

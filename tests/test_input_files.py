@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from calibration.data import input_files
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
+from calibration.data.runs import Path, read_runs
 from calibration.discovery.loop_input import remove_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
@@ -85,7 +85,7 @@ def test_what_is_no_table_is_refused_in_one_short_sentence(tmp_path, case):
     content, says = TABLES[case]
     (tmp_path / "t.csv").write_bytes(content)
     with pytest.raises(BadData, match=says) as refusal:
-        records.read_runs(tmp_path / "t.csv", robot=bench(tmp_path))
+        read_runs(tmp_path / "t.csv", robot=bench(tmp_path))
     assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
 
 
@@ -93,9 +93,9 @@ def test_pipes_devices_and_folders_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, what in ((tmp_path / "pipe", "a pipe"), (tmp_path, "a folder"), ("/dev/zero", "a device")):
         with pytest.raises(BadData, match=f"is {what}; expected a file"):
-            records.read_runs(path)
+            read_runs(path)
         with pytest.raises(BadConfiguration, match=f"is {what}; expected a file"):
-            input_files.toml_text(records.Path(path), "x")
+            input_files.toml_text(Path(path), "x")
 
 
 @pytest.mark.parametrize("word", ["NaN", "nan", "NA", "N/A", "null", "None"])
@@ -119,7 +119,7 @@ def test_a_factor_of_few_digits_reaches_the_limit(tmp_path):
         table(tmp_path, f"{head}256,1800\n", robot)
 
 
-@pytest.mark.parametrize(("imposed", "column"), [("voltage", "supply_voltage_V"), ("motor_speed", "motor_speed_rpm")])
+@pytest.mark.parametrize("imposed, column", [("voltage", "supply_voltage_V"), ("motor_speed", "motor_speed_rpm")])
 def test_a_row_that_nothing_drives_is_left_out_with_a_note(tmp_path, imposed, column):
     robot = bench(tmp_path, f'imposed = "{imposed}"')
     found = table(tmp_path, f"{column},motor_current_A,room_C\n0,0,20\n4,0.3,21\n8,0.4,22\n", robot)
@@ -131,7 +131,7 @@ ROWS = "4,0.3,700{}\n6,0.4,1100{}\n6,0.4,1100{}\n"
 
 
 @pytest.mark.parametrize(
-    ("head", "rows", "kept"),
+    "head, rows, kept",
     [
         ("", ROWS.format("", "", ""), 3),  # repeats on a coarse display
         (",run_id", ROWS.format(",a", ",b", ",c"), 3),

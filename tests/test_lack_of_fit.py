@@ -14,10 +14,9 @@ from worlds import settled, tables
 from calibration.data.runs import Runs
 from calibration.discovery.result_remarks import noise_remarks_before_verdict
 from calibration.discovery.verdict import VerdictNoise
-from calibration.inference import lack_of_fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import AdequacyFinding
-from calibration.inference.lack_of_fit import Residuals, adequacy_of_residuals
+from calibration.inference.lack_of_fit import LEVEL, Residuals, _replicate_test, adequacy_of_residuals, judge_adequacy
 from calibration.inference.noise_factor import noise_factors, noise_remarks, variance_of_sums
 from calibration.inference.observers import SettledRuns
 from calibration.inference.simulation_errors import root_mean_square
@@ -85,7 +84,7 @@ def judged(made, estimated=False):
 def test_complete_models_are_called_inadequate_as_often_as_stated(estimated):
     rng = np.random.default_rng(1)
     wrong = sum(not judged(toy(rng), estimated).adequate for _ in range(200))
-    assert wrong <= stats.binom.ppf(0.999, 200, lack_of_fit.LEVEL)
+    assert wrong <= stats.binom.ppf(0.999, 200, LEVEL)
 
 
 @pytest.mark.parametrize("estimated", [False, True])
@@ -102,7 +101,7 @@ def test_noise_that_is_larger_than_stated_is_not_adequate():
 
 def test_replicates_tell_what_the_noise_is():
     made = toy(np.random.default_rng(4), missing=1.5, repeats=2)
-    found = lack_of_fit._replicate_test(made)
+    found = _replicate_test(made)
     assert found[0] < 0.01 and found[1] == AdequacyFinding(what="repeats")
     clean = toy(np.random.default_rng(5), repeats=2)
     assert judged(clean, estimated=True).adequate
@@ -118,7 +117,7 @@ def test_too_few_rows_cannot_be_tested_and_say_so():
 
 
 @pytest.mark.parametrize(
-    ("missed", "noise", "estimated", "converged", "stated_off", "obstacle", "adequate"),
+    "missed, noise, estimated, converged, stated_off, obstacle, adequate",
     [
         (0.0, 1.0, True, True, 9.0, "", True),
         (0.0, 1.0, True, False, 9.0, "not converged", None),
@@ -141,7 +140,7 @@ def test_no_test_of_residuals_decides_before_the_fit_is_one(
     made = dataclasses.replace(made, simulated=simulated, whitened=whitened)
     unknown = np.full(3, estimated)
     as_stated = made.runs.measured() + stated_off * SIGMA
-    found = lack_of_fit.judge_adequacy(made, as_stated, sd, estimated=unknown, converged=converged)
+    found = judge_adequacy(made, as_stated, sd, estimated=unknown, converged=converged)
     assert (found.obstacle, found.adequate) == (obstacle, adequate) and len(found.misses) == 3
     if obstacle:
         assert "as given" in found.statement and "Adequate" not in found.statement

@@ -25,7 +25,7 @@ def rated(robot):
 
 
 @pytest.mark.parametrize(
-    ("changed", "flags"),
+    "changed, flags",
     [
         ({}, set()),
         ({"voltage_source": 8 * 2.99}, {"cut_off"}),
@@ -75,7 +75,7 @@ def test_a_driven_robot_creeps_where_either_lags_and_one_that_gravity_drives_whe
 
 
 @pytest.mark.parametrize(
-    ("voltage", "slope", "way"), [(24.0, 10.0, 1.0), (-24.0, 0.0, -1.0), (0.4, 20.0, -1.0), (0.4, 5.0, 1.0)]
+    "voltage, slope, way", [(24.0, 10.0, 1.0), (-24.0, 0.0, -1.0), (0.4, 20.0, -1.0), (0.4, 5.0, 1.0)]
 )
 def test_travel_is_the_way_of_the_larger_torque_at_rest(robot, voltage, slope, way):
     """48 C_m U / R = 2.03 U [N·m] on a side, of which gravity asks 6.55 kg · g · sin α · 38.2 mm."""

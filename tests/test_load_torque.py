@@ -12,10 +12,13 @@ from test_worlds_rigs import steady
 from worlds import rigs
 
 import mmrjax as mm
-from calibration.data import profiles, rig_facts, robot_file
+from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.inference import bases, blocks
+from calibration.data.profiles import read_profile
+from calibration.data.rig_facts import doubtful_torque, log_doubts
+from calibration.inference import bases
+from calibration.inference.blocks import distinct_held_out_blocks, kind_in_words
 from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
@@ -174,7 +177,7 @@ def read(tmp_path, lines, head=""):
 
 
 @pytest.mark.parametrize(
-    ("column", "head", "factor"),
+    "column, head, factor",
     [
         ("load_torque_Nm", "", 1.0),
         ("load_torque_mNm", "", 1e-3),
@@ -241,9 +244,9 @@ def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
     torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
     lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
     runs, _ = read(tmp_path, lines)
-    found = blocks.distinct_held_out_blocks(runs, SettledRuns.blocks)
+    found = distinct_held_out_blocks(runs, SettledRuns.blocks)
     assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
-    assert blocks.kind_in_words("load_torque") == "load torque"
+    assert kind_in_words("load_torque") == "load torque"
 
 
 def test_a_drift_that_goes_with_the_torque_is_none():
@@ -264,8 +267,8 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
     rows = [f"24,{4565 - 1.91 * m},{m}" for m in (0, 100, 200, 300)]
     for column, doubted in (("load_torque_Nm", True), ("load_torque_mNm", False)):
         runs, rig = read(tmp_path, [f"supply_voltage_V,motor_speed_rpm,{column}", *rows])
-        said = rig_facts.doubtful_torque(runs, rig)
-        assert bool(said) == doubted and rig_facts.log_doubts(runs, rig) == ((said,) if doubted else ())
+        said = doubtful_torque(runs, rig)
+        assert bool(said) == doubted and log_doubts(runs, rig) == ((said,) if doubted else ())
         assert not doubted or said == (
             "runs.csv row 2, load_torque_Nm: got 100 N·m, but the motors stall at 2.39 N·m; is it in mN·m? then state "
             '[columns] load_torque_mNm = "load_torque_Nm"'
@@ -273,11 +276,11 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
 
 
 def test_a_profile_and_a_sweep_state_the_torque(tmp_path, robot):
-    table = profiles.read_profile(text_file(tmp_path / "p.csv", "time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n"))
+    table = read_profile(text_file(tmp_path / "p.csv", "time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n"))
     assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
     assert table.stated == ("load_torque_Nm",)
     with pytest.raises(BadData, match=r"bad\.csv row 2, load_torque_Nm: got an empty cell; expected a number"):
-        profiles.read_profile(text_file(tmp_path / "bad.csv", "time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n"))
+        read_profile(text_file(tmp_path / "bad.csv", "time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n"))
     made = mm.sweep(bench(), voltages=[12.0, 24.0], load_torques=[0.0, 0.5])
     assert made.to_dict()["load_torque_Nm"].tolist() == [0.0, 0.5, 0.0, 0.5]
     free, braked = np.asarray(made.motor_speed).reshape(2, 2).T

@@ -8,15 +8,19 @@ import pytest
 from test_log_kinds import carriage, servo, written
 from test_weak_form import RIG, motor
 
-from calibration.data import rig_facts, robot_file, unused_readings
-from calibration.data import runs as records
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadData
-from calibration.data.runs import Runs
+from calibration.data.rig_facts import log_doubts, swapped_sentence
+from calibration.data.robot_file import read_robot
+from calibration.data.runs import Runs, read_runs
+from calibration.data.unused_readings import without_held
 from calibration.described import describe
-from calibration.discovery import discover, loop_input, result_remarks, verdict
-from calibration.inference import calibration, shown_states
+from calibration.discovery import discover, result_remarks
+from calibration.discovery.loop_input import LoopInput, prepare_loop, settled_input
+from calibration.discovery.verdict import LoopStages
+from calibration.inference import calibration
 from calibration.inference.conduct import error_after_steps
+from calibration.inference.shown_states import missing_states_remarks
 from mmrjax.model import channels
 
 
@@ -24,7 +28,7 @@ from mmrjax.model import channels
 def robot(tmp_path_factory):
     file = tmp_path_factory.mktemp("motor") / "rig.toml"
     file.write_text(RIG, encoding="utf-8")
-    return robot_file.read_robot(file)
+    return read_robot(file)
 
 
 def held(speed):
@@ -50,9 +54,9 @@ SPEED, VOLTS = "motor_speed_rpm", "supply_voltage_V"
 ])  # fmt: skip
 def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words):
     columns = motor()
-    assert rig_facts.log_doubts(Runs("log.csv", columns).of(robot), robot) == ()
+    assert log_doubts(Runs("log.csv", columns).of(robot), robot) == ()
     faulty = Runs("log.csv", {**columns, column: fault(columns[column])}).of(robot)
-    (text,) = rig_facts.log_doubts(faulty, robot)
+    (text,) = log_doubts(faulty, robot)
     assert words in text and column in text and len(text) <= 400
 
 
@@ -60,9 +64,9 @@ def wrapped(tmp_path, kind, make, column, length):
     """A log as it is read, and the same log with an encoder that wraps."""
     log = make(np.random.default_rng(1))
     robot = written(tmp_path, kind, log)
-    yield records.read_runs(tmp_path / "log.csv", robot=robot)
+    yield read_runs(tmp_path / "log.csv", robot=robot)
     written(tmp_path, kind, {**log, column: log[column] % length})
-    yield records.read_runs(tmp_path / "log.csv", robot=robot)
+    yield read_runs(tmp_path / "log.csv", robot=robot)
 
 
 def test_a_position_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path):
@@ -93,22 +97,22 @@ def test_rows_after_a_jump_of_the_clock_are_a_run_that_begins_at_their_readings(
     log = carriage(np.random.default_rng(1))
     late = np.arange(len(log["time_s"])) >= 700
     robot = written(tmp_path, "carriage", {**log, "time_s": log["time_s"] + step * late})
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    runs = read_runs(tmp_path / "log.csv", robot=robot)
     assert (runs.run_names == "part 2").tolist() == late.tolist()
     np.testing.assert_allclose(np.diff(runs["time_s"])[701:], np.diff(log["time_s"])[701:], atol=1e-6)
     assert runs["time_s"][700] == 0 and any("row 701, time_s" in n and "new run" in n for n in runs.notes)
 
 
-@pytest.mark.parametrize(("column", "left_out"), [(SPEED, 276), ("motor_current_A", 276), ("output_angle_deg", 0)])
+@pytest.mark.parametrize("column, left_out", [(SPEED, 276), ("motor_current_A", 276), ("output_angle_deg", 0)])
 def test_readings_that_are_held_at_the_last_value_are_left_out(robot, column, left_out):
     """The last 70 of 150 rows of each run repeat one reading, over steps of 1.8 to 15 V. An angle may rest."""
     shown = tuple(channels.find_channel(n) for n in ("motor_speed", "motor_current", "output_angle"))
     columns = motor()
     columns["output_angle_deg"] = np.cumsum(columns[SPEED])
     runs = Runs("log.csv", columns, layout=dataclasses.replace(Layout.of(robot), channels=shown))
-    assert unused_readings.without_held(runs).notes == ()
+    assert without_held(runs).notes == ()
     faulty = dataclasses.replace(runs, columns={**columns, column: held(columns[column])})
-    found = unused_readings.without_held(faulty)
+    found = without_held(faulty)
     lost = {c.column: np.isnan(found[c.column]) for c in shown}
     assert {name: rows.sum() for name, rows in lost.items()} == dict.fromkeys(lost, 0) | {column: left_out}
     assert lost[column].reshape(4, 150)[:, 81:].all() == bool(left_out)
@@ -119,20 +123,18 @@ def test_readings_that_are_held_at_the_last_value_are_left_out(robot, column, le
     assert note.endswith("Such rows are left out" if left_out else "Empty these cells to use the other rows")
 
 
-@pytest.mark.parametrize(
-    ("kind", "make", "column"), [("servo", servo, "duty"), ("carriage", carriage, "motor_current_A")]
-)
+@pytest.mark.parametrize("kind, make, column", [("servo", servo, "duty"), ("carriage", carriage, "motor_current_A")])
 def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, make, column):
     log = make(np.random.default_rng(1), levels=(0.9, -0.8, 0.7, -0.9, 0.8, -0.7), hold=0.5)
-    runs = records.read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log))
-    assert rig_facts.swapped_sentence(runs) == ""
+    runs = read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log))
+    assert swapped_sentence(runs) == ""
     half = len(log[column]) // 2
     log[column] = np.where(np.arange(len(log[column])) < half, log[column], -log[column])
-    text = rig_facts.swapped_sentence(records.read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log)))
+    text = swapped_sentence(read_runs(tmp_path / "log.csv", robot=written(tmp_path, kind, log)))
     assert f"opposite to {column}" in text and abs(int(text.split()[2].strip(",")) - half) < 30
 
 
-@pytest.mark.parametrize(("delay", "stated", "words"), [
+@pytest.mark.parametrize("delay, stated, words", [
     (0.149, True, "a longer delay is not searched"), (-0.2, False, "earlier than its column states, and a longer delay"),
     (0.1, False, "the rig file gives no delay. To start"), (0.1, True, ""), (0.003, False, ""),
 ])  # fmt: skip
@@ -164,14 +166,14 @@ def test_an_error_in_the_first_sample_after_each_step_is_named_with_its_share(ro
     assert error_after_steps(runs, off) == []  # an error everywhere
 
 
-@pytest.mark.parametrize(("file", "options", "freed"), [
+@pytest.mark.parametrize("file, options, freed", [
     ("", {}, True), ("", {"fix": ["rig.delay"]}, False), ("", {"free": ["motor.resistance"]}, False),
     ("[rig]\ndelay = \"0 ± 0\"\n", {}, False),
 ])  # fmt: skip
 def test_a_delay_is_freed_if_the_error_lies_after_the_steps(robot, tmp_path, monkeypatch, file, options, freed):
     """Mass and resistance of a robot absorbed 95 % of the error of its current, which was read after each step."""
     (tmp_path / "rig.toml").write_text(RIG + file, encoding="utf-8")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_robot(tmp_path / "rig.toml")
     runs, searches = Runs("log.csv", motor()).of(robot), []
     off = 0.02 * np.random.default_rng(0).standard_normal((len(runs), 2))
     volts = runs["supply_voltage_V"]
@@ -218,13 +220,13 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
 
 def test_a_log_without_a_motion_is_reported_with_what_to_log(robot):
     runs = Runs("log.csv", motor()).of(robot)
-    assert shown_states.missing_states_remarks(runs, robot) == []
+    assert missing_states_remarks(runs, robot) == []
     silent = Runs("log.csv", {**motor(), SPEED: np.full(600, np.nan)}).of(robot)
-    (note,) = shown_states.missing_states_remarks(silent, robot)
+    (note,) = missing_states_remarks(silent, robot)
     assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)
 
 
-@pytest.mark.parametrize(("levels", "converged"), [(6, False), (6, True), (5, False)])
+@pytest.mark.parametrize("levels, converged", [(6, False), (6, True), (5, False)])
 def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(robot, monkeypatch, levels, converged):
     volts, told, kept = np.repeat(np.linspace(8, 24, levels), 60), [], []
     noise = np.random.default_rng(0).standard_normal((2, len(volts)))
@@ -248,16 +250,16 @@ def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(rob
         def trace(self, ahead):
             """Stands for the stages of the table."""
             assert ahead and self.keep("ranking", lambda: 1) == self.keep("search 0", lambda: 1) == 1
-            return verdict.LoopStages("none")
+            return LoopStages("none")
 
-    readings = discover.Stage("readings", (), lambda given: verdict.LoopStages("place"))
+    readings = discover.Stage("readings", (), lambda given: LoopStages("place"))
     base_and_settled = [s for s in discover.STAGES if s.name in ("base", "settled")]
     monkeypatch.setattr(discover, "STAGES", (*base_and_settled, readings))
     trace_verdict = discover.trace_verdict
     monkeypatch.setattr(discover, "trace_verdict", Table.trace)
-    given = loop_input.LoopInput(
+    given = LoopInput(
         runs, None, robot, *[None] * 4, keep=keep, progress=lambda note: told.append(describe(note)),
-        settled=lambda: loop_input.settled_input(given, lambda runs, settled: Table(settled, runs)),
+        settled=lambda: settled_input(given, lambda runs, settled: Table(settled, runs)),
     )  # fmt: skip
     found = trace_verdict(given)
     if converged or levels < 6:
@@ -267,5 +269,5 @@ def test_a_log_without_a_fit_is_answered_on_its_settled_runs_if_they_suffice(rob
     table, notes = given.settled().runs, given.settled().at_first
     assert told == [describe(note) for note in notes] and "no fit over time converges, so the fit uses" in told[0]
     assert len(table) == levels and not table.sampled
-    again = loop_input.prepare_loop(table, robot, settled=notes)
+    again = prepare_loop(table, robot, settled=notes)
     assert {*notes} <= {*again.notes} and {*notes} <= {*again.at_first}

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from calibration.data import robot_file, settling
-from calibration.data import runs as records
+from calibration.data.robot_file import change_robot, read_robot
+from calibration.data.runs import read_runs
+from calibration.data.settling import settle_log
 from calibration.data.stated import EXAMPLE
 from calibration.data.unused_readings import thin_rows
 from calibration.inference import bases, observers
@@ -20,7 +21,7 @@ def written(tmp_path, kind, columns):
     (tmp_path / "rig.toml").write_text(rig_new.rig_template(kind).replace(EXAMPLE, "measured"), encoding="utf-8")
     lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return robot_file.read_robot(tmp_path / "rig.toml")
+    return read_robot(tmp_path / "rig.toml")
 
 
 def sampled(rng, speed, angle, imposed, rate, delay, step, jitter=0.1):
@@ -74,7 +75,7 @@ def carriage(rng, levels=(1.2, 1.6, 2.0, -1.4, -1.8), hold=1.5):
 def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
     rng = np.random.default_rng(1)
     robot = written(tmp_path, "servo", servo(rng))
-    found = settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot))
+    found = settle_log(read_runs(tmp_path / "log.csv", robot=robot))
     volts, r, k, friction, ratio, eta, viscous, dry = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005, 0.05
     duty = np.array([0.4, 0.7, 1.0, -0.6, -0.9])
     torque = ratio * eta * (k * volts * np.abs(duty) / r - friction) - dry
@@ -88,7 +89,7 @@ def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
 
 def test_a_carriages_log_of_current_and_position_settles(tmp_path):
     robot = written(tmp_path, "carriage", carriage(np.random.default_rng(2)))
-    found = settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot))
+    found = settle_log(read_runs(tmp_path / "log.csv", robot=robot))
     radius = 5e-3 / (2 * np.pi)
     current = np.array([1.2, 1.6, 2.0, -1.4, -1.8])
     exact = np.sign(current) * (0.05 * np.abs(current) - 0.004 - 12.0 * radius) / (400.0 * radius**2) * radius * 1e3
@@ -97,14 +98,14 @@ def test_a_carriages_log_of_current_and_position_settles(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "make", "column", "least"), [
+@pytest.mark.parametrize("kind, make, column, least", [
     ("servo", servo, "output_angle_deg", 0.05), ("carriage", carriage, "position_mm", 0.005),
 ])  # fmt: skip
 def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_path, kind, make, column, least):
     robot = written(tmp_path, kind, make(np.random.default_rng(3), hold=0.4))
     if kind == "carriage":
-        robot = robot_file.change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+        robot = change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
+    runs = read_runs(tmp_path / "log.csv", robot=robot)
     ready = prepare_input(runs, robot)
     shown = points.simulate_histories(ready.robot, runs, None)
     error = np.std(shown[column] - runs[column])
@@ -121,8 +122,8 @@ def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_
     text = (tmp_path / "log.csv").read_text(encoding="utf-8").splitlines()
     modes = ("mode", *np.where(driven, "voltage", "coast"))
     (tmp_path / "log.csv").write_text("\n".join(map(",".join, zip(text, modes, strict=True))), encoding="utf-8")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    robot = read_robot(tmp_path / "rig.toml")
+    runs = read_runs(tmp_path / "log.csv", robot=robot)
     observer = observers.Histories.of(runs, robot)
     seen = {}
     monkeypatch.setattr(bases, "curve_families", lambda columns, *_, **__: seen.update(columns) or ())
@@ -148,7 +149,7 @@ def test_a_thinned_log_takes_the_mean_of_its_current_and_fewer_steps(tmp_path):
     wanted = travelled(time, current)
     columns = {"time_s": time, "motor_current_A": current, "position_mm": 1e3 * wanted[1]}
     robot = written(tmp_path, "carriage", columns)
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot).of(robot)
+    runs = read_runs(tmp_path / "log.csv", robot=robot).of(robot)
     thinned = thin_rows(runs, 500)
     brief = observers.Histories.of(thinned, robot)
     times, amperes = np.asarray(brief.times[0]), np.asarray(brief.conditions.motor_current[0])

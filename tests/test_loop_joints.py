@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 
 from calibration.data.delimited import read_csv_columns
 from calibration.data.input_errors import BadData
-from sweeps import store
-from sweeps.commands import loop_joints
+from sweeps.commands.loop_joints import Chain, runs_of_joints
+from sweeps.store import finish_run_folder, open_folder
 from tests.commands import ends, read_json, read_rig
 
 JOINTS = ("shoulder", "elbow")
@@ -87,7 +87,7 @@ def write(folder, rows, noise=0.0, model=MODEL):
 def test_torque_of_the_model_is_what_mujoco_was_given_without_friction_and_rotors(tmp_path):
     """At states of the arm, MuJoCo's own forward dynamics with the torque gives the acceleration."""
     (tmp_path / "arm.xml").write_text(MODEL)
-    chain, rows = loop_joints.Chain(tmp_path / "arm.xml"), arm(0.5)[::10]
+    chain, rows = Chain(tmp_path / "arm.xml"), arm(0.5)[::10]
     friction = (
         np.where(rows[:, 7:9] > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(rows[:, 7:9] / REST) + VISCOUS * rows[:, 7:9]
     )
@@ -108,8 +108,8 @@ def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
     for noise in (0.0, 1e-3):
         write(tmp_path, rows, noise)
         robot = read_rig(tmp_path, RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n")
-        chain, log = loop_joints.Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
-        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"].whole
+        chain, log = Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
+        runs = runs_of_joints(log, chain, {"elbow": robot})["elbow"].whole
         needed = chain.torques(motion)[:, 1]
         given = runs["load_torque_Nm"] + 0.05 * acceleration + 0.3 * np.sin(angle - 0.2)
         errors.append(np.abs(given - needed)[inner].max() / np.abs(needed).max())
@@ -126,11 +126,11 @@ def test_units_of_a_log_reach_each_joint(tmp_path):
     )
     write(tmp_path, rows)
     header, *lines = (tmp_path / "log.csv").read_text().splitlines()
-    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
+    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, Chain(tmp_path / "arm.xml")
 
     def runs(units, header=header, lines=lines):
         (tmp_path / "log.csv").write_text("\n".join([header, units, *lines]))
-        return loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)["elbow"]
+        return runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)["elbow"]
 
     table = runs("s,V,V,A,A,deg,deg")
     assert any("contains units" in note for note in table.notes)
@@ -152,9 +152,9 @@ def test_current_is_left_out_where_the_direction_of_the_smoothed_speed_is_uncert
     """A reading of friction with the wrong sign looks like a missing effect."""
     rows = arm(2.0)
     write(tmp_path, rows, 3e-4)
-    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
+    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, Chain(tmp_path / "arm.xml")
     log = read_csv_columns(tmp_path / "log.csv", "log.csv")
-    table = loop_joints.runs_of_joints(log, chain, robots)["elbow"]
+    table = runs_of_joints(log, chain, robots)["elbow"]
     true_speed = np.interp(table["time_s"], rows[:, 0], rows[:, 8])
     wrong = np.sign(table["motor_speed_rpm"]) != np.sign(true_speed)
     kept = np.isfinite(table["motor_current_A"])
@@ -168,8 +168,8 @@ def test_currents_of_a_joint_are_not_late(tmp_path, joint):
     late by 4 ms. Inertias that move half a row early made that 10 ms."""
     rows, k = arm(2.0, seed=12), JOINTS.index(joint)
     write(tmp_path, rows, 3e-4)
-    robots, chain = {joint: read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
-    table = loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)[joint]
+    robots, chain = {joint: read_rig(tmp_path, RIG)}, Chain(tmp_path / "arm.xml")
+    table = runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)[joint]
     time, speed = table.whole["time_s"], table.whole["motor_speed_rpm"] * np.pi / 30 / 50
     gradient = np.gradient(speed, time)[np.searchsorted(time, table["time_s"])]
     speed = speed[np.searchsorted(time, table["time_s"])]
@@ -183,7 +183,7 @@ def test_currents_of_a_joint_are_not_late(tmp_path, joint):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "joints", "message"),
+    "old, new, joints, message",
     [
         ("", "", "wrist", r"--joints: got wrist; arm.xml has no such driven joint"),
         ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow is no named hinge"),
@@ -238,13 +238,13 @@ def test_finished_joints_are_kept_and_all_are_on_one_page(mmrjax, tmp_path, monk
 
     def loop(one, beside, robot, runs):
         ran.append(one.joints)
-        with store.open_folder("loop", one, robot, beside, runs) as folder:
+        with open_folder("loop", one, robot, beside, runs) as folder:
             errors = {
                 which: {"held_out": {"motor_current": {"rms_percent": x}}}
                 for which, x in (("before", 4.0), ("after", 2.0))
             }
             folder.write_json("result.json", {"statement": f"Friction of {runs.source}.", "errors": errors})
-            return store.finish_run_folder(folder, one, {}, robot=robot, runs=runs)
+            return finish_run_folder(folder, one, {}, robot=robot, runs=runs)
 
     monkeypatch.setattr("sweeps.commands.loop._run_with_time_limit", loop)
     write(

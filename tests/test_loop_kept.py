@@ -15,13 +15,13 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import OutOfTime
-from calibration.discovery import discover as room
+from calibration.discovery.discover import discover
 from calibration.discovery.verdict import LoopStages
 from calibration.inference import population
 from mmrjax.compile import programs
-from sweeps import config
-from sweeps import stage_files as kept_stages
 from sweeps.commands import loop as command
+from sweeps.config import FolderPart, LoopBeside
+from sweeps.stage_files import read_stage, write_stage
 from sweeps.store import RunFolder, open_folder
 from tests.commands import ends
 
@@ -44,7 +44,7 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
 
 def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch, robot):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
-    told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), config.FolderPart(out=tmp_path / "x")
+    told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), FolderPart(out=tmp_path / "x")
 
     def stage(make, force=False):
         with (
@@ -70,9 +70,9 @@ def test_nothing_kept_leaves_nothing_behind(tmp_path):
     assert not folder.partial.exists()
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("90s", 90.0), ("5min", 300.0), ("1.5h", 5400.0), ("40", 40.0)])
+@pytest.mark.parametrize("text, seconds", [("90s", 90.0), ("5min", 300.0), ("1.5h", 5400.0), ("40", 40.0)])
 def test_a_budget_has_a_unit(text, seconds):
-    assert config.LoopBeside(within=text).seconds == seconds
+    assert LoopBeside(within=text).seconds == seconds
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def rig(tmp_path):
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
 
-@pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
+@pytest.mark.parametrize("end, code", [(KeyboardInterrupt, 130), (OutOfTime, 3)])
 def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, code):
     def first(*_, keep, **__):
         keep("verdict", lambda: LoopStages("class"))
@@ -184,14 +184,14 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
     def keep(name, make):
         made = make()
-        kept_stages.write_stage(tmp_path / name, made)
-        written[name] = kept_stages.read_stage(tmp_path / name)
+        write_stage(tmp_path / name, made)
+        written[name] = read_stage(tmp_path / name)
         return made
 
-    found = room.discover(runs, robot, replicates=250, keep=keep)
+    found = discover(runs, robot, replicates=250, keep=keep)
     factors = tuple(float(name.split()[1]) for name in written if name.startswith("noise"))
     assert {"base", "bootstrap 0", "verdict", "result"} <= set(written) and len(factors) == 2
-    again = room.discover(runs, robot, replicates=250, keep=lambda name, make: written[name])
+    again = discover(runs, robot, replicates=250, keep=lambda name, make: written[name])
     assert again.verdict == found.verdict and again.chi2 == found.chi2
     assert [e.name for e in again.effects] == [e.name for e in found.effects]
     assert again.sensitivity == found.sensitivity
@@ -201,7 +201,7 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
             raise concurrent.futures.TimeoutError
         return written[name]
 
-    ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
+    ended = discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
     assert ended.verdict == found.verdict and not ended.sensitivity
     assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [tuple(sorted(factors))]
 

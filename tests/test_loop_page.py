@@ -31,13 +31,14 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.discovery.verdict import FAR
 from calibration.inference.fit_notes import Remark, remarks_with_codes
 from calibration.inference.identifiability import HELD
-from calibration.words import loop_words as words
+from calibration.words.loop_words import largest_share, p_value
 from mmrjax.model import channels
-from sweeps.commands import loop as room
-from sweeps.pages import loop_figures
+from sweeps.commands.loop import changes_by_effect
 from sweeps.pages.figure_style import figure_settings
-from sweeps.report import loop_report, page_renderer
+from sweeps.pages.loop_figures import BLUE, draw_effect_laws
+from sweeps.report import page_renderer
 from sweeps.report.fit_tables import Change
+from sweeps.report.loop_report import _next_step, loop_document, rows_for_figures
 from sweeps.report.terminal_renderer import print_document
 from tests.commands import schema_of
 
@@ -68,7 +69,7 @@ CASES = [n if n == "churning" else pytest.param(n, marks=pytest.mark.slow) for n
 
 def documented(found):
     """The report of a result, as the command makes it."""
-    return loop_report.loop_document(found, "nominal", room.changes_by_effect(found))
+    return loop_document(found, "nominal", changes_by_effect(found))
 
 
 def page_of(folder, found):
@@ -125,7 +126,7 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
     best = min((a["rise_chi2"] for a in d["implausible"]), default=0.0)
     assert best > -d["settings"]["same"] or "ruled out only by size or sign" in got.page.text
     # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
-    p = words.p_value(got.found.before.p_value)
+    p = p_value(got.found.before.p_value)
     assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["verdict_statement"]
     for e in got.found.effects:
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
@@ -152,11 +153,11 @@ def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
     """And the law that is drawn is of the robot that is written, as the dots are."""
     found = shown("churning", capsys).found
     (effect,) = found.effects
-    change = room.changes_by_effect(found)[effect.name]
+    change = changes_by_effect(found)[effect.name]
     k = [c.name for c in found.channels].index(change.channel.name)
     here = found.included
     assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
-    assert change.rms > 1.0 and "brush_drop" not in room.changes_by_effect(found)
+    assert change.rms > 1.0 and "brush_drop" not in changes_by_effect(found)
     assert "law" in drawn(shown("churning", capsys).text)
 
 
@@ -169,11 +170,9 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     )
     assert "May I use it for …" in head and "new law, 95 % band" in head
     with figure_settings():
-        (axes,) = loop_figures.draw_effect_laws(
-            got.found, loop_report.rows_for_figures(got.found), room.changes_by_effect(got.found)
-        ).axes
+        (axes,) = draw_effect_laws(got.found, rows_for_figures(got.found), changes_by_effect(got.found)).axes
     band = axes.collections[-1].get_paths()[0].get_extents()
-    (change,) = room.changes_by_effect(got.found).values()
+    (change,) = changes_by_effect(got.found).values()
     size = got.found.effects[0].parameters["amplitude"]
     largest = np.abs(change.with_it - change.without).max() / change.channel.factor
     assert axes.get_xlabel() == "motor speed [rpm]"
@@ -202,7 +201,7 @@ def drawn_law(table, x_column, law, sd=0.1):
     )  # fmt: skip
     change = {"ours": Change(speed, 1.0, 0 * law, law)}
     with figure_settings():
-        fig = loop_figures.draw_effect_laws(found, table, change)
+        fig = draw_effect_laws(found, table, change)
     fig.canvas.draw()
     legend = next(x for x in [*fig.legends, *(a.get_legend() for a in fig.axes)] if x)
     assert fig.axes[0].get_xlabel() == x_column
@@ -220,7 +219,7 @@ def test_both_directions_of_a_law_have_their_own_line():
         {"supply_voltage_V": volts, "configuration": np.full(16, "a")}, "supply voltage [V]", np.abs(volts)
     )
     assert names.count("backward") == 1 and len([n for n in names if n.startswith("new law")]) == 1
-    ways = [np.sign(line.get_xdata()) for line in curves_of(axes, loop_figures.BLUE)]
+    ways = [np.sign(line.get_xdata()) for line in curves_of(axes, BLUE)]
     assert len(ways) == 2 and all(np.ptp(way) == 0 for way in ways)
 
 
@@ -229,7 +228,7 @@ def test_a_law_over_two_quantities_is_a_line_for_each_level():
     volts, torque = (x.ravel() for x in np.meshgrid([4.0, 8.0, 12.0], np.linspace(0.0, 3.0, 7)))
     table = {"supply_voltage_V": volts, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
     axes, names = drawn_law(table, "load torque [N·m]", -torque * (1 + 4 / volts))
-    lines = curves_of(axes, loop_figures.BLUE)
+    lines = curves_of(axes, BLUE)
     assert len(lines) == 3 and all(np.all(np.diff(line.get_ydata()) < 0) for line in lines)
     assert "new law by supply voltage, 95 % band (±20 %)" in names
     band = axes.collections[-1].get_paths()[0].get_extents()
@@ -263,13 +262,13 @@ def test_reading_that_weighs_most_is_named(shown, capsys):
     after = seen.measured + 0.5 * seen.sd
     after[row, 1] += 40 * seen.sd[row, 1]
     off = dataclasses.replace(found, written=True, readings_of_rows=dataclasses.replace(seen, after=after))
-    said = words.largest_share(off)
+    said = largest_share(off)
     assert (
         said.startswith(f"Row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
         and "its motor speed" in said
     )
     even = dataclasses.replace(seen, after=seen.measured + 0.5 * seen.sd)
-    assert words.largest_share(dataclasses.replace(off, readings_of_rows=even)) == ""
+    assert largest_share(dataclasses.replace(off, readings_of_rows=even)) == ""
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -362,7 +361,7 @@ def test_a_run_that_is_different_is_checked_before_another_experiment():
     test = NameTest("cogging", 7.1, 3.7, (), 0.0, 4, changed="bench.inertia", root_changed=15.8)
     remark = Remark("run_differs", test=test)
     steps = [
-        loop_report._next_step(
+        _next_step(
             SimpleNamespace(headline=SimpleNamespace(level=level), remarks=(remark,), next_experiment=None), ""
         )
         for level in ("place", "class")
