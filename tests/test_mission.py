@@ -274,25 +274,6 @@ def test_derivatives_by_every_parameter_and_row_match_differences(robot):
 
 
 @pytest.mark.slow
-def test_fidelities_agree_on_energy_per_metre(robot):
-    """To 1 %: settled travel of a mission, of steady, and of the track model, whose share of the guides the others take."""
-    from mmrjax.fidelities.steady import steady
-    from mmrjax.fidelities.track import track_batch
-
-    for voltage, slope in ((15.0, 0.0), (24.0, 5.0)):
-        one = asked(voltage=voltage, slope_deg=slope, adhesion=2.0)
-        resolved = track_batch(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], one), rolling=True)
-        shared = params.replace(robot, {"6T2A.track.guide_share": float(resolved.steady.guide_share[0])})
-        lumped = steady(shared, one)
-        p = rows([0, 3, 6], voltage=voltage, slope_deg=slope)
-        found = run(shared, one, p)
-        driven = float(found.segments.energy[0, 1] / found.segments.of["distance"][0, 1])
-        per_metre = [float(r.power_supply) / float(r.reading["speed"]) for r in (lumped,)]
-        per_metre.append(float(resolved.result.power_supply[0]) / float(resolved.result.reading["speed"][0]))
-        assert driven == pytest.approx(per_metre[0], rel=5e-3) and per_metre[1] == pytest.approx(driven, rel=1e-2)
-
-
-@pytest.mark.slow
 def test_endurance_has_the_derivative_of_its_closed_form(robot):
     def endurance(capacity):
         changed = params.replace(robot, {"battery.capacity": capacity})

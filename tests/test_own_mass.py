@@ -105,13 +105,8 @@ def _sd(effect):
     return next(p for p in params.walk_parameters(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
 
 
-def shown(name):
-    """A test of many effects: one compiles, the rest only run."""
-    return pytest.param(name, marks=[] if name in ("", "mass_offset", "sinkage") else pytest.mark.slow)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [shown(n) for n in ("", *SEEN)])
+@pytest.mark.parametrize("name", ("", *SEEN))
 def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     reading, status, again, status_again = fits(name)
     assert_array_equal(status_again, status)

@@ -100,10 +100,8 @@ def test_parts_winding_stays_cool_at_the_nominal_current():
 def test_parts_hold_the_robot_of_the_paper():
     (motor,) = (m for m in part_options.packaged_motors() if m.name == "RE 30 24 V")
     ours = Motor()
-    assert motor.resistance == pytest.approx(float(ours.resistance), rel=1e-12)
-    assert motor.inductance == pytest.approx(float(ours.inductance), rel=1e-12)
-    assert motor.torque_constant == pytest.approx(float(ours.torque_constant), rel=1e-12)
-    assert motor.inertia == pytest.approx(float(ours.inertia), rel=1e-12)
+    for name in ("resistance", "inductance", "torque_constant", "inertia"):
+        assert getattr(motor, name) == pytest.approx(float(getattr(ours, name)), rel=1e-12), name
     thermal = motor.resistance_thermal_housing + motor.resistance_thermal_winding
     assert thermal == pytest.approx(float(ours.resistance_thermal), rel=1e-12)
     assert motor.time_constant_winding == pytest.approx(float(ThermalDrift().time_constant), rel=1e-12)

@@ -1,7 +1,5 @@
 """Levers stated of runs: `simulate` leaves their posture, and what cannot be is refused in a sentence."""
 
-import csv
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.model import params
 from sweeps.inputs import one_run
 from sweeps.report import turn_words
-from tests.commands import ends, text_file
+from tests.commands import ends, rows, text_file
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +86,7 @@ def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
         "steps up to 236 mm",
         code=0,
     )
-    with (folder / "posture.csv").open(newline="") as file:
-        (row,) = csv.DictReader(file)
+    (row,) = rows(folder / "posture.csv")
     assert float(row["highest_step_mm"]) == pytest.approx(236, abs=1)
     page = (folder / "report.html").read_text()
     assert 'id="posture-section"' in page and (folder / "figures/posture.svg").exists()

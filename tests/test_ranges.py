@@ -1,7 +1,5 @@
 """Readings in other units, and readings of another robot, are found before anything is fitted."""
 
-import csv
-
 import numpy as np
 import pytest
 import worlds.histories
@@ -16,7 +14,7 @@ from calibration.inference import ranges
 from calibration.inference.ranges import check_ranges
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
-from tests.commands import read_rig, read_table
+from tests.commands import csv_text, read_rig, read_table, text_file
 
 #: Column of a table, factor on its readings, and what is said.
 WRONG = {
@@ -150,10 +148,7 @@ def test_missing_channels_and_readings_pass(runs, robot):
 
 @pytest.mark.parametrize("command", ["compare", "calibrate", "loop"])
 def test_every_command_on_measured_runs_refuses(runs, command, tmp_path):
-    with (tmp_path / "runs.csv").open("w", newline="", encoding="utf-8") as file:
-        out = csv.writer(file)
-        out.writerow(runs.columns)
-        out.writerows(zip(*scaled(runs, "speed_mm_s", 1e-3).columns.values(), strict=True))
+    text_file(tmp_path / "runs.csv", csv_text(scaled(runs, "speed_mm_s", 1e-3).columns))
     answer = mmrjax(tmp_path, command, "runs.csv", "--out", "x")
     assert answer.code == 4 and "are they in m/s? expected mm/s" in answer.err
     assert len(answer.err.strip().splitlines()) == 1 and not (tmp_path / "x").exists()

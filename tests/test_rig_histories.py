@@ -139,19 +139,6 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
         assert Histories.check(runs, nothing) == []
 
 
-@pytest.mark.nightly
-def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
-    robot = drive(tmp_path, "total_current", imposed="motor_speed", start="measured")
-    truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
-    t = np.arange(0, 4, 0.03)
-    speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / quantities.RPM
-    runs = history(tmp_path, robot, truth, {"time_s": t, "motor_speed_rpm": speed}, [0.01], 1)
-    found = calibrate(runs, robot, **OPTIONS)
-    delay, friction = found.parameters["rig.delay"], found.parameters["bench.loss_coulomb"]
-    assert abs(delay.value - 0.03) < 4 * delay.sd < 4e-3
-    assert abs(friction.value - 0.26) < 4 * friction.sd < 0.02
-
-
 @pytest.mark.slow
 def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
     robot = drive(tmp_path, "total_current", "motor_speed", "output_angle", load=ARM, start="free")

@@ -68,7 +68,7 @@ def test_steady_with_effects_matches_the_newton_of_numpy(robot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("effects", [False, True])
 def test_steady_outputs_are_those_of_steady_batch(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
     whole = steady_batch(robot, runs)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from test_track_bad_input import SHAKING
 
 from mmrjax.fidelities.steady import steady
 from mmrjax.fidelities.track import PARTS, _simulate_batch, track_batch
@@ -65,18 +66,7 @@ def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
 
 def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     """Set S of docs/explanation/vibration.md, guides recessed by 0.36 mm: it shakes and slides beyond V_s on 20°."""
-    shaking = params.replace(
-        robot,
-        {
-            "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
-            "6T2A.ground.friction.speed_static": 0.00961,
-            "6T2A.ground.friction.speed_dynamic": 0.0961,
-            "6T2A.track.guide_friction": 0.06, "running_gear.guide_recess": 3.648e-4,
-            "running_gear.contact_stiffness": 3.816e7,
-            "running_gear.contact_damping": 649.2, "running_gear.guide_gap": 0.01066,
-            "running_gear.centre_offset": 1.1e-4, "running_gear.payload_height": 0.0595,
-        },
-    )  # fmt: skip
+    shaking = params.replace(robot, SHAKING)
     commands = Conditions(voltage=[15.0, 15.0], slope_deg=[10.0, 20.0])
     answer = _simulate_batch(shaking, commands, 1.5, 1e-4, 1e-3, True)
     assert [STATUSES[s] for s in answer.result.status] == ["converged"] * 2

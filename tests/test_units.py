@@ -1,6 +1,5 @@
 """Units of columns against a table written out by hand, and quantities that are one row each."""
 
-import csv
 import math
 import os
 import subprocess
@@ -13,7 +12,7 @@ from calibration.data.input_errors import BadData
 from mmrjax.fidelities import outputs
 from mmrjax.model import channels, quantities
 from sweeps.commands import explain
-from tests.commands import ROOT, read_json, read_rig, read_table, text_file
+from tests.commands import ROOT, columns_of, read_json, read_rig, read_table, text_file
 
 #: One of each unit, in SI.
 BY_HAND = {
@@ -143,8 +142,7 @@ def test_a_channel_of_one_row_is_in_tables_sweeps_help_pages_and_json(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "torque of the gearbox [N·m], as shown by its instrument" in done.stdout
-    with (tmp_path / "swept/runs.csv").open() as stream:
-        assert [float(row["gear_torque_Nm"]) for row in csv.DictReader(stream)] == pytest.approx([0.1, 0.1])
+    assert columns_of(tmp_path / "swept/runs.csv")["gear_torque_Nm"] == pytest.approx([0.1, 0.1])
     assert "torque of the gearbox" in (tmp_path / "compared/report.html").read_text("utf-8")
     error = read_json(tmp_path / "compared/result.json")["errors"]["bench"]["gear_torque"]
     assert error["unit"] == "Nm" and error["rms"] == pytest.approx(math.sqrt((0.0**2 + 0.02**2) / 2), rel=1e-6)

@@ -83,11 +83,8 @@ CASES = {
 }
 
 
-SLOW = ("current over time", "speeds of a turn", "mission")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [pytest.param(k, marks=pytest.mark.slow) if k in SLOW else k for k in CASES])
+@pytest.mark.parametrize("case", CASES)
 def test_no_number_rests_on_what_is_unknown(tmp_path, case):
     """Results, statuses, flags and histories, of every kind of run that a rig has."""
     text, imposed, more, conditions, options = CASES[case]
