@@ -1,6 +1,8 @@
 """The command line in this process, the tables that it leaves, and files that it reads."""
 
+import contextlib
 import csv
+import dataclasses
 import json
 import os
 import sys
@@ -11,6 +13,7 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
+from calibration.data.input_errors import BadData
 from sweeps import cli
 
 #: The checkout.
@@ -48,6 +51,14 @@ def ends(run, *said, code=2):
     return run
 
 
+@contextlib.contextmanager
+def refused(says, error=BadData):
+    """What it does is refused in one sentence that matches `says`."""
+    with pytest.raises(error, match=says) as refusal:
+        yield
+    assert "\n" not in str(refusal.value)
+
+
 def text_file(path, text):
     """Path of a new file with this text."""
     path.write_text(text, encoding="utf-8")
@@ -68,6 +79,11 @@ def read_rig(folder, text, name="rig.toml", **options):
 def read_table(folder, text, robot=None, name="log.csv", **options):
     """The runs of a new table with this text."""
     return records.read_runs(text_file(folder / name, text), robot=robot, **options)
+
+
+def with_columns(runs, **columns):
+    """The runs with these columns added or replaced."""
+    return dataclasses.replace(runs, columns=runs.columns | columns)
 
 
 def read_json(path):

@@ -89,7 +89,7 @@ def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut):
     """990.3 s and 816 m, where whole steps gave 1161 s and 944 m."""
     time, distance = integrated(3.3)
     assert STATUSES[int(cut.result.status)] == "cut_off"
-    assert float(cut.total.time) == pytest.approx(time, rel=2e-5)
+    assert cut.total.time == pytest.approx(time, rel=2e-5)
     assert float(cut.total.of["path"]) == pytest.approx(distance, rel=5e-5)
 
 
@@ -109,7 +109,7 @@ def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
 def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
     at = mm.Conditions(configuration=0, battery=1.0)
     numbers = mission_batch.mission_numbers(with_battery(robot), at, cut)
-    assert float(numbers["endurance"]) == float(cut.total.time) and float(numbers["state_of_charge"]) > 0.1
+    assert float(numbers["endurance"]) == cut.total.time and float(numbers["state_of_charge"]) > 0.1
     assert float(numbers["range"]) == float(cut.total.of["path"])
 
 
@@ -117,7 +117,7 @@ def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
 def test_the_inrush_recovers_in_time_and_a_longer_stay_below_does_not(robot, followed):
     """The start presses the cells below for 9 ms: a delay that is shorter ends the mission there, timed."""
     short = followed(with_battery(robot, delay=0.004))
-    assert STATUSES[int(short.result.status)] == "cut_off" and float(short.total.time) < 0.005
+    assert STATUSES[int(short.result.status)] == "cut_off" and short.total.time < 0.005
     marks, count = short.course.event, int(short.steps - short.rejected)
     k = int(np.flatnonzero(marks[:count] == MARKS.index("below_cut_off"))[-1])
     assert short.course.time[count - 1] - short.course.time[k] == pytest.approx(0.004, abs=1e-12)
@@ -143,16 +143,16 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     for k in range(4):
         apart = (both(zero.at[k].add(h))[0] - both(zero.at[k].add(-h))[0]) / (2 * h)
         assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
-        assert abs(float(apart[0])) > 1.0  # s: the moment moves
+        assert abs(apart[0]) > 1.0  # s: the moment moves
 
 
 @pytest.mark.slow
 def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
     """The energy of a battery follows from its charge: one that has drifted by 1.3e-4 is not overlooked."""
     through = float(cut.total.of["drawn"])
-    assert abs(float(cut.total.unaccounted)) < 1e-6 * through
+    assert abs(cut.total.unaccounted) < 1e-6 * through
     drifted = dataclasses.replace(cut.total, given=cut.total.given * (1 + 1.3e-4))
-    assert float(drifted.unaccounted) == pytest.approx(1.3e-4 * through, rel=1e-2)
+    assert drifted.unaccounted == pytest.approx(1.3e-4 * through, rel=1e-2)
 
 
 # --- what is said ---------------------------------------------------------------------------------------------------

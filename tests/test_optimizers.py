@@ -243,15 +243,15 @@ def test_one_evaluation_has_the_derivatives_of_the_root(posed, truth):
 def test_the_objective_is_finite_where_the_robot_slides_and_leads_back(posed):
     nominal_z = jnp.zeros(len(posed.coordinates))
     seen = posed.observation(nominal_z)
-    assert np.sum(np.asarray(seen.status) == SLIDES) == 6  # Table 5's adhesion against 15 and 20 degrees
-    assert np.all(np.isfinite(np.asarray(seen.reading)))
+    assert np.sum(seen.status == SLIDES) == 6  # Table 5's adhesion against 15 and 20 degrees
+    assert np.all(np.isfinite(seen.reading))
     gradient = jax.grad(lambda z: 0.5 * jnp.sum(residuals(posed, z) ** 2))(nominal_z)
     for name, g in zip(posed.coordinates.names, np.asarray(gradient), strict=True):
         if name.endswith("friction.static"):
             assert g < 0  # more adhesion costs less
     found = solve(posed, nominal_z, posed.data)
     assert found.converged
-    assert np.all(np.asarray(posed.observation(found.z).status) == CONVERGED)
+    assert np.all(posed.observation(found.z).status == CONVERGED)
 
 
 @pytest.mark.slow
@@ -303,7 +303,7 @@ def test_search_goes_along_the_edge_of_a_penalty():
         end = to_the_end(z, True)
         assert steps(end) < 30
         assert_allclose(end.value[1:], 0.0, atol=1e-6)
-        assert 0.1999 < float(end.value[0]) < 0.2
+        assert 0.1999 < end.value[0] < 0.2
         found = end.state.found
         assert jnp.linalg.norm(one_sided_step(found.residual, found.jacobian, found.one_sided, 0.0)) < 1e-6
 
@@ -338,15 +338,15 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured, 
     it nothing shows the penalty."""
     posed = pose(measured, robot, stated="current=10%,motor_speed=6%,speed=4%")
     limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
-    assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
+    assert np.any(posed.observation(limit.z[0]).adhesion_used > 1 - problem.MARGIN)
     inside = jnp.asarray(limit.z[0]).at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
     r, jacobian, seen = fit.linearise(posed, inside, posed.data)
-    assert (np.asarray(seen.adhesion_used) < 1 - problem.MARGIN)[:10].all()
+    assert (seen.adhesion_used < 1 - problem.MARGIN)[:10].all()
     plain = np.linalg.lstsq(np.asarray(jacobian), np.asarray(r))[0]
     assert 0.5 * np.sum((jacobian @ plain) ** 2) > 3 * fit.DECREMENT  # a gain that is not there
     found, _, _ = fit.search_rollout(posed, inside, posed.data)
-    assert found.converged and float(found.decrement) < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
-    assert float(found.cost) == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
+    assert found.converged and found.decrement < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
+    assert found.cost == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
 
 
 def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():

@@ -12,7 +12,7 @@ from synthetic import SETTLED, STATED
 
 from calibration.data import inferred_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import findings, loop_input
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
@@ -22,6 +22,7 @@ from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
+from tests.commands import refused
 
 #: Mass without payload that the tables here state [kg]; the nominal robot has 13.1 and 11.5 kg.
 MASSES = {"6T2A": 14.2, "4W2T": 13.1}
@@ -189,13 +190,13 @@ def test_a_total_without_its_payload_is_suspected(robot):
 def test_a_mass_that_no_robot_has_is_refused(robot):
     runs = table({"6T2A": 0.003, "4W2T": 13.1})
     says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected 0\.01 to 10000 kg without"
-    with pytest.raises(BadData, match=says):
+    with refused(says):
         inferred_facts.with_table_mass(robot, runs)
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
     says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
     inferred_facts.check_priors(["4W2T.mass"], robot, unweighed(table()))
 

@@ -49,14 +49,14 @@ def test_parts_weigh_what_the_paper_prints(robot):
     for name in ("6T2A", "4W2T"):
         body = 2 * float(half(robot, name).body)
         assert body == pytest.approx(10.3, abs=0.05)
-        assert abs(body + 2 * float(gear.pulley_mass + gear.additional_pulley_mass) - 10.3) > 0.3
+        assert abs(body + 2 * (gear.pulley_mass + gear.additional_pulley_mass) - 10.3) > 0.3
 
 
 def test_parts_add_up_to_the_printed_inertia(robot):
     """Table 7's 0.145 of 4W2T and 0.251 of 6T2A, which is that of the robot with its levers outstretched."""
-    assert float(whole(robot, "4W2T")) == pytest.approx(0.145, rel=0.015)
-    assert float(whole(params.replace(robot, OUTSTRETCHED))) == pytest.approx(0.251, rel=0.01)
-    assert float(whole(robot)) == pytest.approx(0.153, rel=0.01)
+    assert whole(robot, "4W2T") == pytest.approx(0.145, rel=0.015)
+    assert whole(params.replace(robot, OUTSTRETCHED)) == pytest.approx(0.251, rel=0.01)
+    assert whole(robot) == pytest.approx(0.153, rel=0.01)
 
 
 @pytest.mark.parametrize("configuration", ["6T2A", "4W2T"])
@@ -88,7 +88,7 @@ def test_inertia_is_that_of_points(robot, configuration):
     own = body * g["body_gyration"] ** 2 + 2 * len(levers) * g["lever_inertia"]
     turning = 2 * (float(chassis.inertia) - g["belt_mass"] * radius**2)  # of J_w the belt is among the points
     about = (m * ((x - np.average(x, weights=m)) ** 2 + (z - np.average(z, weights=m)) ** 2)).sum()
-    assert float(whole(robot, configuration, payload)) == pytest.approx(own + turning + about, rel=1e-6)
+    assert whole(robot, configuration, payload) == pytest.approx(own + turning + about, rel=1e-6)
 
 
 def test_each_part_payload_and_posture_count_in_every_member_with_derivatives(robot):
@@ -112,13 +112,13 @@ def test_each_part_payload_and_posture_count_in_every_member_with_derivatives(ro
 def test_inertia_stated_as_a_whole_is_that_of_the_folded_robot_without_payload(robot):
     for name, configuration in (("inertia_tracked", "6T2A"), ("inertia_wheeled", "4W2T")):
         stated = params.replace(robot, {f"running_gear.{name}": 0.2, "running_gear.centre_offset": 0.01})
-        assert float(whole(stated, configuration)) == pytest.approx(0.2, rel=1e-12)
+        assert whole(stated, configuration) == pytest.approx(0.2, rel=1e-12)
         lighter = params.replace(stated, {"running_gear.pulley_mass": 0.02})
-        assert float(whole(lighter, configuration)) == pytest.approx(0.2, rel=1e-12)
-        assert float(whole(stated, configuration, payload=8.0)) > 0.22
+        assert whole(lighter, configuration) == pytest.approx(0.2, rel=1e-12)
+        assert whole(stated, configuration, payload=8.0) > 0.22
     stretched = params.replace(robot, OUTSTRETCHED | {"running_gear.inertia_tracked": 0.2})
     lever = 4 * 0.495 * ((0.15 + 0.083) ** 2 - (0.15 - 0.083) ** 2)
-    assert float(whole(stretched)) == pytest.approx(0.2 + lever, rel=1e-9)
+    assert whole(stretched) == pytest.approx(0.2 + lever, rel=1e-9)
 
 
 def test_robot_lighter_than_its_parts_is_refused(robot):
@@ -130,7 +130,7 @@ def test_robot_lighter_than_its_parts_is_refused(robot):
 
 
 @pytest.mark.parametrize(
-    ("name", "least"), [("inertia_tracked", r"0\.0343 kg.*of 6T2A"), ("inertia_wheeled", r"0\.0272 kg.*of 4W2T")]
+    "name, least", [("inertia_tracked", r"0\.0343 kg.*of 6T2A"), ("inertia_wheeled", r"0\.0272 kg.*of 4W2T")]
 )
 def test_stated_inertia_below_that_of_the_parts_is_refused(robot, name, least):
     small = params.replace(robot, {f"running_gear.{name}": 0.01})

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 
 from calibration.data import presets_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.sources import reading
-from tests.commands import read_rig, text_file
+from tests.commands import read_rig, refused, text_file
 
 RIG = """
 base = "none"
@@ -55,9 +55,7 @@ def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
     assert_allclose(found["duty"], [0.1, 0.2, 0.3])
     assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array(VESC["current_motor"]))
     assert any("erpm, read as motor_speed_rpm, is electrical" in note for note in found.notes)
-    with pytest.raises(
-        BadConfiguration, match=r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7"
-    ):
+    with refused(r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7", BadConfiguration):
         records.read_runs(tmp_path / "log.csv", rig, columns="vesc")
 
 
@@ -80,7 +78,7 @@ def test_a_three_phase_motor_is_the_dc_motor_of_the_same_power_and_torque(tmp_pa
     assert any("equivalent DC motor" in note for note in found.notes)
 
 
-@pytest.mark.parametrize(("along_d", "noted"), [(0.1, False), (3.0, True)])
+@pytest.mark.parametrize("along_d, noted", [(0.1, False), (3.0, True)])
 def test_a_weakened_field_is_noted(tmp_path, along_d, noted):
     log = {**VESC, "d_axis_current": [along_d, -along_d, along_d]}
     rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
@@ -169,7 +167,7 @@ def test_feetech_signs_are_bits(tmp_path):
         assert_allclose(found["output_angle_deg"], [180, 4095 * 360 / 4096, -180, -180])
 
 
-@pytest.mark.parametrize(("preset", "names", "bits", "limits"), [
+@pytest.mark.parametrize("preset, names, bits, limits", [
     ("damiao,v_max=30,t_max=10", ("p_int", "v_int", "t_int"), (16, 12, 12), (12.5, 30, 10)),
     ("robstride,speed_max=44,torque_max=17", ("angle_raw", "velocity_raw", "torque_raw"), (16, 16, 16), (4 * np.pi, 44, 17)),
 ])  # fmt: skip
@@ -199,7 +197,7 @@ def test_integers_are_decoded_before_they_are_interpolated(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["/arm/joint_states", "/dynamic_joint_states"])
-@pytest.mark.parametrize(("preset", "column"), [("ros2", "output_torque_Nm"), ("ros2_amperes", "motor_current_mA")])
+@pytest.mark.parametrize("preset, column", [("ros2", "output_torque_Nm"), ("ros2_amperes", "motor_current_mA")])
 def test_ros_2_effort_is_what_the_preset_assumes(tmp_path, topic, preset, column):
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -256,25 +254,25 @@ FILES = {
 @pytest.mark.parametrize("case", WRONG | FILES)
 def test_a_preset_that_cannot_be_is_refused(tmp_path, case):
     stated, says = (WRONG | FILES)[case]
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         presets_file.find_preset(stated if case in WRONG else text_file(tmp_path / "mine.toml", stated))
 
 
 def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
-    with pytest.raises(BadData, match=r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
+    with refused(r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
         records.read_runs(
             {"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7"
         )
 
 
-@pytest.mark.parametrize(("imposed", "refused"), [("voltage", True), ("motor_speed", False)])
+@pytest.mark.parametrize("imposed, refused", [("voltage", True), ("motor_speed", False)])
 def test_a_supply_without_its_duty_does_not_drive_the_motor(tmp_path, imposed, refused):
     text = "input_voltage,erpm,current_motor\n40,7000,3\n41,8000,4\n"
     (tmp_path / "log.csv").write_text(text)
     channels = ("motor_speed", "motor_current") if refused else ("motor_current",)
     rig = robot(tmp_path, *channels, imposed=imposed)
     if refused:
-        with pytest.raises(BadData, match=r"has no duty_cycle; --columns vesc needs it for duty"):
+        with refused(r"has no duty_cycle; --columns vesc needs it for duty"):
             records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
     else:
         assert len(records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")) == 2

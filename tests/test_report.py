@@ -167,7 +167,7 @@ def test_operating_points_lie_on_the_chart_of_motor_and_gear(robot):
     lost = 33.0 * curves["motor_A"] - curves["torque_Nm"] * curves["motor_rpm"] * np.pi / 30 / float(
         robot.gearbox.ratio
     )
-    assert (lost > 0).all() and curves["efficiency_percent"].max() < 100 * float(robot.gearbox.efficiency_load)
+    assert (lost > 0).all() and curves["efficiency_percent"].max() < 100 * robot.gearbox.efficiency_load
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
 from sweeps.report.terminal_renderer import print_document
-from tests.commands import ROOT, ends, read_rig
+from tests.commands import ROOT, ends, read_rig, refused
 from tests.pages import as_text, recorded, tokens
 
 KINDS = tuple(rig_new.KINDS)
@@ -183,7 +183,7 @@ amplitude = 1e-4
 def test_written_rig_keeps_the_prior_of_what_a_fit_left_alone(tmp_path):
     robot = params.replace(read_rig(tmp_path, BENCH), {"motor.torque_constant": params.as_float(0.052)})
     back = again(tmp_path, robot)
-    assert float(back.motor.torque_constant) == 0.052
+    assert back.motor.torque_constant == 0.052
     assert [name for name, _, _ in back.rig.priors] == ["gearbox.efficiency_load", "bench.loss_coulomb"]
 
 
@@ -198,16 +198,14 @@ def test_nominal_drive_on_a_bench(tmp_path):
     robot = read_rig(tmp_path, 'configurations = ["b"]\n[b]\nload = "shaft"\ninertia = 0.01\nloss_coulomb = 0.1\n')
     assert (
         not robot.has_ground
-        and float(robot.motor.resistance) == 0.611
+        and robot.motor.resistance == 0.611
         and robot.rig.channels == ("total_current", "motor_speed")
     )
     assert survives(tmp_path, robot)
 
 
 @pytest.mark.parametrize("sides", [1, 2])
-@pytest.mark.parametrize(
-    ("travel", "radius"), [("lead_mm = 5.0", 5e-3 / (2 * math.pi)), ("drum_radius_mm = 20.0", 0.02)]
-)
+@pytest.mark.parametrize("travel, radius", [("lead_mm = 5.0", 5e-3 / (2 * math.pi)), ("drum_radius_mm = 20.0", 0.02)])
 def test_linear_unit_is_a_shaft(tmp_path, travel, radius, sides):
     text = (
         CARRIAGE.format(sides=sides)
@@ -261,27 +259,27 @@ def test_what_is_known_exactly_is_never_freed(tmp_path):
         *priors.loop_parameter_names(dry, ["bench"]),
     )
     assert "bench.radius" not in uncertain_inputs.default_input_names(robot, ["bench"], battery=False)
-    with pytest.raises(BadConfiguration, match=r"--free bench\.radius: the robot's file states ± 0"):
+    with refused(r"--free bench\.radius: the robot's file states ± 0", BadConfiguration):
         priors.parameter_coordinates(robot, ["bench.radius"])
     assert len(priors.parameter_coordinates(robot, ["bench.radius"], {"bench.radius": (0.02, 0.001)})) == 1
 
 
 def test_inductance_that_is_not_stated_follows_the_resistance(tmp_path):
     robot = read_rig(tmp_path, ROVER.replace("resistance = 1.0", "resistance = 3.0"))
-    assert float(robot.motor.inductance) == pytest.approx(6e-4, rel=1e-12)
+    assert robot.motor.inductance == pytest.approx(6e-4, rel=1e-12)
     assert survives(tmp_path, robot)
     found = {o.name: o for o in rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rig.toml"))}
     assert found["motor.inductance"].why == "not stated: assumed, 0.2 ms of the resistance"
     stated = read_rig(tmp_path, ROVER.replace("[gearbox]", "inductance = 1e-3\n[gearbox]"))
-    assert float(stated.motor.inductance) == 1e-3
+    assert stated.motor.inductance == 1e-3
 
 
 def test_wheels_lose_nothing_that_is_not_stated_and_tracks_have_to_state_it(tmp_path):
     robot = read_rig(tmp_path, ROVER)
     track, friction = robot.configurations["rover"].track, robot.configurations["rover"].ground.friction
     assert [float(x) for x in (track.loss_coulomb, track.loss_viscous, track.guide_share)] == [0.0, 0.0, 0.0]
-    assert float(friction.dynamic) == pytest.approx(0.4)
-    with pytest.raises(BadConfiguration, match=r"rover\.track\.loss_coulomb \[N·m\] is missing"):
+    assert friction.dynamic == pytest.approx(0.4)
+    with refused(r"rover\.track\.loss_coulomb \[N·m\] is missing", BadConfiguration):
         read_rig(tmp_path, ROVER.replace('load = "vehicle"', 'movers = "tracks"'))
 
 
@@ -299,7 +297,7 @@ def test_wheels_whose_inertia_is_not_stated_are_disks_of_a_share_of_the_mass(tmp
 
 def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path):
     turns = f"{ROVER}[rover.turning]\nwidth = 0.3\ninertia = 0.2\n"
-    with pytest.raises(BadConfiguration, match=r"running_gear\.wheelbase \[m\] is missing; a robot with base"):
+    with refused(r"running_gear\.wheelbase \[m\] is missing; a robot with base", BadConfiguration):
         read_rig(tmp_path, turns)
     usual = float(read_rig(tmp_path, ROVER).running_gear.wheelbase)  # an example's
     robot = read_rig(tmp_path, f"{turns}[running_gear]\nwheelbase = {usual}\n")
@@ -318,14 +316,14 @@ LIMIT, PATH = "temperature_limit = 125.0\n", "resistance_thermal_winding = 1.7\n
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("stated", "flagged", "lacking"),
+    "stated, flagged, lacking",
     [("", False, False), (LIMIT, False, True), (PATH, False, False), (LIMIT + PATH, True, False)],
 )
 def test_no_winding_is_too_hot_for_a_rig_that_states_no_limit_or_no_heat(tmp_path, stated, flagged, lacking):
     """Also where none would settle: at 30 A of 1 ohm. What is stated is so with the packaged motor's number too."""
     robot = read_rig(tmp_path, ROVER.replace("[motor]\n", f"[motor]\n{stated}").replace("mass = 4.0", "mass = 80.0"))
     seen = steady_batch(robot, Conditions(voltage=np.array([40.0]), slope_deg=np.array([20.0])))
-    assert float(seen.winding_settled[0]) == np.inf if PATH in stated else np.isnan(float(seen.winding_settled[0]))
+    assert seen.winding_settled[0] == np.inf if PATH in stated else np.isnan(float(seen.winding_settled[0]))
     assert bool(int(seen.flags[0]) >> FLAGS.index("winding_hot") & 1) == flagged
     said = " ".join(rig_check.examine_rig_file(tmp_path / "rig.toml", None).remarks())
     assert ("temperature_limit cannot be checked" in said) == lacking
@@ -419,10 +417,8 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
-    with pytest.raises(BadConfiguration, match=sentence) as refusal:
+    with refused(rf"^rig\.toml.*(?:{sentence})", BadConfiguration):
         read_rig(tmp_path, text)
-    said = str(refusal.value)
-    assert said.startswith("rig.toml") and "\n" not in said
 
 
 def test_packaged_robot_is_as_it_was(tmp_path, robot):
@@ -584,7 +580,7 @@ def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
     robot = read_rig(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngrass = "rover"\n')
     assert robot.rig.surfaces == (("grass", "rover"),)
     assert survives(tmp_path, robot)
-    with pytest.raises(BadConfiguration, match=r"surfaces\.gras: got gras; did you mean grass\?"):
+    with refused(r"surfaces\.gras: got gras; did you mean grass\?", BadConfiguration):
         read_rig(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
 
 

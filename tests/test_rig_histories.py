@@ -23,7 +23,7 @@ from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.signals import State
-from tests.commands import csv_text, ends, read_rig, read_table, rows
+from tests.commands import csv_text, ends, read_rig, read_table, refused, rows, with_columns
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -113,7 +113,7 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
 
 @pytest.mark.parametrize("duty", [False, True])
 @pytest.mark.parametrize(
-    ("load", "shown", "stated", "said"),
+    "load, shown, stated, said",
     [
         (BENCH, "motor_current", "", "motor_current_A: got 1 A"),
         (BENCH, "motor_speed", "", "motor_speed_rpm: got 1 rpm"),
@@ -178,8 +178,8 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         begun = kind.with_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
-        assert float(begin.motor_speed) == pytest.approx(60 * quantities.RPM * 16, rel=1e-9)
-        assert float(begin.angle) == pytest.approx(np.radians(30), abs=0.002)
+        assert begin.motor_speed == pytest.approx(60 * quantities.RPM * 16, rel=1e-9)
+        assert begin.angle == pytest.approx(np.radians(30), abs=0.002)
         assert bool(priors.initial_state_names(begun)) == (start == "free")
 
 
@@ -252,7 +252,7 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
     robot, runs = imposed_speed(tmp_path, 2)
     speed = np.repeat(np.linspace(-400, 400, 20)[None], 2, 0)
     speed[1] = -speed[0]
-    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed.ravel() / quantities.RPM})
+    runs = with_columns(runs, motor_speed_rpm=speed.ravel() / quantities.RPM)
     observer = observers.observer_kind(runs).of(runs, robot)
     columns = {**runs.columns, "total_current_A": np.sign(speed.ravel()) + speed.ravel() / 100}
     bases = observer.bases(columns, np.ones(len(runs), bool), robot)
@@ -319,7 +319,7 @@ def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
 
 
 @pytest.mark.parametrize(
-    ("stated", "free"),
+    "stated, free",
     [("", True), ("delay = 0.0", True), (USUAL["rig"], True), ("delay = 0.03", True), ('delay = "0 ± 0"', False)],
 )
 def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, free):
@@ -353,7 +353,7 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
 def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
     """Two a sample, 10 ms at most: readings follow at once from the speed, but what effects remember."""
     robot, runs = imposed_speed(tmp_path, 2)  # at 20 Hz
-    runs = dataclasses.replace(runs, columns={**runs.columns, "time_s": runs["time_s"] / faster})
+    runs = with_columns(runs, time_s=runs["time_s"] / faster)
     times = np.asarray(Histories.of(runs, robot).times)
     steps = np.diff(times, axis=1)
     late = (steps > 0) & (times[:, :-1] > 4.5 * step)
@@ -384,11 +384,11 @@ def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
     # from 0.07 s before a tenth of the largest speed on; of a current from 0.1 s before three tenths
     begin, end = {"voltage": (1.4, 1.54), "motor_current": (1.32, 1.6)}[imposed]
     none = np.full(len(t), np.nan)
-    by_angle = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": none})
+    by_angle = with_columns(runs, motor_speed_rpm=none)
     for shown in (runs, by_angle):
         assert longest(shown, begin, end) == pytest.approx(fine) and longest(shown, begin - 0.06, end) > 2 * fine
         assert longest(shown, 0.6, 1.2) == longest(shown, 1.7, 1.98) == pytest.approx(usual)
-    hidden = dataclasses.replace(by_angle, columns={**by_angle.columns, "output_angle_deg": none})
+    hidden = with_columns(by_angle, output_angle_deg=none)
     assert longest(hidden, 0.6, 1.2) == pytest.approx(fine)
     assert longest(hidden, 0.6, 1.98, stiff) == longest(runs, begin, end, stiff) == pytest.approx(usual)
 
@@ -438,7 +438,7 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
 
 
 def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
-    with pytest.raises(BadConfiguration, match=r"rig.toml, between_rows: got spline; .*allowed: held, linear"):
+    with refused(r"rig.toml, between_rows: got spline; .*allowed: held, linear", BadConfiguration):
         drive(tmp_path, "motor_speed", top='between_rows = "spline"')
     robot = drive(tmp_path, "motor_speed", top='between_rows = "linear"')
     robot_file.write_robot(robot, tmp_path / "robot.toml")

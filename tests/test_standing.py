@@ -189,7 +189,7 @@ def test_balances_are_alike_where_they_change_the_readings_alike(toy):
 
 
 @pytest.mark.parametrize(
-    ("law", "named"),
+    "law, named",
     [(lambda a: np.ones_like(a), True), (lambda a: np.sin(2 * a + 0.5), False)],
     ids=["same", "wave"],
 )
@@ -377,7 +377,7 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
 
 
 @pytest.mark.parametrize(
-    ("root", "without", "evidence", "stands", "rests_on"),
+    "root, without, evidence, stands, rests_on",
     [
         (6.9, 5.8, 11.6, True, None),
         (10.6, 4.3, 14.1, True, 10),  # it keeps less than 1/√3 of its root without that row
@@ -441,7 +441,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     assert _largest_variation(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf, math.inf)
 
 
-@pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])
+@pytest.mark.parametrize("single, lacks", [(3.4, {"slip"}), (5.0, {"slip", "track"})])
 def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(monkeypatch, single, lacks):
     monkeypatch.setattr(
         "calibration.discovery.standing.locate_discrepancy", lambda *a: SimpleNamespace(place="speed")
@@ -488,7 +488,7 @@ def candidate_of(*effects):
 
 
 @pytest.mark.parametrize(
-    ("adequate", "established", "predicts", "model"),
+    "adequate, established, predicts, model",
     [
         (True, ("a", "b"), None, ("a", "b")),  # all stand: nothing is asked of data held out
         (True, ("a",), None, ("a",)),  # the other neither stands nor predicts

@@ -26,7 +26,7 @@ from sweeps.points import axes, scale, zarr_store
 from sweeps.points.job import prepare_job, store_layout
 from sweeps.points.tasks import task_of_configuration
 from sweeps.store import LOCK, MANIFEST, RunFolder
-from tests.commands import ROOT, ends, read_json, rows
+from tests.commands import ROOT, ends, read_json, refused, rows
 from tests.commands import command as run_command
 
 CONFIG = """report = false
@@ -260,7 +260,7 @@ STOPS = {
 
 
 @pytest.mark.quick("2-130", "25-2")
-@pytest.mark.parametrize(("at", "code"), [(2, 130), (6, 130), (7, 130), (20, 130), (25, 2), (40, 130)])
+@pytest.mark.parametrize("at, code", [(2, 130), (6, 130), (7, 130), (20, 130), (25, 2), (40, 130)])
 def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, tmp_path, at, code):
     error, said = STOPS[code]
     heal = stopping(monkeypatch, at, error)
@@ -457,7 +457,7 @@ def written(store, *chunks, speed=1.0):
 def test_refused_second_process_leaves_the_store_of_the_first(opened):
     first, second = opened(), opened()
     first.begin()
-    with pytest.raises(BadConfiguration, match=r"another process is using \S*s\.partial, share 1 of 1; wait"):
+    with refused(r"another process is using \S*s\.partial, share 1 of 1; wait", BadConfiguration):
         second.begin()
     second.abandon()
     written(first, 0)
@@ -479,16 +479,14 @@ def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
     early, other = opened(), opened()
     other.begin()
     other.abandon()
-    with pytest.raises(
-        BadConfiguration, match=r"another process has removed \S*s\.partial; the same command starts again"
-    ):
+    with refused(r"another process has removed \S*s\.partial; the same command starts again", BadConfiguration):
         early.begin()
 
 
 def test_force_is_refused_while_another_process_writes(opened):
     first = opened()
     first.begin((2, 3))
-    with pytest.raises(BadConfiguration, match=r"another process is using \S*s\.partial, share 2 of 3; wait"):
+    with refused(r"another process is using \S*s\.partial, share 2 of 3; wait", BadConfiguration):
         opened(seed=1, force=True)
     written(first, 1)
     assert set(opened().done()) == {1}
@@ -500,7 +498,7 @@ def test_force_is_refused_while_another_process_writes(opened):
 
 def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_one(opened):
     early, forced = opened(), opened(seed=1, force=True)
-    with pytest.raises(BadConfiguration, match=r"s\.partial contains another sweep, which differs in configuration"):
+    with refused(r"s\.partial contains another sweep, which differs in configuration", BadConfiguration):
         early.begin()
     forced.begin()
     assert str(os.getpid()) in forced._aside.name
@@ -591,9 +589,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
     store.close()
     HARMS[harm](victim(store.partial, name))
     if name == "identity.json" and harm != "remove":  # without one the store had not begun
-        with pytest.raises(
-            BadData, match=r"identity\.json is damaged; choose another path, or use --force to start again"
-        ):
+        with refused(r"identity\.json is damaged; choose another path, or use --force to start again"):
             opened()
         again = opened(force=True)
     else:
@@ -609,7 +605,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("name", "harm"), [*((n, h) for n in DAMAGED for h in ("flip", "remove")), ("manifest.json", "cut")]
+    "name, harm", [*((n, h) for n in DAMAGED for h in ("flip", "remove")), ("manifest.json", "cut")]
 )
 def test_what_is_damaged_of_a_finished_sweep_is_said(opened, tmp_path, name, harm):
     store = opened()
@@ -647,15 +643,15 @@ def test_a_store_and_a_table_of_one_path_leave_each_other_alone(opened, tmp_path
     store.begin()
     written(store, 0)
     for force, why in ((False, "contains an interrupted sweep into a store"), (True, "another process is using")):
-        with pytest.raises(BadConfiguration, match=why):
+        with refused(why, BadConfiguration):
             RunFolder(tmp_path / "s", {"command": "sweep"}, force=force)
     assert len(store.done()) == 1
     store.close()
     with RunFolder(tmp_path / "s", {"command": "sweep"}, force=True) as folder:
-        with pytest.raises(BadConfiguration, match="another process is using"):
+        with refused("another process is using", BadConfiguration):
             opened(force=True)
         folder.stage("base", lambda: 1)
-    with pytest.raises(BadConfiguration, match="contains an interrupted sweep, which"):
+    with refused("contains an interrupted sweep, which", BadConfiguration):
         opened()
     store = opened(force=True)
     assert read_json(store.partial / LOCK)["command"] == zarr_store.COMMAND and not store.done()

@@ -51,7 +51,7 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
 
 def test_a_cell_has_no_voltage_on_the_external_supply(robot):
     found = api.simulate(robot, api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
-    assert (np.asarray(found.voltage_cell) > 0).tolist() == [False, True]
+    assert (found.voltage_cell > 0).tolist() == [False, True]
     assert np.isnan(found.to_dict()["supply_voltage_V"]).tolist() == [False, True]
 
 

@@ -73,7 +73,7 @@ def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     slips = 1 << FLAGS.index("slips")
     assert [bool(f & slips) for f in np.asarray(answer.result.flags)] == [False, True]
     # the slip of the search that found this gear, at the step and at half and a quarter of it
-    assert_allclose(100 * np.asarray(answer.result.slip), [1.8, 5.04], atol=0.15)
+    assert_allclose(100 * answer.result.slip, [1.8, 5.04], atol=0.15)
 
 
 def test_too_steep_a_slope_slides_it_down(runs):

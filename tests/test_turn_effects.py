@@ -80,7 +80,7 @@ def test_terms_are_their_equations():
     assert_allclose(terms["side_radius"], values["side_radius"] * side * rolled, rtol=1e-9)
     resisted = values["turning_resistance"] * np.asarray(signals.normal) * -1.1
     assert_allclose(terms["turning_resistance"], resisted, rtol=1e-9)
-    assert float(jnp.sum(grip.moment)) > 0.5  # against a turn to the right
+    assert jnp.sum(grip.moment) > 0.5  # against a turn to the right
     dug = values["lateral_grip"] * 1.1 * -np.asarray(grip.moment)
     assert_allclose(terms["lateral_grip"], dug, rtol=1e-9)
 
@@ -110,7 +110,7 @@ def test_straight_travel_shows_none_of_them(robot):
 
 def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_path):
     robot = read_rig(tmp_path, 'base = "nominal"\n[effects.side_torque]\namplitude = 0.1\n', "robot.toml")
-    assert [e.name for e in robot.effects] == ["side_torque"] and float(robot.effects[0].amplitude) == 0.1
+    assert [e.name for e in robot.effects] == ["side_torque"] and robot.effects[0].amplitude == 0.1
     assert not set(effects.OF_TURNS) & set(effects.BY_NAME)
     for kind in effects.OF_TURNS.values():
         assert "Source:" in (kind.__doc__ or "") and kind.balance in balances.BALANCES

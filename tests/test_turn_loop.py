@@ -128,7 +128,7 @@ FOUND = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("case", "form"), [
+@pytest.mark.parametrize("case, form", [
     ("clean", planted.rows), ("friction", planted.rows), ("voltage", planted.rows), ("moment", planted.rows), ("grip", planted.rows), ("friction", planted.log),
 ])  # fmt: skip
 def test_what_a_second_implementation_planted_is_found(tmp_path, case, form):

@@ -66,7 +66,7 @@ def test_turns_are_found_past_kinks_of_friction_and_gears():
     for k in range(len(table)):
         own = jax.tree.map(lambda x, k=k: x[k], (values, stated))
         speed, gains, solved = circled(*own)
-        assert bool(solved) and abs(float(speed)) > 1e-3
+        assert bool(solved) and abs(speed) > 1e-3
         assert_allclose(gains, 0.0, atol=1e-6)
 
 
@@ -145,7 +145,7 @@ def powers(robot, run, motion):
         return source, energy.sink_powers_turning(robot, run, travel), change
 
     source, sinks, change = at(motion)
-    assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
+    assert (sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
     return sinks
 
 
@@ -181,9 +181,9 @@ def test_rates_are_those_of_a_second_implementation(robot, configuration):
 def test_turning_numbers_are_those_of_the_paper(robot):
     for name, (x, y) in {"6T2A": world.SURFACES["wood"][:2], "4W2T": world.SURFACES["wood"][2:]}.items():
         own = robot.configurations[name].turning
-        assert float(own.lateral) == pytest.approx(y / x, rel=1e-12)
-        assert float(own.inertia) == world.INERTIA_YAW[name]
-        assert float(own.width) == world.WIDTH
+        assert own.lateral == pytest.approx(y / x, rel=1e-12)
+        assert own.inertia == world.INERTIA_YAW[name]
+        assert own.width == world.WIDTH
         run = mm.Conditions(name, payload=8.0).resolved(robot)
         chassis = robot.configurations[name]
         height = float(balances.stance(robot, run, chassis, chassis.mass + 8.0).height)
@@ -202,7 +202,7 @@ def test_friction_is_on_its_ellipse_and_takes_power(rule):
         ahead, aside = float(jnp.sum(held.ahead)), float(jnp.sum(held.aside))
         assert (ahead / 3.0) ** 2 + (aside / 4.2) ** 2 == pytest.approx(1.0 if rule == 2 else u**2 + v**2, rel=1e-9)
         assert ahead * u + aside * v > 0
-        assert float(jnp.sum(held.across)) == pytest.approx(aside * v, abs=1e-12)
+        assert jnp.sum(held.across) == pytest.approx(aside * v, abs=1e-12)
 
 
 def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
@@ -210,13 +210,13 @@ def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
     friction, rolling = Friction(static=0.6, dynamic=0.5), jnp.array([0.05, 0.05])
     held = jax.jit(lambda: grip(stance, friction, 1.0, 100.0, jnp.array([0.03, 0.05]), -0.05, 0.4, rolling))()
     along = float(jnp.sum(held.ahead - rolling * held.normal))
-    assert float(held.moved) == pytest.approx(0.12 * float(jnp.sum(held.aside)) / 0.243, rel=1e-9)
-    assert float(held.centre) == pytest.approx(0.01 - 0.12 * along / 100.0, rel=1e-9)
-    assert float(held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
+    assert held.moved == pytest.approx(0.12 * float(jnp.sum(held.aside)) / 0.243, rel=1e-9)
+    assert held.centre == pytest.approx(0.01 - 0.12 * along / 100.0, rel=1e-9)
+    assert (held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("height", "lifts"), [(0.06, False), (0.2, True)])
+@pytest.mark.parametrize("height, lifts", [(0.06, False), (0.2, True)])
 @pytest.mark.parametrize("on_tracks", [0.0, 1.0])
 def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lifts, on_tracks):
     """Against sums over the nodes and differences, where all of a track bears and where its front has lifted off."""
@@ -236,7 +236,7 @@ def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lift
     assert_allclose(jnp.sum(1.2**1.4 * force * across, 1), found.aside, rtol=1e-9)
     assert_allclose(jnp.sum(1.2**1.4 * force * across * (place - 0.01), 1), found.moment, rtol=1e-9)
     assert bool((jnp.abs(found.centre) > 0.05) & (on_tracks > 0.5)) == (lifts and on_tracks > 0.5)
-    assert float(found.moved) == pytest.approx(height * float(jnp.sum(found.aside)) / 0.5, rel=1e-9)
+    assert found.moved == pytest.approx(height * float(jnp.sum(found.aside)) / 0.5, rel=1e-9)
     exact, step = jax.jacfwd(held)(x), 1e-6
     for k in range(len(x)):
         ahead, behind = held(x.at[k].add(step)), held(x.at[k].add(-step))

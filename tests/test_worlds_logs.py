@@ -77,7 +77,7 @@ def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "imposed", "every", "share"),
+    "seed, imposed, every, share",
     [
         ([3, 2], "motor_speed", 0.02, 2),  # smooth between its rows: slopes of lines were off by 2.5 times the noise
         ([41, 0, 1], "motor_current", 0.005, 3),  # with reversals: steps of 2.5 ms were off by 0.49 of the noise

@@ -52,7 +52,7 @@ def test_spot_turn_figures_of_the_issue():
     assert turning.moment_lateral(13.1 * paper.G, LENGTH, 0.38, False) == pytest.approx(3.66, abs=0.005)
 
 
-@pytest.mark.parametrize(("ratio", "rule"), [(1.0, 1.0), (1.2, 1.0), (1.2, 2.0), (0.5, 2.0)])
+@pytest.mark.parametrize("ratio, rule", [(1.0, 1.0), (1.2, 1.0), (1.2, 2.0), (0.5, 2.0)])
 def test_spot_turn_under_coulomb_friction_follows_its_quadrature(ratio, rule):
     robot = ideal(coulomb=True, ratio=ratio, rule=rule, nodes=96)
     assert spot_ratio(robot, 1.0) == pytest.approx(turning.spot_coulomb(LENGTH, WIDTH, ratio, rule=rule), rel=1e-8)
@@ -108,7 +108,7 @@ def test_side_slope_creeps_below_and_slides_above_its_lateral_adhesion(wheeled):
 
 
 @pytest.mark.parametrize("wheeled", [False, True])
-@pytest.mark.parametrize(("voltage", "slope"), [(15.0, 0.0), (33.0, 0.1), (33.0, -0.05)])
+@pytest.mark.parametrize("voltage, slope", [(15.0, 0.0), (33.0, 0.1), (33.0, -0.05)])
 def test_equal_voltages_travel_straight(wheeled, voltage, slope):
     robot = paper_robot(wheeled)
     current, w, speed = paper.Side(voltage, slope, 0.0, wheeled).steady()
