@@ -724,8 +724,7 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m) or cost (EUR)")
     pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front")
     motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all in the catalogue")
-    starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Number of searches")
-    seed: Seed = option_field(0, "Random seed of the starts")
+    seed: Seed = option_field(0, "Random seed of the first designs")
 
 
 class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):

@@ -1,11 +1,12 @@
 """Backlash as a state of the load: a rigid gear in the limit, free play at reversals, and found in a history."""
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from test_shaft import DRIVE
 
@@ -37,7 +38,7 @@ def bench(backlash):
 
 @jax.jit
 def driven(robot):
-    conditions = dataclasses.replace(Conditions(voltage=0.0), voltage=jnp.asarray(VOLTAGE))
+    conditions = replace(Conditions(voltage=0.0), voltage=jnp.asarray(VOLTAGE))
     return history_signals(robot, conditions, jnp.asarray(TIMES))
 
 
@@ -57,7 +58,7 @@ def test_effects_of_the_gearbox_go_by_the_load_within_the_backlash_too():
     @jax.jit
     def moving(amplitudes, gap):
         there = tuple(e(amplitude=a) for e, a in zip(those, amplitudes, strict=True))
-        robot = dataclasses.replace(bench(0.02), effects=there)
+        robot = replace(bench(0.02), effects=there)
         found = balances.moving_signals(
             robot, Conditions(0, voltage=6.0), State(0.5, 64.0, 4.0, 0.0, memory, gap=gap)
         )
@@ -147,7 +148,7 @@ def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     truth = params.replace(robot, {"bench.backlash": 0.06})
     seen = driven(truth)
     at = np.searchsorted(TIMES, SAMPLES)
-    random = np.random.default_rng(3)
+    random = default_rng(3)
     lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
     for k, t in zip(at, SAMPLES, strict=True):
         speed = float(seen.speed_motor[k]) / quantities.RPM + 5 * random.standard_normal()

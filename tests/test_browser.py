@@ -1,8 +1,8 @@
 """Every report in a headless browser, on a phone, a laptop, a wide screen and paper: nothing is cut off or printed over,
 nothing scrolls sideways but tables and figures in themselves, nothing is asked of a network, and all can be read."""
 
-import dataclasses
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -120,8 +120,8 @@ def test_the_page_of_the_loop_can_be_read_everywhere(browser):
 
 def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
     found = commanded().found
-    summary = dataclasses.replace(found.summary, verdict="none")
-    none = dataclasses.replace(found, verdict="none", effects=(), support=None, summary=summary)
+    summary = replace(found.summary, verdict="none")
+    none = replace(found, verdict="none", effects=(), support=None, summary=summary)
     assert wrong(browser, write_report_page(tmp_path, loop_report.loop_document(none, "nominal", {}))) == {}
 
 

@@ -1,14 +1,15 @@
 """Channels belong to a rig: its robot, the tables of its runs and every result carry theirs, and nothing else does."""
 
-import dataclasses
 import itertools
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import calibration
@@ -84,7 +85,7 @@ def calibrated(runs, robot):
         "readings": readings_by_channel(runs.channels, measured, sd, measured, measured),
         "status": np.full(len(runs), "converged"),
     }  # fmt: skip
-    return CalibrationResult(**{**dict.fromkeys(f.name for f in dataclasses.fields(CalibrationResult)), **known})
+    return CalibrationResult(**{**dict.fromkeys(f.name for f in fields(CalibrationResult)), **known})
 
 
 def discovered(runs):
@@ -95,7 +96,7 @@ def discovered(runs):
         "runs": runs, "numbers": np.arange(1, len(runs) + 1), "outliers": (), "unusable": (),
         "readings_of_rows": shown, "detail": SimpleNamespace(columns=dict),
     }  # fmt: skip
-    return DiscoveryResult(**{**dict.fromkeys(f.name for f in dataclasses.fields(DiscoveryResult)), **known})
+    return DiscoveryResult(**{**dict.fromkeys(f.name for f in fields(DiscoveryResult)), **known})
 
 
 # --- a robot, a table, a result
@@ -177,8 +178,8 @@ def test_a_table_takes_the_channels_of_the_robot_that_it_is_used_with(tmp_path, 
 
 
 def test_what_is_imposed_is_kept_though_it_is_no_channel(bench):
-    imposed = dataclasses.replace(bench.rig, imposed="motor_speed", channels=("total_current",))
-    robot = dataclasses.replace(bench, rig=imposed)
+    imposed = replace(bench.rig, imposed="motor_speed", channels=("total_current",))
+    robot = replace(bench, rig=imposed)
     columns = {"motor_speed_rpm": 100.0 * np.arange(1, 13), "total_current_A": np.arange(1.0, 13)}
     runs = Runs("made", {"configuration": np.full(12, "brake"), **columns})
     assert runs.of(robot).has("motor_speed_rpm") and runs.of(robot).channels == robot.channels
@@ -240,7 +241,7 @@ def measured_with(robot, folder, changed, sd=0.01):
     columns = {"configuration": np.full(12, "brake"), "supply_voltage_V": VOLTAGES}
     truth = params.replace(robot, {name: np.asarray(value) for name, value in changed.items()})
     shown = steady_batch(truth, Runs("made", columns, layout=layout).conditions(robot)).reading
-    drawn, table = np.random.default_rng(1), {"supply_voltage_V": VOLTAGES}
+    drawn, table = default_rng(1), {"supply_voltage_V": VOLTAGES}
     for c in robot.channels:
         x = np.asarray(shown[c.name]) / c.factor
         table |= {c.column: x * (1 + sd * drawn.standard_normal(12)), c.sd_column: sd * np.abs(x)}

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import samples
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import robot_file
@@ -105,7 +106,7 @@ def held(values, rows):
     return np.asarray(values)[(np.arange(int(len(values) * rows)) / rows).astype(int)]
 
 
-RNG = np.random.default_rng(3)
+RNG = default_rng(3)
 WALK = 10 + np.cumsum(RNG.normal(size=200))
 T = np.arange(3000)
 #: Channels that are read in every row, though they repeat numbers.

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model.contact import Friction, cubic_step, damping_contact, force_contact, smooth_sign
 
-RNG = np.random.default_rng(27)
+RNG = default_rng(27)
 LAW = dict(static=0.4, dynamic=0.3, speed_static=0.02, speed_dynamic=0.2)
 quick = settings(max_examples=60, deadline=None, derandomize=True)
 

@@ -1,6 +1,6 @@
 """Curves: smooth through their ordinates, and lawful as every effect of the library, in `steady` and `drive`."""
 
-import dataclasses
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -42,7 +42,7 @@ def robot(amplitudes=None, kinds=CURVES):
         values = {n: v for n, v in SHAPE.items() if hasattr(effect(), n)}
         values |= {} if amplitudes is None else {"amplitude": amplitudes[k]}
         every.append(params.replace(effect(), {n: jnp.asarray(v) for n, v in values.items()}))
-    return dataclasses.replace(nominal(), effects=tuple(every))
+    return replace(nominal(), effects=tuple(every))
 
 
 # --- interpolation --------------------------------------------------------------------------------------
@@ -144,7 +144,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     robot = laws.metered(signed=False)
     each = [laws.terms(made, robot, s) for s in (laws.STATES, laws.mirrored(laws.STATES))]
     assert_allclose(*each, rtol=1e-12, atol=1e-15)
-    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("motor_current", "speed")))
+    robot = replace(robot, rig=replace(robot.rig, channels=("motor_current", "speed")))
     columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}
     columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
     ways = dict.fromkeys(curve.WAYS, np.repeat([1.0, -1.0], 9))
@@ -157,7 +157,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
 @EACH
 def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
     made = params.replace(effect(), {"amplitude": 0.3})
-    floats = [f.name for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")]
+    floats = [f.name for f in fields(Signals) if f.name not in ("memory", "configuration")]
     still = Signals(**{name: jnp.asarray(0.0) for name in floats})
     slopes = eqx.filter_grad(lambda both: both[0].term(nominal(), both[1]))((made, still))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
@@ -166,17 +166,13 @@ def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
 # --- where they are known -------------------------------------------------------------------------------
 
 
-def test_curves_are_no_part_of_the_library():
-    assert not set(CURVES) & set(effects.BY_NAME) and not set(CURVES.values()) & set(effects.ALL)
-
-
 def test_curves_are_those_that_the_trace_looks_for():
     assert tuple(curve.BALANCES) == BALANCES and tuple(curve.ROUND) == OF_TURNS
     assert (*curve.VARIABLES, *curve.VARIABLES_ROUND) == tuple(VARIABLES)
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
     assert set(curve.READINGS) == {c.name for c in channels.EVERY} - {*curve.ROUND}  # a heading is no `yaw` moment
     assert set(curve.READ_BY) <= set(curve.READINGS)
-    robot = dataclasses.replace(
+    robot = replace(
         blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
         rig=Rig(channels=("output_torque", "position")),
     )
@@ -196,13 +192,13 @@ def test_curve_of_any_reading_obeys(name, law):
 
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
+    def values(robot):
+        return [(p.name, float(p.value)) for p in params.walk_parameters(robot)]
+
     mine = robot(0.1 * jnp.asarray([laws.size(e) for e in UNNAMED.values()]), UNNAMED)
     write_robot(mine, tmp_path / "robot.toml")
     for library in ({}, effects.BY_NAME):
-        again = read_robot(tmp_path / "robot.toml", library)
-        assert [(p.name, float(p.value)) for p in params.walk_parameters(again)] == [
-            (p.name, float(p.value)) for p in params.walk_parameters(mine)
-        ]
+        assert values(read_robot(tmp_path / "robot.toml", library)) == values(mine)
 
 
 def test_curve_without_a_range_is_refused(tmp_path):

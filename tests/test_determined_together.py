@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.described import describe
@@ -34,7 +35,7 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
     found = posterior(correlation, kinds, spread)
     (pair,) = determined_together(found)
     assert (pair.one, pair.other, pair.form) == ("a", "b", form) and pair.weight == pytest.approx(weight)
-    z = np.random.default_rng(1).standard_normal((4000, 3)) @ found.root.T * 0.1
+    z = default_rng(1).standard_normal((4000, 3)) @ found.root.T * 0.1
     a, b, _ = found.at(z).T
     combined = {"ratio": np.log(a / b), "product": np.log(a * b), "linear": a + pair.weight * b}[form]
     alone = a if form == "linear" else np.log(a)
@@ -49,8 +50,7 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
 def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
-    (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
-    assert describe(Determination.from_pairs("a", True, (pair,))) == "only with b"
-    assert describe(Determination.from_pairs("c", True, (pair,))) == "no" and undetermined_names(
-        ("a", "c"), (pair,)
-    ) == ("c",)
+    pairs = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
+    assert describe(Determination.from_pairs("a", True, pairs)) == "only with b"
+    assert describe(Determination.from_pairs("c", True, pairs)) == "no"
+    assert undetermined_names(("a", "c"), pairs) == ("c",)

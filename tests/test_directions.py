@@ -1,9 +1,10 @@
 """What shows only where a robot goes both ways, or where its load drives it, through the stages of the loop."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from synthetic import Analyst
 
 from calibration.data.runs import Runs, read_runs
@@ -22,7 +23,7 @@ FORWARD, EITHER = (15.0, 20.0, 27.0, 33.0), (15.0, 33.0, -15.0, -33.0)
 CLIMBING = {f"{c}.ground.friction.{k}": v for c in ("6T2A", "4W2T") for k, v in (("static", 0.9), ("dynamic", 0.7))}
 SEARCHED = ("directional_friction", "backdriving_loss", "churning", "tension_friction", "slope_bias")
 ANALYST = Analyst(
-    dataclasses.replace(settings_for(SettledRuns, 192), slots=1),
+    replace(settings_for(SettledRuns, 192), slots=1),
     {name: BY_NAME[name] for name in SEARCHED},
     {f"{c}.ground.friction.static": (0.9, 0.1) for c in ("6T2A", "4W2T")},
 )
@@ -35,7 +36,7 @@ def table(name, amplitude, voltages):
     )
     slope = slope * np.sign(voltage)
     effect = params.replace(BY_NAME[name](), {"amplitude": amplitude})
-    robot = dataclasses.replace(params.replace(paper_robots.nominal(), CLIMBING), effects=(effect,))
+    robot = replace(params.replace(paper_robots.nominal(), CLIMBING), effects=(effect,))
     shown = steady_batch(robot, Conditions(wheeled, voltage, slope, payload)).reading
     columns = {
         "configuration": np.where(wheeled == 1, "4W2T", "6T2A"),
@@ -43,7 +44,7 @@ def table(name, amplitude, voltages):
         "payload_kg": payload,
         "supply_voltage_V": voltage,
     }
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     for channel in usual_channels():
         reading = np.asarray(shown[channel.name]) / channel.factor
         sd = channel.sd_share * np.maximum(np.abs(reading), 0.2 * np.abs(reading).max())
@@ -58,7 +59,7 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
     speeds = [c.column for c in usual_channels() if c.zero_at_rest]
 
     def changed(**values):
-        return dataclasses.replace(measured, columns={**columns, **values})
+        return replace(measured, columns={**columns, **values})
 
     turned = np.where(np.arange(rows) == 3, -1.0, 1.0)
     for name in ("supply_voltage_V", *speeds):

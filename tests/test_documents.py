@@ -1,15 +1,16 @@
 """Reports as documents: page, terminal and CSV show the same cells. One text of each document is kept."""
 
 import csv
-import dataclasses
 import importlib
 import io
 import json
 import re
 import urllib.parse
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from pages import Tables, as_text, drawn, outside, recorded
 
 from calibration.data import settling
@@ -66,9 +67,9 @@ def size():
         drive, packaged_cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip
-    short = dataclasses.replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
+    short = replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
     sizing = SizingResult(
-        None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
+        None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 31000
     )  # fmt: skip
     return size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
@@ -84,7 +85,7 @@ def test_a_terminal_has_few_lines_of_a_sizing(capsys):
     """All tables are on the page."""
     print_document(size(), brief=True)
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "256 searches" in lines[1]
+    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "31,000 designs" in lines[1]
 
 
 def above_the_bench(rise):
@@ -99,46 +100,36 @@ def above_the_bench(rise):
 
 def test_a_comparison_draws_the_band_of_stated_sds_and_names_no_other():
     measured = read_runs("measured")
-    sds = {"speed_sd_mm_s": np.full(len(measured), 7.0)}
-    for columns, named in (({}, False), (sds, True)):
-        runs = dataclasses.replace(measured, columns=measured.columns | columns)
-        table, summary = compare_readings(runs, {**runs.columns, "status": np.repeat("converged", len(runs))})
-        found = Comparison(table, summary, runs.channels, "measured", "steady", "nominal (PM)")
-        (figure,) = comparison_document(found).sections[0].blocks
+    for columns, named in (({}, False), ({"speed_sd_mm_s": np.full(len(measured), 7.0)}, True)):
+        runs = replace(measured, columns=measured.columns | columns)
+        compared = compare_readings(runs, {**runs.columns, "status": np.repeat("converged", len(runs))})
+        (figure,) = commented(*compared).sections[0].blocks
         assert ("Band: " in figure.caption) == named
     bands = [axes.patches[0].get_y() for axes in figure.draw().axes]
     assert min(bands) == bands[-1] == -14.0 and max(bands) == 0.0
+
+
+def commented(table, summary, **more):
+    """The document of a comparison with the bench's rows."""
+    return comparison_document(
+        Comparison(table, summary, read_runs("measured").channels, "measured", "steady", "nominal (PM)", **more)
+    )
 
 
 def comparison(log=False):
     """A simulation above the bench. Of a log as its first 2.8 s."""
     measured, table, summary = above_the_bench(rise=0.001)
     time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
-    return comparison_document(
-        Comparison(
-            table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", "" if log else "these",
-            {"time_s": "time [s]"} if log else None, ("a note",),
-        )
-    )  # fmt: skip
+    over = {"time_s": "time [s]"} if log else None
+    return commented(table | time, summary, fit="" if log else "these", over=over, notes=("a note",))
 
 
 def comparison_two():
     """The same with a second robot, 2 % below the readings, which reaches the first row but not the second."""
     measured, table, summary = above_the_bench(rise=0.0)
     error = np.where(np.arange(len(measured)) == 1, np.nan, 0.98)
-    table = add_second_robot(
-        table, measured.channels, {c.column: error * measured[c.column] for c in measured.channels}
-    )
-    return comparison_document(
-        Comparison(
-            table, summary, measured.channels, "measured", "steady", "nominal (PM)", against="found/robot.toml"
-        )
-    )
-
-
-def test_two_robots_are_compared_on_the_rows_that_both_reach():
-    text = as_text(comparison_two())
-    assert "This robot and found/robot.toml on the same 18 rows: total current 4.0 and 2.0 %" in text
+    other = {c.column: error * measured[c.column] for c in measured.channels}
+    return commented(add_second_robot(table, measured.channels, other), summary, against="found/robot.toml")
 
 
 def test_fits_of_a_log_keep_the_samples_after_steps_apart():
@@ -147,10 +138,11 @@ def test_fits_of_a_log_keep_the_samples_after_steps_apart():
     runs = Runs("log.csv", {"time_s": 0.01 * np.arange(120), "supply_voltage_V": volts})
     steps = np.logical_or(*rows_after_steps(runs))
     assert np.flatnonzero(steps).tolist() == [40, 41, 80, 81]
-    speed = channels.find_channel("motor_speed")
-    table = {"time_s": runs["time_s"], speed.column: volts + np.sin(np.arange(120)), "status": np.full(120, "ended")}
-    table[f"simulated_{speed.column}"] = table[speed.column] + 9.0 * steps
-    table[f"error_{speed.name}_percent"] = 9.0 * steps
+    speed, measured = channels.find_channel("motor_speed"), volts + np.sin(np.arange(120))
+    table = {
+        "time_s": runs["time_s"], speed.column: measured, f"simulated_{speed.column}": measured + 9.0 * steps,
+        f"error_{speed.name}_percent": 9.0 * steps, "status": np.full(120, "ended"),
+    }  # fmt: skip
     found = Comparison(
         table, {"all": {speed.name: {"rows": 0}}}, (speed,), "log.csv", "drive", "ours", over={}, after_steps=steps
     )
@@ -166,19 +158,17 @@ def comparison_log():
 
 def settle():
     """A log of two levels, the first of which still changes at its beginning, and of a third that is too short."""
-    rng = np.random.default_rng(3)
+    rng, row = default_rng(3), np.arange(412)
     volts = np.repeat([6.0, 12.0, 18.0], (200, 200, 12))
-    lag = np.where(np.arange(len(volts)) < 200, np.exp(-np.arange(len(volts)) / 40), 0.0)
-    runs = Runs(
-        "log.csv",
-        {
-            "configuration": np.repeat("6T2A", len(volts)), "time_s": 0.01 * np.arange(len(volts)),
-            "supply_voltage_V": volts, "payload_kg": 0.0 * volts, "slope_deg": 0.0 * volts,
-            "total_current_A": 1.2 + volts / 20 + 0.01 * rng.standard_normal(len(volts)),
-            "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(len(volts)),
-        },
-    )  # fmt: skip
-    return settle_report.settle_document(settling.settle_log(runs), "Too few for the loop.", ("a further note",))
+    lag = np.where(row < 200, np.exp(-row / 40), 0.0)
+    columns = {
+        "configuration": np.repeat("6T2A", 412), "time_s": 0.01 * row, "supply_voltage_V": volts,
+        "payload_kg": 0.0 * volts, "slope_deg": 0.0 * volts,
+        "total_current_A": 1.2 + volts / 20 + 0.01 * rng.standard_normal(412),
+        "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(412),
+    }  # fmt: skip
+    log = settling.settle_log(Runs("log.csv", columns))
+    return settle_report.settle_document(log, "Too few for the loop.", ("a further note",))
 
 
 DOCUMENTS = {
@@ -212,18 +202,16 @@ def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
     robot, runs = tmp_path / "robot.toml", read_runs("measured")
     robot.write_text("# a robot\n")
     file = RobotFile(nominal(), str(robot))
+    hashes = {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest}
+
+    def fitted(command, text="# a robot\n", runs=runs):
+        robot.write_text(text)
+        (tmp_path / "manifest.json").write_text(json.dumps({"arguments": [command, "x.csv"], "hashes": hashes}))
+        return recorded_fit(file, runs)
+
     assert recorded_fit(file, runs) == "" == recorded_fit(RobotFile(nominal(), "nominal"), runs)
-    manifest = {
-        "arguments": ["loop", "x.csv"],
-        "hashes": {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest},
-    }
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    assert recorded_fit(file, runs) == "these"
-    assert recorded_fit(file, Runs("other", runs.columns)) == "others"
-    robot.write_text("# changed by hand\n")
-    assert recorded_fit(file, runs) == ""
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"arguments": ["compare", "x.csv"]}))
-    assert recorded_fit(file, runs) == ""
+    assert fitted("loop") == "these" and fitted("loop", runs=Runs("other", runs.columns)) == "others"
+    assert fitted("loop", "# changed by hand\n") == fitted("compare") == ""
 
 
 def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
@@ -267,14 +255,11 @@ def test_the_page_of_check_draws_motor_and_gear(tmp_path):
 
 def test_every_figure_of_the_catalogue_can_be_drawn():
     """A figure of turning missions named a function that was gone."""
-    draws = [
-        e["draws"].rpartition(".") for room in catalogue._content().values() for e in room.values() if "draws" in e
-    ]
-    folder = {False: "sweeps.pages", True: "sweeps"}
-    modules = [f"{folder[module.startswith('paper.')]}.{module}" for module, _, _ in draws]
+    draws = [e["draws"] for room in catalogue._content().values() for e in room.values() if "draws" in e]
     assert len(draws) > 40
-    assert [
-        n
-        for m, (_, _, n) in zip(modules, draws, strict=True)
-        if not callable(getattr(importlib.import_module(m), n, None))
-    ] == []
+    for path in draws:
+        module, _, name = path.rpartition(".")
+        room = importlib.import_module(
+            f"sweeps.{module}" if module.startswith("paper.") else f"sweeps.pages.{module}"
+        )
+        assert callable(getattr(room, name, None)), path

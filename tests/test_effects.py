@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from calibration.data.effect_file import readable_signals
@@ -128,7 +129,7 @@ CONDITIONS = Conditions(
 
 def random_states(n=400):
     """Signals of the nominal robot at random states: either direction, either configuration, spinning."""
-    rng = np.random.default_rng(12)
+    rng = default_rng(12)
     low, high = (-20, -1200, -1.2, 0, 15, -0.3, 0, 0.5), (20, 1200, 1.2, 7000, 33, 0.3, 8, 2)
     current, motor, speed, charge, voltage, slope, payload, adhesion = rng.uniform(low, high, (n, 8)).T
     memory = {e.name: jnp.asarray(e.memory_size * rng.uniform(0, 1, n)) for e in ALL if e.memory_size is not None}
@@ -146,7 +147,7 @@ def random_states(n=400):
     return dataclasses.replace(
         straight,
         pause=rng.uniform(0, 1, n),
-        command=np.random.default_rng(13).uniform(-1, 1, n),
+        command=default_rng(13).uniform(-1, 1, n),
         side=rng.choice((-1.0, 1.0), n),
         yaw_rate=turn,
         direction_turn=np.sign(turn),
@@ -280,23 +281,17 @@ def law_family(effect):
     made = fitted(effect, size(effect))
     before = terms(made)
     if not effect.driver:
-        of = [
-            np.ones_like(before),
-            *(np.asarray(getattr(STATES, n)) for n in SHARED.get(effect.channel or effect.balance, ())),
-            *(np.asarray(c.read(NOMINAL, STATES)) for c in channels.EVERY if c.name == effect.channel),
-        ]
-        shares = [before / x for x in of]
+        of = [np.ones_like(before), *(getattr(STATES, n) for n in SHARED.get(effect.channel or effect.balance, ()))]
+        of += [c.read(NOMINAL, STATES) for c in channels.EVERY if c.name == effect.channel]
+        shares = [before / np.asarray(x) for x in of]
         assert any(np.ptp(x) < 1e-9 * np.abs(x).max() for x in shares), "varies, and says not with what"
         return
     if effect.driver == "angle" or effect.memory_size is not None:
         assert (effect.driver == "angle") == issubclass(effect, Periodic)
         return
-    moved = {
-        n: 0.5 * getattr(STATES, n) if n != "configuration" else 1 - STATES.configuration
-        for n in DRIVERS[effect.driver]
-    }
-    if effect.driver == "configuration":
-        moved["on_tracks"] = 1 - STATES.on_tracks
+    halved = {n: 0.5 * getattr(STATES, n) for n in DRIVERS[effect.driver]}
+    turned = {n: 1 - getattr(STATES, n) for n in ("configuration", "on_tracks")}
+    moved = turned if effect.driver == "configuration" else halved
     after = terms(made, signals=dataclasses.replace(STATES, **moved))
     assert np.abs(after - before).max() > 1e-3 * np.abs(before).max(), f"does not change with {effect.driver}"
 
@@ -330,7 +325,7 @@ def law_linear(effect):
 
 def law_unit(effect):
     """Under other units of mass, length, time and current the term turns as the unit of its balance."""
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     start = fitted(effect, 0.8 * size(effect))
     before = terms(start)
     for _ in range(3):
@@ -362,19 +357,16 @@ def law_dissipative(effect):
 
 #: Instants at which a term may read: settled travel (None where it has none), motion, and standstill.
 INSTANTS = {
-    "settled": (State(*map(jnp.asarray, (2.0, 700.0, 0.5, 100.0))), True),
-    "climbing": (State(*map(jnp.asarray, (2.0, 700.0, 0.5, 100.0))), False),
-    "backwards": (State(*map(jnp.asarray, (-3.0, -500.0, -0.45, 100.0))), False),
-    "standstill": (State(*map(jnp.asarray, (0.0, 0.0, 0.0, 0.0))), False),
-}
+    "settled": (2.0, 700.0, 0.5, 100.0), "climbing": (2.0, 700.0, 0.5, 100.0),
+    "backwards": (-3.0, -500.0, -0.45, 100.0), "standstill": (0.0, 0.0, 0.0, 0.0),
+}  # fmt: skip
 
 
 @functools.cache
 def known(balance, channel, instant):
     """What a term in this balance may read."""
-    state, settled = INSTANTS[instant]
-    run = jax.tree.map(lambda x: x[2], CONDITIONS)
-    return readable_signals(NOMINAL, run, state, balance, channel, settled=settled)
+    run, state = jax.tree.map(lambda x: x[2], CONDITIONS), State(*map(jnp.asarray, INSTANTS[instant]))
+    return readable_signals(NOMINAL, run, state, balance, channel, settled=instant == "settled")
 
 
 def law_readable(effect):
@@ -434,12 +426,9 @@ SHOWN_BY_STATES = ("motor_current", "output_torque", "motor_voltage", "yaw_rate"
 @pytest.mark.parametrize("law", (law_declared, law_family, law_linear, law_unit), ids=lambda law: law.__name__[4:])
 @pytest.mark.parametrize(
     "effect",
-    [
-        *effects.OF_TURNS.values(),
-        *(effects.OF_CHANNELS[f"{n}_{what}"] for n in SHOWN_BY_STATES for what in ("gain", "offset")),
-    ],
+    [*effects.OF_TURNS.values(), *(effects.OF_CHANNELS[f"{n}_{x}"] for n in SHOWN_BY_STATES for x in ("gain", "offset"))],
     ids=lambda effect: effect.name,
-)
+)  # fmt: skip
 def test_effect_of_turns_and_of_channels_obeys(effect, law):
     law(effect)
 
@@ -457,13 +446,14 @@ def test_every_channel_has_an_error_of_its_scale_and_of_a_zero_that_it_may_miss(
     # Random numbers go by position: the errors of zeros stand behind those that were before.
     behind = [e.of_zero for e in effects.OF_CHANNELS.values() if e.channel != "winding_temperature"]
     assert behind == sorted(behind)
-    values = {f.name: 0.5 for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")}
-    signals = Signals(**values)
+    signals = Signals(
+        **{f.name: 0.5 for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")}
+    )
     for effect in effects.OF_CHANNELS.values():
         law_declared(effect)
         shown = float(channels.find_channel(effect.channel).read(NOMINAL, signals))
-        size = 1.0 if effect.of_zero else shown
-        assert shown and float(effect(amplitude=0.02).term(NOMINAL, signals)) == pytest.approx(0.02 * size)
+        error = float(effect(amplitude=0.02).term(NOMINAL, signals))
+        assert shown and error == pytest.approx(0.02 if effect.of_zero else 0.02 * shown)
 
 
 #: Readings of a motor current of 2 A both ways and at rest, of a meter 5 % and 0.18 A too high.
@@ -607,76 +597,27 @@ def test_units_of_parameters_and_balances_are_all_known(free):
         dimensions(unit)
 
 
-def test_dimensions_of_products():
-    assert dimensions("V/A") == dimensions("ohm")
-    assert dimensions("N·m/s") == dimensions("W") == dimensions("V·A")
-    assert dimensions("V·s") == dimensions("N·m/A")
-    with pytest.raises(ValueError, match="furlong"):
-        dimensions("furlong/s")
-
-
 # --- both fidelities feel every effect ------------------------------------------------------------------
 
 
-#: In `make test` one of a balance of the electrical side, one of the mechanical, one with a memory and one of an
-#: instrument; that every effect is alive at zero in its own balance, and in `steady`, is a law above.
-FELT = ("supply_sag", "churning", "ammeter_gain")
-#: Instants at which `drive` is read [s]: what acts at a crawl shows at the first, what warms up at the last.
-DRIVEN = (0.0, 0.003, 0.1, 1.0, 4.0)
+@pytest.mark.slow
+def test_drive_without_amplitudes_is_drive_without_effects():
+    def driven(*present):
+        robot, times = with_effects(*present), jnp.asarray([0.0, 0.003, 0.1, 1.0, 4.0])
+        run = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-11, max_steps=65_536).signals))
+        return readings(robot, run(CONDITIONS))[:, 1:]
 
-
-@pytest.fixture(scope="module")
-def drive_readings():
-    """Readings of `drive` from 3 ms to 4 s in all conditions, for a vector of amplitudes of ALL."""
-    times = jnp.asarray(DRIVEN)
-
-    @jax.jit
-    def run(amplitudes):
-        robot = with_effects(*(fitted(e, a) for e, a in zip(ALL, amplitudes, strict=True)))
-
-        def one(c):
-            answer = drive(robot, c, times, tolerance=1e-11, max_steps=65_536)
-            return readings(robot, answer.signals)[1:]
-
-        return jax.vmap(one)(CONDITIONS)
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def without_amplitudes(drive_readings):
-    return drive_readings(jnp.zeros(len(ALL)))
+    assert_allclose(driven(*(effect() for effect in ALL)), driven(), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_drive_without_amplitudes_is_drive_without_effects(without_amplitudes):
-    bare = NOMINAL
-    plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray(DRIVEN), tolerance=1e-11)))(CONDITIONS)
-    expected = readings(bare, plain.signals)[:, 1:]
-    assert_allclose(without_amplitudes, expected, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(
-    "k",
-    [k if e.name in FELT else pytest.param(k, marks=pytest.mark.slow) for k, e in enumerate(ALL)],
-    ids=[e.name for e in ALL],
-)
-def test_drive_and_steady_both_feel(k, drive_readings, without_amplitudes):
-    """At a tenth of the prior's standard deviation a reading moves by more than 1e-5, in both fidelities.
-
-    What settled travel does not show is looked for in `drive` alone, at the whole of it.
-    """
-    share = (1.0 if ALL[k].transient else 0.1) * size(ALL[k])
-    base, moved = without_amplitudes, drive_readings(jnp.zeros(len(ALL)).at[k].set(share))
-    assert np.isfinite(moved).all()
-    assert (np.abs(moved - base) / np.abs(base)).max() > (1e-6 if ALL[k].transient else 1e-5)
-    if ALL[k].transient:
-        return
-    of_steady = compiled(outputs_steady, ALL)[0]
-    base, moved = of_steady(jnp.zeros(len(ALL))), of_steady(jnp.zeros(len(ALL)).at[k].set(share))
-    count = len(channels.EVERY)  # the readings
-    assert (np.abs(moved - base)[:, :count] / np.maximum(np.abs(base[:, :count]), 1e-9)).max() > 1e-5
+def test_drive_feels_every_effect():
+    """That `steady` feels those that settled travel shows is a law above."""
+    values, slopes = at_zero(outputs_start, ALL)
+    sizes = np.array([size(effect) for effect in ALL])
+    moved = np.abs(slopes * sizes / np.maximum(np.abs(values), 1e-9)[..., None]).max((0, 1))
+    least = np.where([effect.transient for effect in ALL], 1e-6, 1e-4)
+    assert np.isfinite(slopes).all() and [e.name for e, x in zip(ALL, moved < least, strict=True) if x] == []
 
 
 # --- what single effects amount to ----------------------------------------------------------------------
@@ -698,32 +639,37 @@ def _same(a, b, channels=("total_current", "motor_speed", "speed")):
 
 
 @pytest.mark.slow
-def test_series_resistance_is_winding_resistance():
-    _same(_steady_with(series_resistance=0.4), _steady_with({"motor.resistance": 0.611 + 0.4}))
+@pytest.mark.parametrize("effect, amplitude, parameter, value", [
+    ("series_resistance", 0.4, "motor.resistance", 0.611), ("mass_offset", 1.6, "4W2T.mass", 11.5),
+])  # fmt: skip
+def test_effect_is_more_of_a_parameter(effect, amplitude, parameter, value):
+    _same(_steady_with(**{effect: amplitude}), _steady_with({parameter: value + amplitude}))
 
 
-@pytest.mark.slow
-def test_mass_offset_is_mass_of_the_wheeled_robot():
-    _same(_steady_with(mass_offset=1.6), _steady_with({"4W2T.mass": 11.5 + 1.6}))
+def _in_each_run(effect, amplitude, changes, channel):
+    """A reading with an effect is in each run that of a robot with other numbers, which follow from the result."""
+    with_it = _steady_with(**{effect: amplitude})
+    for k, reading in enumerate(getattr(with_it, channel)):
+        changed = _steady_with(changes(float(with_it.motor_current[k]), float(with_it.motor_speed[k])))
+        assert_allclose(reading, getattr(changed, channel)[k], rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_winding_heating_is_resistance_at_the_settled_temperature():
-    with_it = _steady_with(winding_heating=1.0)
-    for k in range(CONDITIONS.voltage.size):
-        current = float(with_it.motor_current[k])
-        rise = 7.7 * 0.611 * current**2
-        hot = _steady_with({"motor.resistance": 0.611 * (1 + 0.00393 * rise)})
-        assert_allclose(with_it.motor_speed[k], hot.motor_speed[k], rtol=1e-9)
+    def hot(current, _):
+        return {"motor.resistance": 0.611 * (1 + 0.00393 * 7.7 * 0.611 * current**2)}
+
+    _in_each_run("winding_heating", 1.0, hot, "motor_speed")
 
 
 def test_churning_is_viscous_loss_that_grows_with_speed():
-    with_it = _steady_with(churning=3e-4)
-    for k in range(CONDITIONS.voltage.size):
-        turn = 3e-4 * float(with_it.motor_speed[k]) / 48.0
-        viscous = {"6T2A.track.loss_viscous": 0.016 + turn, "4W2T.track.loss_viscous": 0.003 + turn}
-        more = _steady_with(viscous)
-        assert_allclose(with_it.total_current[k], more.total_current[k], rtol=1e-9)
+    def viscous(_, speed):
+        return {
+            "6T2A.track.loss_viscous": 0.016 + 3e-4 * speed / 48,
+            "4W2T.track.loss_viscous": 0.003 + 3e-4 * speed / 48,
+        }
+
+    _in_each_run("churning", 3e-4, viscous, "total_current")
 
 
 def test_rolling_radius_changes_the_distance_and_no_torque():
@@ -785,17 +731,17 @@ def test_stribeck_exponent_is_its_formula(exponent):
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 4.0])
 def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     def term(speed, fade, power):
-        effect = params.replace(BY_NAME["stribeck_exponent"](), {"speed_fade": fade, "exponent": power})
-        effect = params.replace(effect, {"amplitude": 1.0})
+        effect = params.replace(
+            BY_NAME["stribeck_exponent"](), {"speed_fade": fade, "exponent": power, "amplitude": 1.0}
+        )
         return effect.term(NOMINAL, Signals(speed_wheel=speed, direction=jnp.asarray(1.0)))
 
     slopes = jax.vmap(jax.grad(term, (0, 1, 2)), (0, None, None))
     speeds = jnp.asarray([-1e-3, -1e-12, 0.0, 1e-12, 1e-3, 1.0, 30.0])
-    found = np.stack(slopes(speeds, jnp.asarray(8.0), jnp.asarray(exponent)))
+    found = np.stack(slopes(speeds, 8.0, exponent))
     assert np.isfinite(found).all() and np.abs(found).max() < 20
-    step = 1e-6
-    at = [term(jnp.asarray(1.0 + s), jnp.asarray(8.0), jnp.asarray(exponent)) for s in (-step, step)]
-    assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
+    less, more = (term(jnp.asarray(1.0 + s), 8.0, exponent) for s in (-1e-6, 1e-6))
+    assert_allclose(found[0, 5], (more - less) / 2e-6, rtol=1e-6)
 
 
 def _torque(name, memory, **signals):
@@ -821,24 +767,23 @@ def test_load_lost_through_a_bristle_is_its_mean_and_its_difference(bend, way):
     """μ_avg |τ| z + μ_dif τ z² with μ_avg = a + b/2 and μ_dif = -b/2, whichever way the load acts."""
     average, difference = 0.12, -0.05
     amplitudes = {"bristle_load_loss": average + difference, "bristle_backdriving_loss": -2 * difference}
+
+    def at(name, amplitude, **signals):
+        given = {k: jnp.asarray(v) for k, v in (signals | {"direction": way}).items()}
+        return fitted(BY_NAME[name], amplitude), Signals(memory={name: jnp.asarray(bend)}, **given)
+
     for load in (1.5, -1.5):
-        at = dict(torque_carried=jnp.asarray(load), direction=jnp.asarray(way))
-        signals = [Signals(memory={n: jnp.asarray(bend)}, **at) for n in amplitudes]
-        found = [
-            fitted(BY_NAME[n], a).term(NOMINAL, s) for (n, a), s in zip(amplitudes.items(), signals, strict=True)
-        ]
-        assert float(sum(found)) == pytest.approx(average * abs(load) * bend + difference * load * bend**2)
-    rate = fitted(BY_NAME["bristle_load_loss"], 1.0).rate
-    at = Signals(
-        memory={"bristle_load_loss": jnp.asarray(bend)}, speed_wheel=jnp.asarray(4 * way), direction=jnp.asarray(way)
-    )
-    assert float(rate(NOMINAL, at)) == pytest.approx((4 * way - 4 * bend) / 0.02)
+        made = [at(name, a, torque_carried=load) for name, a in amplitudes.items()]
+        lost = sum(float(effect.term(NOMINAL, signals)) for effect, signals in made)
+        assert lost == pytest.approx(average * abs(load) * bend + difference * load * bend**2)
+    effect, signals = at("bristle_load_loss", 1.0, speed_wheel=4 * way)
+    assert float(effect.rate(NOMINAL, signals)) == pytest.approx((4 * way - 4 * bend) / 0.02)
 
 
 @pytest.mark.parametrize("name", ["bristle_load_loss", "bristle_backdriving_loss"])
 def test_settled_loss_through_a_bristle_is_that_of_the_load(name):
     settled = dataclasses.replace(STATES, memory={})
-    at_speed = np.abs(np.asarray(settled.direction)) == 1
+    at_speed = np.abs(settled.direction) == 1
     found, known = (_term(n, settled, amplitude=0.1)[at_speed] for n in (name, BY_NAME[name].settles_to))
     assert_allclose(found, known, rtol=1e-12, atol=1e-15)
     assert at_speed.sum() > 300 and np.abs(found).max() > 0.01
@@ -862,13 +807,12 @@ def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
 
 
 def test_friction_by_the_position_begins_where_a_history_does():
-    names = ("position_friction", "angle_friction", "presliding")
-    load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
-    robot = blank_robot(Configurations({"bench": load}))
-    begins = RunStarts({"begin_a": RunStart(angle=1.5), "begin_b": RunStart(angle=-2.0)})
+    names, angles = ("position_friction", "angle_friction", "presliding"), (1.5, -2.0)
+    robot = blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)}))
+    begins = RunStarts({f"begin_{k}": RunStart(angle=angle) for k, angle in enumerate(angles)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
-    for begin, angle in enumerate((1.5, -2.0)):
+    for begin, angle in enumerate(angles):
         run = jax.tree.map(lambda x: x[0], Conditions([0], voltage=[0.0], begin=[begin]))
         memory = state_of_unknowns(robot, drive_start(robot, run)).memory
         assert [float(memory[n]) for n in names] == [angle, angle, 0.0]
@@ -878,22 +822,18 @@ def test_friction_by_the_position_begins_where_a_history_does():
 
 
 def test_library_declares_what_the_loop_asks_for():
-    assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
     both_ways = ["directional_friction", "directional_viscous", "torque_offset", "directional_stribeck"]
-    assert [e.name for e in ALL if e.needs_reverse] == both_ways
+    for field, names in {
+        "needs_battery": ["battery_sag"], "needs_reverse": both_ways, "odd_in_travel": [*both_ways, "slope_bias"],
+        "needs_duty": ["coast_decay", "duty_exponent", "duty_dead_band", "duty_saturation"],
+    }.items():  # fmt: skip
+        assert [e.name for e in ALL if getattr(e, field)] == names
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {
         "thermal_drift": "winding_heating", "torque_offset": "directional_friction",
         "bristle_load_loss": "gear_load_loss", "bristle_backdriving_loss": "backdriving_loss",
     }  # fmt: skip
-    assert [e.name for e in ALL if e.needs_duty] == [
-        "coast_decay",
-        "duty_exponent",
-        "duty_dead_band",
-        "duty_saturation",
-    ]
     # An effect of a balance without a probe would have a score of 0 in every table.
     assert {e.balance for e in ALL if SettledRuns.shows(e)} <= {*PROBED, "sensor"}
-    assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",
     }  # fmt: skip

@@ -5,16 +5,18 @@ from __future__ import annotations
 import ast
 import builtins
 import csv
-import dataclasses
 import html.parser
 import json
 import re
 import tomllib
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import samples
+from pyarrow import feather, parquet
 from rich.table import Table as RichTable
 
 from calibration.data import delimited
@@ -31,6 +33,7 @@ from sweeps.export.law_source import LawConstant, jax_source, mjlab_files, modul
 from sweeps.export.mujoco import mjcf_fragment, mjcf_motor, mjcf_scene, translate_law
 from sweeps.report import export_report, page_renderer
 from sweeps.report.document import Column, Document, Note, Section, Table
+from tests.commands import csv_text
 
 #: Each ends a literal, a comment or a line of some language, and would then call `boom`.
 NAMES = (
@@ -51,17 +54,10 @@ def obeyed(text):
 def drive():
     """The packaged robot as a joint, its file and its load called by all names, and its numbers."""
     file = find_robot_file("nominal")
-    robot = file.robot
-    named = dataclasses.replace(robot, configurations=Configurations({ALL: robot.configurations.members[0]}))
-    joint = joints.joint_of_robot(dataclasses.replace(file, robot=named, source=f"{ALL.replace('/', '')}.toml"), ALL)
-    known = [
-        LawConstant(n, x, ALL, ALL, ALL)
-        for n, x in {
-            **{n: float(p.value) for n, p in joint.parameters().items()},
-            **dict.fromkeys(joint.surroundings(), 0.7),
-        }.items()
-    ]
-    return joint, known
+    named = replace(file.robot, configurations=Configurations({ALL: file.robot.configurations.members[0]}))
+    joint = joints.joint_of_robot(replace(file, robot=named, source=f"{ALL.replace('/', '')}.toml"), ALL)
+    numbers = {n: float(p.value) for n, p in joint.parameters().items()} | dict.fromkeys(joint.surroundings(), 0.7)
+    return joint, [LawConstant(n, x, ALL, ALL, ALL) for n, x in numbers.items()]
 
 
 def test_generated_source_has_names_as_words_and_runs_none(drive, monkeypatch):
@@ -121,8 +117,8 @@ def test_toml_and_json_keep_every_name(name):
 def test_robot_files_keep_names_of_columns(tmp_path):
     robot = find_robot_file("nominal").robot
     columns = tuple((f"column_{k}", n.encode("utf-8", "replace").decode(), 1.0) for k, n in enumerate(NAMES))
-    rig = dataclasses.replace(robot.rig, columns=columns)
-    write_robot(dataclasses.replace(robot, rig=rig), tmp_path / "robot.toml", note=ALL.replace("\ud800", ""))
+    rig = replace(robot.rig, columns=columns)
+    write_robot(replace(robot, rig=rig), tmp_path / "robot.toml", note=ALL.replace("\ud800", ""))
     content = (tmp_path / "robot.toml").read_text("utf-8")
     assert list(tomllib.loads(content)["columns"].values()) == [theirs for _, theirs, _ in columns]
 
@@ -160,17 +156,16 @@ class Elements(html.parser.HTMLParser):
 
 
 def test_pages_have_names_as_words(tmp_path):
-    def elements(name, folder):
+    def elements(name):
         table = Table("t", (Column(name), Column("b", name, group=name)), [(name, name), ("y", -1.5)], title=name)
         document = Document(name, name, (Note(name),), (Section(name, (table, Note((name, name)))),))
-        (tmp_path / folder).mkdir()
-        text = page_renderer.write_report_page(tmp_path / folder, document).read_text("utf-8")
+        text = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")
         assert not obeyed(text)
         return Elements(text).found
 
-    plain = elements("plain", "a")
-    for k, name in enumerate(n for n in NAMES if "`" not in n):  # which our markup shows as code
-        assert elements(name, f"b{k}") == plain
+    plain = elements("plain")
+    for name in (n for n in NAMES if "`" not in n):  # which our markup shows as code
+        assert elements(name) == plain
 
 
 def test_terminals_get_nothing_that_they_obey(capsys):
@@ -189,27 +184,24 @@ def test_terminals_get_nothing_that_they_obey(capsys):
 
 #: Name of a signal that sets a terminal's colour and title.
 RED = "\x1b[31mred\x1b]0;pwn\x07\u202e"
+
+
+def arrow(columns):
+    schema = pa.schema([pa.field(n, pa.float64(), metadata={"unit": RED}) for n in columns])
+    return pa.table(list(map(pa.array, columns.values())), schema=schema)
+
+
 WRITERS = {
     "a.npz": samples.npz, "a.json": samples.json_records, "b.json": samples.json_arrays, "c.mat": samples.mat73,
-    "a.csv": lambda path, columns: path.write_text(
-        "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in zip(*map(list, columns.values()), strict=True))])
-    ),
+    "a.csv": lambda path, columns: path.write_text(csv_text(columns)),
+    "a.parquet": lambda path, columns: parquet.write_table(arrow(columns), path),
+    "a.feather": lambda path, columns: feather.write_feather(arrow(columns), str(path)),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("file", [*WRITERS, "a.parquet", "a.feather"])
+@pytest.mark.parametrize("file", WRITERS)
 def test_names_in_files_of_every_format_reach_no_terminal(mmrjax, tmp_path, file):
-    columns = {RED if n == "amps" else n: v for n, v in samples.table().items()}
-    if file in WRITERS:
-        WRITERS[file](tmp_path / file, columns)
-    else:
-        import pyarrow as pa
-        from pyarrow import feather, parquet
-
-        metadata = {"unit": RED}
-        schema = pa.schema([pa.field(n, pa.float64(), metadata=metadata) for n in columns])
-        made = pa.table(list(map(pa.array, columns.values())), schema=schema)
-        (parquet.write_table if file == "a.parquet" else feather.write_feather)(made, str(tmp_path / file))
+    WRITERS[file](tmp_path / file, {RED if n == "amps" else n: v for n, v in samples.table().items()})
     for arguments in (("inspect", file), ("inspect", file, "--json"), ("rig", "check", f"{RED}.toml", file)):
         code, out, err = mmrjax(*arguments)
         assert code in (0, 2, 4) and not obeyed(out + err), (arguments, out, err)
@@ -220,8 +212,8 @@ def test_names_in_files_of_every_format_reach_no_terminal(mmrjax, tmp_path, file
     assert code in (0, 4) and not obeyed(out + err)
 
 
-def test_half_a_surrogate_pair_is_shown_replaced(mmrjax, tmp_path):
+@pytest.mark.parametrize("words", ["inspect surr.json", "inspect surr.json --json"])
+def test_half_a_surrogate_pair_is_shown_replaced(mmrjax, tmp_path, words):
     (tmp_path / "surr.json").write_text('[{"\\ud800": 1, "t": 2}]')
-    for further in ((), ("--json",)):
-        code, out, err = mmrjax("inspect surr.json", *further)
-        assert code in (0, 4) and "Traceback" not in err and not obeyed(out + err)
+    code, out, err = mmrjax(words)
+    assert code in (0, 4) and "Traceback" not in err and not obeyed(out + err)

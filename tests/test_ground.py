@@ -3,13 +3,14 @@
 import jax
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model import chassis, paper_robots
 from mmrjax.model.contact import Friction, Ground, force_gravity, slip_ratio
 
-RNG = np.random.default_rng(5)
+RNG = default_rng(5)
 G = 9.80665
 
 

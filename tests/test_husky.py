@@ -1,6 +1,6 @@
 """The Husky's table of settled turns: read, checked and calibrated as any other rig's."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
     freed = loop_parameter_names(ours, present, *SettledTurns.free())
     of_ground = {f"{name}.ground.friction.{number}" for name in present for number in ("static", "speed_static")}
     assert len(of_ground) == 6 and of_ground < set(freed)
-    straight = dataclasses.replace(ours, rig=dataclasses.replace(ours.rig, channels=("motor_current",)))
+    straight = replace(ours, rig=replace(ours.rig, channels=("motor_current",)))
     assert not of_ground & set(loop_parameter_names(straight, present))
 
 

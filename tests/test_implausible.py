@@ -1,10 +1,11 @@
 """What would explain the data but for its size is said beside `unnamed`, with how large it is and what to check."""
 
-import dataclasses
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from synthetic import FEW, SETTLED, table
 from test_stated_values import LOOKS
 from worlds import laws, settled, tables
@@ -24,7 +25,7 @@ def heated(times, grid=settled.table8):
     p = dict(settled.CLIMBING)
     c = grid(p)
     readings = settled.readings(c, p, (laws.Term("winding_heating", times * LARGEST),))
-    return table(tables.table_of(c, *readings, settled.Instruments(), np.random.default_rng(1)))
+    return table(tables.table_of(c, *readings, settled.Instruments(), default_rng(1)))
 
 
 def steep(p):
@@ -143,33 +144,36 @@ def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
 )
 def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
     """Whatever stands beside a strong effect: none gives power, none is at a bound, each has a p of its own."""
-    seen = 0
-    for seed in range(4):
-        found = SETTLED.trace(table(tables.narrow(names, sigmas, seed)))
-        if found.alike is None:
-            continue
-        space, base = found.screened.base.space, found.screened.base.candidate
-        told = found_effects(space, base, found.best, found.alike, found.left.test, SETTLED.settings)
-        for e in told:
-            amplitude = e.parameters["amplitude"]
-            assert e.p_value <= SETTLED.settings.family_wise_error, e.name
-            assert not BY_NAME[e.name].dissipative or amplitude.value > 0, e.name
-            spec = amplitude_of(BY_NAME[e.name]()).spec
-            assert spec.bounds[0] < amplitude.value < spec.bounds[1]
-            seen += 1
+    traces = [SETTLED.trace(table(tables.narrow(names, sigmas, seed))) for seed in range(4)]
+    seen = []
+    for found in (t for t in traces if t.alike is not None):
+        base = found.screened.base
+        seen += found_effects(base.space, base.candidate, found.best, found.alike, found.left.test, SETTLED.settings)
         assert found.best.plausible
-    assert seen >= 3
+    for e in seen:
+        kind, amplitude = BY_NAME[e.name], e.parameters["amplitude"].value
+        low, high = amplitude_of(kind()).spec.bounds
+        assert e.p_value <= SETTLED.settings.family_wise_error, e.name
+        assert low < amplitude < high and (not kind.dissipative or amplitude > 0), e.name
+    assert len(seen) >= 3
 
 
 def test_an_effect_without_a_p_of_its_own_is_not_proposed(looks):
     """The same search, once as it is and once where noise explains as much in every table of the bootstrap."""
     analyst, grid = looks
-    runs = table(tables.narrow(["churning"], 10.0, seed=4, grid=grid))
-    found = analyst.trace(runs)
+    found = analyst.trace(table(tables.narrow(["churning"], 10.0, seed=4, grid=grid)))
     assert "churning" in found.members[0]
-    space, base, left = found.screened.base.space, found.screened.base.candidate, found.left
-    quiet = lambda text: None  # noqa: E731
-    assert search_effects(space, base, left, found.screened.bases, analyst.settings, quiet).best is not None
-    loud = dataclasses.replace(left.test.null, single=np.full_like(left.test.null.single, 1e3))
-    left = dataclasses.replace(left, test=dataclasses.replace(left.test, null=loud))
-    assert search_effects(space, base, left, found.screened.bases, analyst.settings, quiet).best is None
+    base, test = found.screened.base, found.left.test
+    loud = replace(test, null=replace(test.null, single=np.full_like(test.null.single, 1e3)))
+    best = [
+        search_effects(
+            base.space,
+            base.candidate,
+            replace(found.left, test=of),
+            found.screened.bases,
+            analyst.settings,
+            lambda text: None,
+        ).best
+        for of in (test, loud)
+    ]
+    assert best[0] is not None and best[1] is None

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from worlds import rigs
 
 from calibration.data import robot_file
@@ -17,7 +18,6 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import OutOfTime
 from calibration.discovery.discover import discover
 from calibration.discovery.verdict import LoopStages
-from calibration.inference import population
 from mmrjax.compile import programs
 from sweeps.commands import loop as command
 from sweeps.config import FolderPart, LoopBeside
@@ -78,7 +78,7 @@ def test_a_budget_has_a_unit(text, seconds):
 @pytest.fixture
 def rig(tmp_path):
     """A folder with a bench's file and its table."""
-    world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    world = rigs.world(default_rng(3), "bench", "voltage", rows=(16, 20))
     rigs.case(world).write(tmp_path)
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
@@ -169,7 +169,7 @@ def test_a_budget_ends_a_step_that_says_nothing():
 
 @pytest.mark.nightly
 def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
-    world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    world = rigs.world(default_rng(3), "bench", "voltage", rows=(16, 20))
     rigs.case(world, "iron_loss", 12.0).write(tmp_path)
     text = (tmp_path / "table.csv").read_text().splitlines()
     header = text[0].split(",")
@@ -204,7 +204,3 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     ended = discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
     assert ended.verdict == found.verdict and not ended.sensitivity
     assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [tuple(sorted(factors))]
-
-
-def test_nothing_is_kept_where_nobody_asks():
-    assert population.compute_without_storing("base", lambda: 3) == 3

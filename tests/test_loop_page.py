@@ -1,15 +1,16 @@
 """What the loop's page, its terminal output and result.json say, and that their numbers agree."""
 
-import dataclasses
 import difflib
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import ANY
 
 import jsonschema
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pages import Tables, as_text, drawn, recorded, tokens
 from synthetic import SETTLED, table
@@ -49,8 +50,8 @@ def happening():
     """A clean table in random order, with the speed shown 12 mm/s too low in fifteen runs that were made one after another."""
     p = dict(settled.CLIMBING)
     c = settled.table8(p)
-    columns = tables.table_of(c, *settled.readings(c, p), settled.Instruments(), np.random.default_rng(1))
-    columns["order"] = np.random.default_rng(5).permutation(len(columns["slope_deg"])) + 1.0
+    columns = tables.table_of(c, *settled.readings(c, p), settled.Instruments(), default_rng(1))
+    columns["order"] = default_rng(5).permutation(len(columns["slope_deg"])) + 1.0
     off = (columns["order"] >= 30) & (columns["order"] <= 44)
     columns["speed_mm_s"] = columns["speed_mm_s"] - 12.0 * off
     return table(columns)
@@ -94,13 +95,6 @@ def shown(tmp_path_factory):
         return SimpleNamespace(**vars(known[name]), printed=" ".join(capsys.readouterr().out.split()))
 
     return of
-
-
-def written(folder, found):
-    """The page of a result, without its figures: pages with them are those of `shown`."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_renderer, "figure_as_svg", lambda figure: "<svg/>")
-        return page_of(folder, found)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -165,28 +159,28 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     """A stranger has to find the law, its band and whether the robot can be used before anything else."""
     got = shown("churning", capsys)
     head = got.text[: got.text.index('<nav id="contents"')]
-    assert [head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")] == sorted(
-        head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")
-    )
-    assert "May I use it for …" in head and "new law, 95 % band" in head
+    places = [head.index(f'id="{name}"') for name in ("answer", "law", "errors", "advice")]
+    assert places == sorted(places) and "May I use it for …" in head and "new law, 95 % band" in head
+    changes = changes_by_effect(got.found)
     with figure_settings():
-        (axes,) = draw_effect_laws(got.found, rows_for_figures(got.found), changes_by_effect(got.found)).axes
-    band = axes.collections[-1].get_paths()[0].get_extents()
-    (change,) = changes_by_effect(got.found).values()
-    size = got.found.effects[0].parameters["amplitude"]
+        (axes,) = draw_effect_laws(got.found, rows_for_figures(got.found), changes).axes
+    (change,), size = changes.values(), got.found.effects[0].parameters["amplitude"]
     largest = np.abs(change.with_it - change.without).max() / change.channel.factor
+    band = band_of(axes)
     assert axes.get_xlabel() == "motor speed [rpm]"
     assert_allclose(max(abs(band.y0), abs(band.y1)), largest * (1 + 1.96 * size.sd / abs(size.value)), rtol=1e-3)
     capsys.readouterr()
     print_document(documented(got.found), brief=True)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 4 and lines[0] == got.found.statement  # the fifth is the path of the folder
-    assert [line.partition(":")[0] for line in lines[1:]] == [
-        "Changed",
-        "rms error, robot file as given → after the loop",
-        "Next",
-    ]
-    assert lines[1].index("motor.torque_constant is") < lines[1].index("Added: churning ")  # what moved comes first
+    answer, *lines = capsys.readouterr().out.splitlines()
+    assert answer == got.found.statement  # the fifth is the path of the folder
+    titles = ["Changed", "rms error, robot file as given → after the loop", "Next"]
+    assert [line.partition(":")[0] for line in lines] == titles
+    assert lines[0].index("motor.torque_constant is") < lines[0].index("Added: churning ")  # what moved comes first
+
+
+def band_of(axes):
+    """Extents of the band that is drawn last."""
+    return axes.collections[-1].get_paths()[0].get_extents()
 
 
 def drawn_law(table, x_column, law, sd=0.1):
@@ -223,26 +217,28 @@ def test_both_directions_of_a_law_have_their_own_line():
     assert len(ways) == 2 and all(np.ptp(way) == 0 for way in ways)
 
 
+def levels(torque):
+    """A table of three voltages and these torques."""
+    return {"supply_voltage_V": VOLTS, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
+
+
+VOLTS = np.repeat([4.0, 8.0, 12.0], 7)
+
+
 def test_a_law_over_two_quantities_is_a_line_for_each_level():
     """One line over the current went up and down between the levels of the voltage."""
-    volts, torque = (x.ravel() for x in np.meshgrid([4.0, 8.0, 12.0], np.linspace(0.0, 3.0, 7)))
-    table = {"supply_voltage_V": volts, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
-    axes, names = drawn_law(table, "load torque [N·m]", -torque * (1 + 4 / volts))
+    torque = np.tile(np.linspace(0.0, 3.0, 7), 3)
+    axes, names = drawn_law(levels(torque), "load torque [N·m]", -torque * (1 + 4 / VOLTS))
     lines = curves_of(axes, BLUE)
     assert len(lines) == 3 and all(np.all(np.diff(line.get_ydata()) < 0) for line in lines)
     assert "new law by supply voltage, 95 % band (±20 %)" in names
-    band = axes.collections[-1].get_paths()[0].get_extents()
-    assert band.y0 == pytest.approx(1.196 * min(lines[-1].get_ydata()), rel=1e-3)
+    assert band_of(axes).y0 == pytest.approx(1.196 * min(lines[-1].get_ydata()), rel=1e-3)
 
 
 def test_a_law_that_depends_on_more_has_a_mark_for_each_run():
-    volts = np.repeat([4.0, 8.0, 12.0], 7)
-    torque = np.random.default_rng(1).permutation(21) / 7
-    table = {"supply_voltage_V": volts, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
-    jagged = np.random.default_rng(2).standard_normal(21)
-    assert not any(
-        len(x.get_xdata()) > 2 and x.get_linestyle() == "-" for x in drawn_law(table, ANY, jagged)[0].lines
-    )
+    torque = default_rng(1).permutation(21) / 7
+    axes, _ = drawn_law(levels(torque), ANY, default_rng(2).standard_normal(21))
+    assert not any(len(x.get_xdata()) > 2 and x.get_linestyle() == "-" for x in axes.lines)
 
 
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
@@ -259,44 +255,42 @@ def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
 def test_reading_that_weighs_most_is_named(shown, capsys):
     found = shown("churning", capsys).found
     seen, row = found.readings_of_rows, int(np.flatnonzero(found.included)[3])
-    after = seen.measured + 0.5 * seen.sd
-    after[row, 1] += 40 * seen.sd[row, 1]
-    off = dataclasses.replace(found, written=True, readings_of_rows=dataclasses.replace(seen, after=after))
-    said = largest_share(off)
-    assert (
-        said.startswith(f"Row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
-        and "its motor speed" in said
+    even = seen.measured + 0.5 * seen.sd
+    off = even.copy()
+    off[row, 1] += 40 * seen.sd[row, 1]
+    even, said = (
+        largest_share(replace(found, written=True, readings_of_rows=replace(seen, after=after)))
+        for after in (even, off)
     )
-    even = dataclasses.replace(seen, after=seen.measured + 0.5 * seen.sd)
-    assert largest_share(dataclasses.replace(off, readings_of_rows=even)) == ""
+    assert said.startswith(f"Row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
+    assert "its motor speed" in said and even == ""
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys, tmp_path, name):
+def test_what_is_held_by_its_prior_is_in_the_result_and_in_a_note(shown, capsys, name):
     seen = shown(name, capsys)
     made, sd = seen.found, np.sqrt(np.diag(seen.found.posterior.covariance))  # of coordinates whose prior sd is 1
+    held = made.held_by_prior
     of_posterior = {n for n, x in zip(made.posterior.coordinates, sd, strict=True) if x > HELD}
-    assert set(made.held_by_prior) == {n for n in of_posterior if not n.startswith("effects.unnamed")} != set()
-    held = {n for n, p in seen.document["base_shift"].items() if p["held_by_prior"]}
-    assert held == {n for n in made.held_by_prior if n in made.base_shift}
-    assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
-    (note,) = remarks_with_codes(made.remarks, "held_by_prior")
+    assert set(held) == {n for n in of_posterior if not n.startswith("effects.unnamed")} != set()
+    shifts = seen.document["base_shift"]
+    assert {n for n, p in shifts.items() if p["held_by_prior"]} == {*held} & {*made.base_shift}
     far = {n for n, p in made.base_shift.items() if abs(p.shift_after) > FAR}
     pairs = {n for pair in made.together for n in (pair.one, pair.other)}
-    assert list(note.names) == [n for n in made.held_by_prior if n not in far | pairs]
+    (note,) = remarks_with_codes(made.remarks, "held_by_prior")
+    assert list(note.names) == [n for n in held if n not in far | pairs]
     assert far == {remark.name for remark in remarks_with_codes(made.remarks, "far_from_prior")}
-    assert pairs == {
-        n for r in remarks_with_codes(made.remarks, "only_together") for p in r.pairs for n in (p.one, p.other)
-    }
+    together = [p for r in remarks_with_codes(made.remarks, "only_together") for p in r.pairs]
+    assert pairs == {n for p in together for n in (p.one, p.other)}
 
 
 def with_effect(found, **changes):
-    return dataclasses.replace(found, verdict="class", effects=(dataclasses.replace(found.effects[0], **changes),))
+    return replace(found, verdict="class", effects=(replace(found.effects[0], **changes),))
 
 
 def judged(found, established, how, **more):
     test = NameTest(found.effects[0].name, 6.0, 3.3, (), 5.0, 7, 2.5)
-    return dataclasses.replace(found, support=NameSupport(established, how, tests=(test,)), **more)
+    return replace(found, support=NameSupport(established, how, tests=(test,)), **more)
 
 
 #: The result of the command as it is, and with what it could have found besides.
@@ -308,16 +302,16 @@ TOLD = {
     "tentative": lambda found: judged(found, True, "beside", cluster=OutlierCluster("time", 0.6, 0.7, "", 12, 13, 1e-5)),
     "perhaps": lambda found: judged(found, False, "beside"),
     "two_of_a_kind": lambda found: judged(
-        found, False, "beside", effects=(*found.effects, dataclasses.replace(found.effects[0], name="windage"))
+        found, False, "beside", effects=(*found.effects, replace(found.effects[0], name="windage"))
     ),
-    "none": lambda found: dataclasses.replace(
-        found, verdict="none", effects=(), support=None, summary=dataclasses.replace(found.summary, verdict="none")
+    "none": lambda found: replace(
+        found, verdict="none", effects=(), support=None, summary=replace(found.summary, verdict="none")
     ),
-    "hidden": lambda found: dataclasses.replace(found, hidden=(
+    "hidden": lambda found: replace(found, hidden=(
         HiddenEffect("brush_drop", 0.21, "V", 5.5, "stall", 7.2), HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
     )),
-    "worse": lambda found: dataclasses.replace(found, held_out_worse=(WorseChannel("slope", "motor_speed", 10, 4.3, 4.7),)),
-    "ruled_out": lambda found: dataclasses.replace(found, implausible=(RejectedCandidate(
+    "worse": lambda found: replace(found, held_out_worse=(WorseChannel("slope", "motor_speed", 10, 4.3, 4.7),)),
+    "ruled_out": lambda found: replace(found, implausible=(RejectedCandidate(
         {"brush_drop": 0.9}, {"brush_drop": 0.9}, {"brush_drop": 2.9}, -8.0,
         (RuledOut("brush_drop", "size", 2.9, ("motor.resistance",)),),
     ),)),
@@ -357,13 +351,10 @@ def test_the_head_of_a_page_is_read_in_a_minute(shown, capsys):
     assert len(re.sub(r"<table.*?</table>|<svg.*?</svg>|<[^>]+>", " ", head, flags=re.S).split()) <= 120
 
 
-def test_a_run_that_is_different_is_checked_before_another_experiment():
+@pytest.mark.parametrize("level", ["place", "class"])
+def test_a_run_that_is_different_is_checked_before_another_experiment(level):
     test = NameTest("cogging", 7.1, 3.7, (), 0.0, 4, changed="bench.inertia", root_changed=15.8)
-    remark = Remark("run_differs", test=test)
-    steps = [
-        _next_step(
-            SimpleNamespace(headline=SimpleNamespace(level=level), remarks=(remark,), next_experiment=None), ""
-        )
-        for level in ("place", "class")
-    ]
-    assert steps[0].startswith("A different bench.inertia in run 4 explains 15.8 σ") and "run 4" not in steps[1]
+    found = SimpleNamespace(
+        headline=SimpleNamespace(level=level), remarks=(Remark("run_differs", test=test),), next_experiment=None
+    )
+    assert ("run 4" in _next_step(found, "")) == (level == "place")

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.data import robot_file
-from calibration.data import runs as records
 from calibration.described import describe
 from calibration.discovery import discover, log_stages, verdict
 from calibration.discovery.loop_input import LoopInput, prepare_loop
@@ -18,6 +16,7 @@ from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import loop as command
 from sweeps.commands.rig_check import check_rig_file
+from tests.commands import csv_text, read_rig, read_table
 
 RIG = """base = "none"
 channels = [{channels}]
@@ -66,17 +65,13 @@ def servo(play=0.0, friction=0.17, delay=0, seconds=16.0):
 
 
 def read(tmp_path, log, channels='"output_angle"', backlash=""):
-    time, duty, speed, angle = log
-    (tmp_path / "rig.toml").write_text(RIG.format(channels=channels, backlash=backlash))
-    motor = "motor_speed" in channels
-    lines = [f"time_s,supply_voltage_V,duty,output_angle_deg{',motor_speed_rpm' * motor}"]
-    lines += [
-        f"{t:.3f},12,{d},{a:.3f}" + f",{w / RPM:.1f}" * motor
-        for t, d, w, a in zip(time, duty, speed, angle, strict=True)
-    ]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
-    return records.read_runs(tmp_path / "log.csv", robot=robot), robot
+    columns = dict(zip(("time_s", "duty", "motor_speed_rpm", "output_angle_deg"), log, strict=True))
+    columns = {name: np.round(x, 3) for name, x in columns.items()} | {"supply_voltage_V": np.full(len(log[0]), 12)}
+    columns["motor_speed_rpm"] = np.round(log[2] / RPM, 1)
+    if "motor_speed" not in channels:
+        del columns["motor_speed_rpm"]
+    robot = read_rig(tmp_path, RIG.format(channels=channels, backlash=backlash))
+    return read_table(tmp_path, csv_text(columns), robot), robot
 
 
 @pytest.mark.parametrize(
@@ -139,16 +134,13 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
         return (base, rejected) if name == "bootstrap 0" else (base, rejected, SimpleNamespace(diagnosis=None))
 
     task = SimpleNamespace(
-        settings=SimpleNamespace(replicates=1),
-        keep=keep,
-        ranked=[],
-        progress=lambda step: None,
+        settings=SimpleNamespace(replicates=1), keep=keep, ranked=[], progress=lambda step: None,
         shows_unmodelled_backlash=lost,
-    )
+    )  # fmt: skip
     monkeypatch.setattr(findings, "rank_library", lambda *_: None)
     searched = search_until_clean(task, base, None)[2]
     assert (searched is None) == lost
-    assert steps == (["bootstrap 0"] if lost else ["bootstrap 0", "ranking", "search 0"])
+    assert steps == ["bootstrap 0"] + ["ranking", "search 0"] * (not lost)
 
 
 @pytest.mark.parametrize("rejected", [True, False])

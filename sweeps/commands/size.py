@@ -43,9 +43,8 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
     with open_folder("size", config, robot, beside) as folder:
         with step_reporter(print_message, "drawing designs") as heard:
             sizing = search(
-                robot, requirements, objectives, starts=config.starts, motors=config.motors, seed=config.seed,
-                tell=report_in_words(heard),
-            )  # fmt: skip
+                robot, requirements, objectives, motors=config.motors, seed=config.seed, tell=report_in_words(heard)
+            )
             best = robot if sizing.best is None else sizing.best.robot
             outcomes = (
                 ()
