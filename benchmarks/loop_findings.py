@@ -134,7 +134,7 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
     from calibration.discovery import prediction
     from calibration.discovery.search import best_of_each_size
     from calibration.inference import blocks as blocks_room
-    from calibration.inference.held_out import hold_out_blocks
+    from calibration.inference.blocks import hold_out_blocks
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
     kinds = blocks_room.predictable_blocks(runs, space.bare)

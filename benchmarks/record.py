@@ -90,7 +90,7 @@ CASES = {
     "resonance": Case("resonance --voltages 10:34:6 --payloads 0 --duration 0.5 --no-report"),
     "climb": Case("climb --gap 60 --levers-front 45 --voltage 24 --duration 2 --time-step 4e-4 --no-report"),
     "check": Case("check aims.toml --no-report"),
-    "size": Case("size aims.toml --starts 16 --no-report", rtol=SEARCHED),
+    "size": Case("size aims.toml --no-report", rtol=SEARCHED),
     "rig_check": Case("rig check bench.toml bench.csv --json"),
     "rig_check_robotino": Case("rig check robotino.toml settled.csv --json"),
     **{f"rig_new_{kind}": Case(f"rig new new_{kind}.toml --kind {kind}") for kind in KINDS},

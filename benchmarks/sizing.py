@@ -1,6 +1,6 @@
 """Sizing: time of a search after compilation, and its optimum compared with a grid of designs of the same choices.
 
-    python benchmarks/sizing.py --starts 256 --grid 1000000
+    python benchmarks/sizing.py --grid 1000000
 
 The grid has every drive, cell and number of cells, with as many ratios, radii and parallel cells as fit.
 """
@@ -46,18 +46,15 @@ def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, flo
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--starts", type=int, default=256)
     parser.add_argument("--grid", type=int, default=1_000_000)
     parser.add_argument("--objective", default="mass", choices=list(OBJECTIVES))
     given = parser.parse_args()
     robot, asked = paper_robots.nominal(), requirements_file.load_requirements(None)
     for words in ("with compilation", "once compiled"):
         begin, busy = time.perf_counter(), time.process_time()
-        found = design_search.size_robot(robot, asked, (given.objective,), starts=given.starts)
+        found = design_search.size_robot(robot, asked, (given.objective,))
         seconds, busy = time.perf_counter() - begin, time.process_time() - busy
-        print(
-            f"{given.starts} starts, {found.evaluated} designs, {words}: {seconds:.1f} s, {busy:.1f} s of processors"
-        )
+        print(f"{found.evaluated} designs, {words}: {seconds:.1f} s, {busy:.1f} s of processors")
     assert found.ideal is not None and found.best is not None
     kept = np.array([label not in found.unmeetable for label in found.task.labels])
     best, seen, seconds = grid(given.objective, given.grid, kept)

@@ -38,7 +38,7 @@ def test_rejected_with_margin_is_above_the_threshold_by_the_margin():
 
 
 @pytest.mark.parametrize(
-    ("gain", "chi2", "stands"), [(5.4, 1, False), (19.0, 1, True), (5.4, 99, True)],
+    "gain, chi2, stands", [(5.4, 1, False), (19.0, 1, True), (5.4, 99, True)],
     ids=["refuted", "confirmed", "other statistic"],
 )  # fmt: skip
 def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, chi2, stands):

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from calibration.discovery.classes import ammeter_families
 from calibration.discovery.settings import settings_for
@@ -16,7 +17,7 @@ ROWS, AMOUNT = 40, 12.0
 
 def families(imposed, *shown):
     """Families that imitate a loss which every channel shows, each by so many sigmas in a row."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     ordered = channels.channels_named([name for name, _ in shown])
     of_row = np.array([dict(shown)[c.name] for c in ordered])
     shape = np.linspace(0.0, 1.0, ROWS) ** 2
@@ -29,7 +30,7 @@ def families(imposed, *shown):
 
 
 @pytest.mark.parametrize(
-    ("shown", "listed"),
+    "shown, listed",
     [
         ([("total_current", 1.0)], True),
         ([("total_current", 1.0), ("speed", 0.1)], True),

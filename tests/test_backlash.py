@@ -1,16 +1,17 @@
 """Backlash as a state of the load: a rigid gear in the limit, free play at reversals, and found in a history."""
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from test_shaft import DRIVE
 
-from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.robot_file import load_robot
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
@@ -22,7 +23,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import Signals, State
-from tests.commands import read_rig, read_table, text_file
+from tests.commands import csv_text, read_rig, read_table, text_file
 
 SAMPLES = np.linspace(0, 2, 201)
 TIMES = time_grid(SAMPLES, np.arange(0, 2, 0.5), change=(1e-5, 0.04))
@@ -37,7 +38,7 @@ def bench(backlash):
 
 @jax.jit
 def driven(robot):
-    conditions = dataclasses.replace(Conditions(voltage=0.0), voltage=jnp.asarray(VOLTAGE))
+    conditions = replace(Conditions(voltage=0.0), voltage=jnp.asarray(VOLTAGE))
     return history_signals(robot, conditions, jnp.asarray(TIMES))
 
 
@@ -57,7 +58,7 @@ def test_effects_of_the_gearbox_go_by_the_load_within_the_backlash_too():
     @jax.jit
     def moving(amplitudes, gap):
         there = tuple(e(amplitude=a) for e, a in zip(those, amplitudes, strict=True))
-        robot = dataclasses.replace(bench(0.02), effects=there)
+        robot = replace(bench(0.02), effects=there)
         found = balances.moving_signals(
             robot, Conditions(0, voltage=6.0), State(0.5, 64.0, 4.0, 0.0, memory, gap=gap)
         )
@@ -128,7 +129,7 @@ backlash = "0.08 ± 30 %"
 
 
 @pytest.mark.parametrize(
-    ("stated", "got"),
+    "stated, got",
     [
         ('backlash = "0.08 ± 30 %"', r"backlash: got 0\.08 rad"),
         ('stiffness = "20 ± 5"\ndamping = "0.01 ± 0.005"', "stiffness: got 20 N·m/rad"),
@@ -136,27 +137,25 @@ backlash = "0.08 ± 30 %"
 )
 def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path, stated, got):
     path, text = tmp_path / "rig.toml", FILE.replace('backlash = "0.08 ± 30 %"', stated)
-    assert robot_file.load_robot(text_file(path, text)).loose
+    assert load_robot(text_file(path, text)).loose
     with pytest.raises(BadConfiguration, match=rf"bench\.{got}; .* motor\.inertia and bench\.inertia"):
-        robot_file.load_robot(text_file(path, text.replace("inertia = 2e-6\n", "")))
+        load_robot(text_file(path, text.replace("inertia = 2e-6\n", "")))
 
 
 @pytest.mark.nightly
 def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     robot = read_rig(tmp_path, FILE)
-    truth = params.replace(robot, {"bench.backlash": 0.06})
-    seen = driven(truth)
-    at = np.searchsorted(TIMES, SAMPLES)
-    random = np.random.default_rng(3)
-    lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
-    for k, t in zip(at, SAMPLES, strict=True):
-        speed = float(seen.speed_motor[k]) / quantities.RPM + 5 * random.standard_normal()
-        angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
-        lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
-    runs = read_table(tmp_path, "\n".join(lines), robot, "table.csv")
+    seen = driven(params.replace(robot, {"bench.backlash": 0.06}))
+    at, noise = np.searchsorted(TIMES, SAMPLES), default_rng(3).standard_normal((len(SAMPLES), 2)).T
+    columns = {
+        "time_s": SAMPLES, "supply_voltage_V": VOLTAGE[at],
+        "motor_speed_rpm": np.asarray(seen.speed_motor)[at] / quantities.RPM + 5 * noise[0],
+        "motor_speed_sd_rpm": np.full(len(at), 5.0), "output_angle_deg": np.degrees(seen.angle)[at] + 0.2 * noise[1],
+        "output_angle_sd_deg": np.full(len(at), 0.2),
+    }  # fmt: skip
     found = calibrate(
-        runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
-        profiles=False,
+        read_table(tmp_path, csv_text(columns), robot, "table.csv"), robot, model="drive", starts=2, blocks=False,
+        free=["bench.backlash", "bench.loss_coulomb"], profiles=False,
     )  # fmt: skip
     backlash = found.parameters["bench.backlash"]
     # Flanks that meet and part make kinks in the misfit: its curvature says less than what it finds is off by.

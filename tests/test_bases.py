@@ -1,25 +1,49 @@
 """Bases of curves: over what they go, windows in which something happens, and when row order says nothing new."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.inference import bases
 from calibration.inference.bases import (
+    BALANCES,
     COLLINEAR,
+    CONDITIONS,
+    FEWEST,
+    LEVELS,
+    ORDERS,
+    VARIABLES,
+    CurveScope,
     Window,
-    curve_families,
     family_names,
-    order_collinearity,
-    window_families,
+    wave_families,
     window_from_name,
 )
 from mmrjax.compile.compiling import for_equations
-from mmrjax.model import channels
+from mmrjax.effects.curve import WAYS
+from mmrjax.model import channels, paper_robots
 
-RNG = np.random.default_rng(0)
+RNG = default_rng(0)
 ROWS = 60
+SCOPE = CurveScope.of(paper_robots.nominal(), {})
+
+
+def curve_families(columns, weight, scope=SCOPE):
+    """Of runs that always travel forward."""
+    return bases.curve_families(columns, weight, dict.fromkeys(WAYS, np.ones(len(weight))), scope)
+
+
+def window_families(columns, weight, scope=SCOPE):
+    """Of runs that always travel forward."""
+    return bases.window_families(columns, weight, dict.fromkeys(WAYS, np.ones(len(weight))), scope)
+
+
+def order_collinearity(columns, weight, axes=SCOPE.axes):
+    return bases.order_collinearity(columns, weight, axes, "order")
 
 
 def table(rows=ROWS, **more):
@@ -42,7 +66,7 @@ def table(rows=ROWS, **more):
 
 def shuffled(columns, seed=1):
     """The same runs made in another order."""
-    return columns | {"order": 1.0 + np.random.default_rng(seed).permutation(len(columns["order"]))}
+    return columns | {"order": 1.0 + default_rng(seed).permutation(len(columns["order"]))}
 
 
 COUNTS = np.ones(ROWS)
@@ -63,41 +87,41 @@ def test_order_of_a_grid_that_is_run_through_is_collinear_with_its_conditions():
 def test_order_of_levels_that_rise_one_way_and_then_the_other_is_that_of_the_levels():
     volts = np.array([5, 6.5, 8, 9.5, 11, 12.5, 14, 15.5, 17, 18.5, 20, 22, 24, -7, -11, -15, -19, -23])
     columns = {"configuration": np.full(18, "bench"), "supply_voltage_V": volts, "order": np.arange(18.0)}
-    axes = ("supply_voltage_V",)
-    assert order_collinearity(columns, np.ones(18), axes) > 0.999
-    assert max(order_collinearity(shuffled(columns, seed), np.ones(18), axes) for seed in range(20)) < 0.7
+
+    def told(columns):
+        return order_collinearity(columns, np.ones(18), ("supply_voltage_V",))
+
+    assert told(columns) > 0.999 and max(told(shuffled(columns, seed)) for seed in range(20)) < 0.7
 
 
 @pytest.mark.parametrize("driven", ["supply_voltage_V", "duty"])
 def test_order_of_a_sorted_table_is_no_driver(driven):
     """A propeller's rows by rising duty, the supply sagging. Steps are uneven."""
-    level = np.cumsum(np.random.default_rng(3).uniform(0.05, 1, 30) ** 4)
+    level = np.cumsum(default_rng(3).uniform(0.05, 1, 30) ** 4)
     columns = {
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
         "total_current_A": RNG.uniform(1, 5, 30), driven: level / level[-1],
     }  # fmt: skip
-    scope = bases.CurveScope(("electrical", "track"), ("supply_voltage_V",))
+    scope = replace(SCOPE, balances=("electrical", "track"), axes=("supply_voltage_V",))
     assert "order" not in variables(curve_families(columns, np.ones(30), scope=scope))
     assert not [v for v in variables(window_families(columns, np.ones(30), scope=scope)) if v.startswith("order")]
     for seed in range(5):
         assert "order" in variables(curve_families(shuffled(columns, seed), np.ones(30), scope=scope))
 
 
-def test_time_of_a_single_ramp_is_no_driver():
-    time = np.arange(40.0)
-    columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
-    scope = bases.CurveScope(("electrical",), ("supply_voltage_V",))
-    stairs = np.repeat(np.arange(4.0), 10)  # they tell 0.93 of the time
-    for voltage, expected in (
-        (time / 4, False),
-        (np.full(40, 9.0), True),
-        (np.abs(time - 19.5), True),
-        (stairs, True),
-    ):
-        logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
-        assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
-        windows = [v for v in variables(window_families(*logged, scope=scope)) if v.startswith("time")]
-        assert bool(windows) == expected
+TIME = np.arange(40.0)
+
+
+@pytest.mark.parametrize("voltage, expected", [
+    (TIME / 4, False), (np.full(40, 9.0), True), (np.abs(TIME - 19.5), True),
+    (np.repeat(np.arange(4.0), 10), True),  # stairs tell 0.93 of the time
+])  # fmt: skip
+def test_time_of_a_single_ramp_is_no_driver(voltage, expected):
+    columns = {"configuration": np.full(40, "bench"), "time_s": TIME, "total_current_A": RNG.uniform(1, 5, 40)}
+    logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
+    scope = replace(SCOPE, balances=("electrical",), axes=("supply_voltage_V",))
+    assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
+    assert any(v.startswith("time") for v in variables(window_families(*logged, scope=scope))) == expected
 
 
 def test_collinearity_is_not_made_by_the_number_of_terms():
@@ -118,39 +142,38 @@ def test_curves_of_channels_are_over_their_reading_and_what_order_brings():
         }  # fmt: skip
 
 
-def test_curves_over_the_order_where_it_says_something_new():
-    assert "order" in variables(curve_families(shuffled(table()), COUNTS))
-    assert "order" not in variables(curve_families(table(), COUNTS))
-    bare = {k: v for k, v in table().items() if k != "order"}
-    assert "order" not in variables(curve_families(bare, COUNTS))
-
-
 # --- windows --------------------------------------------------------------------------------------------
 
 
 def test_a_window_is_read_from_its_name():
     for of in (Window("time", 0.6, 0.75), Window("order", 12.0, 19.0), Window("time", 1e-05, 12345.0)):
         assert window_from_name(str(of)) == of
-    for word in ("time", "order", bases.CONDITIONS, "speed_motor", *bases.ORDERS):
+    for word in ("time", "order", CONDITIONS, "speed_motor", *ORDERS):
         assert window_from_name(word) is None
 
 
 def test_windows_cover_the_order_and_overlap_by_half():
     basis, shown = window_families(shuffled(table()), COUNTS)
     assert [v for _, v in shown.names[:4]] == [v for _, v in basis.names[:4]]
-    assert {n[0] for n in basis.names} == set(bases.BALANCES) and {n[0] for n in shown.names} == set(channels.USUAL)
+    assert {n[0] for n in basis.names} == set(BALANCES) and {n[0] for n in shown.names} == set(channels.USUAL)
     assert basis.columns.shape[2] == 1 and set(np.unique(basis.columns)) == {0.0, 1.0}
-    order = shuffled(table())["order"]
-    mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window_from_name(n[1]).axis == "order"]
-    for k in mine:
-        of, inside = window_from_name(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
+    order, shapes = shuffled(table())["order"], []
+    for of, inside in windows_of(basis, "track", "order"):
         assert_array_equal(inside, of.holds(order))
-        assert bases.FEWEST <= inside.sum() <= ROWS / 2
-    shapes = np.asarray(basis.columns)[mine, :, 0]
-    assert (shapes.sum(0) >= 1).all()
+        assert FEWEST <= inside.sum() <= ROWS / 2
+        shapes.append(inside)
+    assert np.any(shapes, 0).all()
     # something that happens within half a window of the smallest share lies in one
     for first in range(1, ROWS - 3):
         assert any(s[(order >= first) & (order < first + 2)].all() for s in shapes)
+
+
+def windows_of(basis, place, axis=None):
+    """Windows of one balance over an axis, and the rows in each."""
+    for (balance, name), column in zip(basis.names, np.asarray(basis.columns), strict=True):
+        of = window_from_name(name)
+        if balance == place and axis in (None, of.axis):
+            yield of, column[:, 0] > 0
 
 
 def over_order(columns):
@@ -178,23 +201,22 @@ def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
     time = np.tile(np.linspace(0, 1.5, 30), 2)
     columns = table(time_s=time, supply_voltage_V=np.full(ROWS, 24.0), slope_deg=np.zeros(ROWS))
     for basis in window_families(columns, COUNTS):
-        over_time = [k for k, (_, v) in enumerate(basis.names) if window_from_name(v).axis == "time"]
+        over_time = [
+            inside for place in {n[0] for n in basis.names} for _, inside in windows_of(basis, place, "time")
+        ]
         assert over_time
-        for shape in np.asarray(basis.columns)[over_time, :, 0]:
-            assert_array_equal(shape[:30], shape[30:])
+        for inside in over_time:
+            assert_array_equal(inside[:30], inside[30:])
 
 
 def test_levels_of_conditions_are_windows():
     columns = table()
     basis = window_families({k: v for k, v in columns.items() if k != "order"}, COUNTS)[0]
-    found = {window_from_name(v) for place, v in basis.names if place == "slip"}
-    slopes = np.unique(columns["slope_deg"])
+    found, slopes = dict(windows_of(basis, "slip")), np.unique(columns["slope_deg"])
     mine = sorted((w for w in found if w.axis == "slope"), key=lambda w: w.low)
     assert_allclose([w.low for w in mine], np.radians(slopes), rtol=1e-4, atol=1e-6)
-    for w in found:
-        k = basis.names.index(("slip", str(w)))
-        x = columns[bases.VARIABLES[w.axis]] * bases.LEVELS[w.axis][0]
-        assert_array_equal(np.asarray(basis.columns)[k, :, 0] > 0, w.holds(x))
+    for w, inside in found.items():
+        assert_array_equal(inside, w.holds(columns[VARIABLES[w.axis]] * LEVELS[w.axis][0]))
     assert mine[-1].words == f"{slopes[-1]:g} deg of slope"
 
 
@@ -206,7 +228,7 @@ def test_rows_that_do_not_count_are_in_no_window():
 
 
 def test_a_table_without_order_or_levels_has_no_windows():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     measured = {c: rng.uniform(1, 9, ROWS) for c in ("supply_voltage_V", "slope_deg", "payload_kg")}
     assert window_families({k: v for k, v in (table() | measured).items() if k != "order"}, COUNTS) == ()
 
@@ -214,8 +236,8 @@ def test_a_table_without_order_or_levels_has_no_windows():
 def test_an_order_that_the_only_condition_tells_has_no_curves():
     order = np.arange(1.0, ROWS + 1)
     columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
-    alone = bases.CurveScope(("electrical", "track"), ("motor_current_A",))
-    assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
+    alone = replace(SCOPE, balances=("electrical", "track"), axes=("motor_current_A",))
+    assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {CONDITIONS}
 
 
 # --- sizes ----------------------------------------------------------------------------------------------
@@ -229,7 +251,7 @@ def shapes(columns, counts):
 @pytest.mark.parametrize("seed", range(4))
 def test_tables_of_one_size_have_families_of_one_size(seed):
     """Whatever their order, gaps and rows that do not count: else each table is compiled for itself."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     first = shapes(table(), COUNTS)
     counts = (rng.uniform(size=ROWS) < 0.6).astype(float)
     gaps = np.sort(rng.choice(np.arange(1.0, 500.0), ROWS, replace=False))
@@ -246,11 +268,9 @@ def test_families_that_fill_up_repeat_others():
     that this does not."""
     found = (*curve_families(table(), COUNTS), *window_families(table(order=np.repeat([1.0, 2, 3, 60], 15)), COUNTS))
     for basis in found:
-        columns = np.asarray(basis.columns)
-        for k, name in enumerate(basis.names):
-            same = [j for j, n in enumerate(basis.names) if n == name]
-            for j in same:
-                assert_array_equal(columns[j], columns[k])
+        first = {}
+        for name, columns in zip(basis.names, np.asarray(basis.columns), strict=True):
+            assert_array_equal(columns, first.setdefault(name, columns))
     assert len(set(family_names(found))) < len(family_names(found))
 
 
@@ -267,7 +287,7 @@ def back_and_forth(turn, runs=3, samples=100):
 def waves_of(turn):
     """Order of the shaft → columns of its wave in one balance, of runs that turn so far [rad] and come back."""
     angle, rows = back_and_forth(turn)
-    (basis,) = bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows)
+    (basis,) = wave_families(np.zeros(angle.size, bool), angle, rows, rows, BALANCES)
     every = {n: np.asarray(c) for n, c in zip(basis.names, basis.columns, strict=True)}
     return angle, rows, {v: c for (place, v), c in every.items() if place == "track"}
 
@@ -275,10 +295,10 @@ def waves_of(turn):
 def test_a_wave_is_of_the_runs_that_pass_two_of_it_wherever_they_end():
     """Runs that come back end where they began. Each has a phase of its own, in columns of its own."""
     angle, rows, found = waves_of(7.0)
-    wave = found["order 2 of the driving shaft"]
+    expected = np.zeros_like(found["order 2 of the driving shaft"])
     for k, mine in enumerate(rows):
-        assert_allclose(wave[mine, 2 * k : 2 * k + 2].T, [np.cos(2 * angle[mine]), np.sin(2 * angle[mine])])
-        assert not np.delete(wave[mine], [2 * k, 2 * k + 1], 1).any()
+        expected[mine, 2 * k : 2 * k + 2] = np.stack([np.cos(2 * angle[mine]), np.sin(2 * angle[mine])], -1)
+    assert_allclose(found["order 2 of the driving shaft"], expected)
 
 
 def test_pieces_of_a_wave_have_one_phase_in_all_runs():
@@ -293,4 +313,4 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
 
 def test_a_shaft_that_stands_has_no_waves():
     angle, rows = back_and_forth(0.0)
-    assert bases.wave_families(np.zeros(angle.size, bool), angle, rows, rows) == ()
+    assert wave_families(np.zeros(angle.size, bool), angle, rows, rows, BALANCES) == ()

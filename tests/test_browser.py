@@ -1,8 +1,8 @@
 """Every report in a headless browser, on a phone, a laptop, a wide screen and paper: nothing is cut off or printed over,
 nothing scrolls sideways but tables and figures in themselves, nothing is asked of a network, and all can be read."""
 
-import dataclasses
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,8 +11,9 @@ from test_loop_command import commanded, few_effects, mmrjax, starts_churning
 from test_settle import made as made_log
 from test_time_overlay import overlay
 
-from sweeps.report import loop_report, page_renderer
+from sweeps.report import loop_report
 from sweeps.report.document import Document, Figure, Section
+from sweeps.report.page_renderer import write_report_page
 from tests.commands import ROOT, text_file
 
 pytestmark = [
@@ -119,12 +120,9 @@ def test_the_page_of_the_loop_can_be_read_everywhere(browser):
 
 def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
     found = commanded().found
-    summary = dataclasses.replace(found.summary, verdict="none")
-    none = dataclasses.replace(found, verdict="none", effects=(), support=None, summary=summary)
-    assert (
-        wrong(browser, page_renderer.write_report_page(tmp_path, loop_report.loop_document(none, "nominal", {})))
-        == {}
-    )
+    summary = replace(found.summary, verdict="none")
+    none = replace(found, verdict="none", effects=(), support=None, summary=summary)
+    assert wrong(browser, write_report_page(tmp_path, loop_report.loop_document(none, "nominal", {}))) == {}
 
 
 def test_the_page_of_histories_can_be_read_everywhere(browser, tmp_path):
@@ -174,7 +172,7 @@ def drag(browser, element, begin, end):
 def test_a_time_overlay_zooms_and_its_residual_follows(browser, tmp_path):
     figure = Figure("histories", "The simulated speed is off by 5.", "**Over time.**", overlay)
     made = Document("Overlay", "The simulated speed is off by 5 rpm.", (), (Section("Over time", (figure,)),))
-    page = page_renderer.write_report_page(tmp_path, made)
+    page = write_report_page(tmp_path, made)
     assert wrong(browser, page) == {}
     browser.open(page, 1280)
     ranges = "document.querySelector('.overlay').ranges()"

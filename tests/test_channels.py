@@ -1,14 +1,15 @@
 """Channels belong to a rig: its robot, the tables of its runs and every result carry theirs, and nothing else does."""
 
-import dataclasses
 import itertools
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 import calibration
@@ -18,7 +19,9 @@ from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.prediction import ReadingsOfRows
 from calibration.discovery.result import DiscoveryResult
-from calibration.inference import estimates, noise, observers
+from calibration.inference import observers
+from calibration.inference.estimates import condition_columns, readings_by_channel
+from calibration.inference.noise import default_noise, infer_noise, noise_from_table
 from calibration.inference.result import CalibrationResult
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params, quantities
@@ -78,11 +81,11 @@ def calibrated(runs, robot):
     """A calibration's result of these runs, without the fit: what is written of readings is read from it."""
     observe, measured, sd = observers.observer_kind(runs).of(runs, robot), runs.measured(), runs.deviations()
     known = {
-        "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": estimates.condition_columns(type(observe), runs),
-        "readings": estimates.readings_by_channel(runs.channels, measured, sd, measured, measured),
+        "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": condition_columns(type(observe), runs),
+        "readings": readings_by_channel(runs.channels, measured, sd, measured, measured),
         "status": np.full(len(runs), "converged"),
     }  # fmt: skip
-    return CalibrationResult(**{**dict.fromkeys(f.name for f in dataclasses.fields(CalibrationResult)), **known})
+    return CalibrationResult(**{**dict.fromkeys(f.name for f in fields(CalibrationResult)), **known})
 
 
 def discovered(runs):
@@ -93,7 +96,7 @@ def discovered(runs):
         "runs": runs, "numbers": np.arange(1, len(runs) + 1), "outliers": (), "unusable": (),
         "readings_of_rows": shown, "detail": SimpleNamespace(columns=dict),
     }  # fmt: skip
-    return DiscoveryResult(**{**dict.fromkeys(f.name for f in dataclasses.fields(DiscoveryResult)), **known})
+    return DiscoveryResult(**{**dict.fromkeys(f.name for f in fields(DiscoveryResult)), **known})
 
 
 # --- a robot, a table, a result
@@ -130,12 +133,12 @@ def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
     columns = {c: x for c, x in made_up(bench).items() if "_sd_" not in c}
     runs = calibration.read_runs(written(tmp_path / "t.csv", columns), robot=bench)
     sizes = observers.observer_kind(runs).sizes(runs)
-    known = noise.infer_noise(runs, sizes, "output_torque=0.05Nm")
+    known = infer_noise(runs, sizes, "output_torque=0.05Nm")
     assert known.source == ("series", "series", "stated") and (known.sd[:, 2] == 0.05).all()
-    assert noise.default_noise(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
+    assert default_noise(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
     assert known.scaled({"output_torque": 2.0}).sd[0].tolist() == [*known.sd[0, :2], 0.1]
     with pytest.raises(calibration.data.input_errors.BadConfiguration, match="--noise speed=1%: no such channel"):
-        noise.noise_from_table(runs, sizes, "speed=1%")
+        noise_from_table(runs, sizes, "speed=1%")
 
 
 def test_a_table_without_a_robot_has_every_channel_of_which_it_has_a_column(tmp_path, robot):
@@ -175,8 +178,8 @@ def test_a_table_takes_the_channels_of_the_robot_that_it_is_used_with(tmp_path, 
 
 
 def test_what_is_imposed_is_kept_though_it_is_no_channel(bench):
-    imposed = dataclasses.replace(bench.rig, imposed="motor_speed", channels=("total_current",))
-    robot = dataclasses.replace(bench, rig=imposed)
+    imposed = replace(bench.rig, imposed="motor_speed", channels=("total_current",))
+    robot = replace(bench, rig=imposed)
     columns = {"motor_speed_rpm": 100.0 * np.arange(1, 13), "total_current_A": np.arange(1.0, 13)}
     runs = Runs("made", {"configuration": np.full(12, "brake"), **columns})
     assert runs.of(robot).has("motor_speed_rpm") and runs.of(robot).channels == robot.channels
@@ -197,7 +200,7 @@ def test_simulated_runs_have_the_columns_of_their_robot(bench):
 def read_by(robot, path):
     """All that a table says of its readings, as one robot's."""
     runs = calibration.read_runs(path, robot=robot)
-    known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), None)
+    known = noise_from_table(runs, observers.observer_kind(runs).sizes(runs), None)
     rows = calibrated(runs, robot).rows()
     return (
         channels.channel_names(runs.channels),
@@ -238,7 +241,7 @@ def measured_with(robot, folder, changed, sd=0.01):
     columns = {"configuration": np.full(12, "brake"), "supply_voltage_V": VOLTAGES}
     truth = params.replace(robot, {name: np.asarray(value) for name, value in changed.items()})
     shown = steady_batch(truth, Runs("made", columns, layout=layout).conditions(robot)).reading
-    drawn, table = np.random.default_rng(1), {"supply_voltage_V": VOLTAGES}
+    drawn, table = default_rng(1), {"supply_voltage_V": VOLTAGES}
     for c in robot.channels:
         x = np.asarray(shown[c.name]) / c.factor
         table |= {c.column: x * (1 + sd * drawn.standard_normal(12)), c.sd_column: sd * np.abs(x)}

@@ -1,7 +1,7 @@
 """Half a robot with levers over terrain: its dynamics against C MuJoCo, energy, tilted gravity, verdicts."""
 
-import dataclasses
 import functools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from mmrjax.climbing import climb_simulation as climb
-from mmrjax.climbing import footing, resting_posture, static_limits, terrain
+from mmrjax.climbing import resting_posture, terrain
 from mmrjax.climbing.climb_simulation import (
     LOSSES,
     SOURCES,
@@ -21,11 +22,12 @@ from mmrjax.climbing.climb_simulation import (
     climb_batch,
     constant_angles,
 )
+from mmrjax.climbing.footing import contacts_with_terrain
+from mmrjax.climbing.static_limits import find_highest_step, flush_lever_angle
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
-from mmrjax.model.paper_tables import PITCH_TOOTH
 from mmrjax.model.signals import GRAVITY
 
 ROBOT = nominal()
@@ -48,6 +50,24 @@ def batch(runs, robot=ROBOT, **options):
     return climb_batch(robot, conditions, grounds, sequences, **options)
 
 
+#: Energies at the beginning of a run.
+NO_ENERGY = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
+
+
+def system(ground=None, levers=None, configuration=0, voltage=6.0, **conditions):
+    """What a climb is simulated by, on flat ground and with levers that stand unless stated."""
+    of = Conditions(configuration, voltage=voltage, **conditions).resolved(ROBOT)
+    ground = terrain.flat_ground() if ground is None else ground
+    return build_climb_system(ROBOT, of, ground, constant_angles(0.5, 0.3) if levers is None else levers)
+
+
+def passed_by(run):
+    """What a step passes on, of zeros."""
+    motion, energy, _ = climb.begin_climb(run)
+    shapes = jax.eval_shape(lambda: climb.advance_climb(run, motion, 0.0, energy)[2])
+    return jax.tree.map(lambda x: jnp.zeros(x.shape), shapes)
+
+
 @functools.cache
 def first_second():
     """Onto a step, and against a wall. A member without numbers and one with levers in the ground beside them."""
@@ -60,28 +80,29 @@ def first_second():
     return batch(runs, duration=0.64, part=0.64)
 
 
-def energy_left(record, k):
-    """What is missing of the energy that came in, and that [J]."""
+def is_balanced(record, k, until=np.inf):
+    """Energy that came in is stored or lost at every instant. Returns what came in and of each kind [J]."""
     since = {name: (x - x[:, :1])[k] for name, x in record.energy.items()}
     come = sum(since[name] for name in SOURCES)
     stored = (record.stored - record.stored[:, :1])[k]
-    return come - stored - sum(since[name] for name in LOSSES), come, since
+    left = come - stored - sum(since[name] for name in LOSSES)
+    running = (record.time[k] > 0.4) & (record.time[k] < until)
+    assert np.abs(left[running] / come[running]).max() < 1e-3, k
+    return come, since
 
 
 def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms_no_other():
-    record = first_second().record
-    assert first_second().names == ["unfinished", "unfinished", "failed", "failed"]
-    assert first_second().ended[3] == 0
+    found = first_second()
+    record, time = found.record, found.record.time[0]
+    assert found.names == ["unfinished", "unfinished", "failed", "failed"] and found.ended[3] == 0
     assert all(np.isfinite(np.asarray(x)[:2]).all() for x in jax.tree.leaves(record.motion))
     for k in range(2):
-        left, come, since = energy_left(record, k)
-        running = record.time[k] > 0.4
-        assert np.abs(left[running] / come[running]).max() < 1e-3
+        come, since = is_balanced(record, k)
         assert all(since[name][-1] > 2e-3 * come[-1] for name in LOSSES), since  # or it would not be missed
-    assert np.ptp(np.asarray(record.motion.q)[0, :, 1]) > 0.01  # it has climbed
+    assert np.ptp(record.motion.q[0, :, 1]) > 0.01  # it has climbed
     # belts bear on either side of the centre of mass until the levers lift it, though grousers leave the ground before
-    assert_allclose(record.carried[0][(record.time[0] > 0.2) & (record.time[0] < 0.3)], 1.0, atol=0.03)
-    standing = np.asarray(record.margin[0][record.time[0] < 0.43])
+    assert_allclose(record.carried[0][(time > 0.2) & (time < 0.3)], 1.0, atol=0.03)
+    standing = np.asarray(record.margin[0][time < 0.43])
     assert np.nanmin(standing) > 0.1 and np.isfinite(standing).mean() > 0.8
 
 
@@ -92,7 +113,7 @@ def test_a_margin_is_of_contacts_that_carry_the_robot():
     assert_allclose(shown, [0.1, -0.1, jnp.nan, jnp.nan])
 
 
-@pytest.mark.parametrize(("duration", "step"), [(20.0, 1e-4), (2.5, 1e-4), (2.0, 3e-4), (0.3, 7e-4), (0.05, 1e-3)])
+@pytest.mark.parametrize("duration, step", [(20.0, 1e-4), (2.5, 1e-4), (2.0, 3e-4), (0.3, 7e-4), (0.05, 1e-3)])
 def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, duration, step):
     parts = []
 
@@ -113,16 +134,13 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
 
 
 def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
-    run = build_climb_system(
-        ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
-    )
+    run = system()
     motion, energy, progress = climb.begin_climb(run)
-    passed = jax.eval_shape(lambda: climb.advance_climb(run, motion, 0.0, energy)[2])
-    passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
+    passed = passed_by(run)
 
     def turned(run, motion, time, energy):
-        motion = dataclasses.replace(motion, q=motion.q.at[climb.SHAFT].add(1.0))
-        return motion, energy, dataclasses.replace(passed, time=time, motion=motion)
+        motion = replace(motion, q=motion.q.at[climb.SHAFT].add(1.0))
+        return motion, energy, replace(passed, time=time, motion=motion)
 
     monkeypatch.setattr(climb, "advance_climb", turned)
     (motion, *_), record = climb.advance_samples(run, (motion, energy, progress), 0.5, jnp.asarray(3), 2)
@@ -132,34 +150,26 @@ def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
 
 def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
     """(350 - 70) / 2 mN·m and (16 - 3) / 2 mN·m·s each. All three as one where the levers stand."""
-    wheeled, tracked = (
-        build_climb_system(
-            ROBOT, Conditions(k, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
-        )
-        for k in (1, 0)
-    )
-    loss = np.asarray(climb._lever_loss(tracked, jnp.array([10.0, -4.0])))
+    speeds = jnp.array([10.0, -4.0])
+    tracked, wheeled = system(), system(configuration=1)
+    loss = np.asarray(climb._lever_loss(tracked, speeds))
     assert loss == pytest.approx([0.140 + 0.0065 * 10, -0.140 - 0.0065 * 4])
     assert 2 * loss[0] + tracked.chassis.track.torque_loss(10.0, 1.0) == pytest.approx(0.350 + 0.016 * 10)
-    assert np.asarray(climb._lever_loss(wheeled, jnp.array([10.0, -4.0]))) == pytest.approx(0.0)
+    assert np.asarray(climb._lever_loss(wheeled, speeds)) == pytest.approx(0.0)
     assert wheeled.chassis.track.torque_loss(10.0, 1.0) == pytest.approx(0.070 + 0.003 * 10)
 
 
 def test_motors_of_levers_load_the_battery():
     """I_b = I_s + I_p (10), with I_s of all four motors: the voltage falls by 8 x 49 mΩ an ampere."""
-    run = build_climb_system(
-        ROBOT, Conditions(0, battery=True).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
-    )
+    run = system(voltage=24.0, battery=True)
     motion = climb.stand_before_obstacle(run)
-    pulls = dataclasses.replace(motion, drawn=jnp.asarray(10.0))
-    none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
-    after = jax.jit(lambda m: climb.advance_climb(run, m, 1.0, none)[::2])
+    after = jax.jit(lambda m: climb.advance_climb(run, m, 1.0, NO_ENERGY)[::2])
     volts = [8 * 4.17 - 8 * 0.049 * (1.5 + drawn) for drawn in (0.0, 10.0)]
-    (end, passed), (end_pulls, passed_pulls) = after(motion), after(pulls)
+    (end, passed), (end_pulls, passed_pulls) = after(motion), after(replace(motion, drawn=jnp.asarray(10.0)))
     assert [float(p.voltage) for p in (passed, passed_pulls)] == pytest.approx(volts)
     assert float(end_pulls.discharge - end.discharge) == pytest.approx(10 * float(run.step))
     # asked to swing they take their current by the duty of their bridge
-    end, passed = after(dataclasses.replace(motion, q=motion.q.at[4].add(-0.5)))
+    end, passed = after(replace(motion, q=motion.q.at[4].add(-0.5)))
     share = float(passed.lever_voltage[0]) / volts[0]
     assert 0.01 < share < 1 and float(end.drawn) == pytest.approx(share * float(passed.lever_current[0]))
 
@@ -168,8 +178,7 @@ def test_motors_of_levers_load_the_battery():
 def test_a_positive_voltage_raises_either_lever():
     """Angles are positive up. Of the rear pair ψ falls then."""
     volts = jnp.full(2, 6.0)
-    asked = LeverSequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
-    run = build_climb_system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), asked)
+    run = system(levers=LeverSequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5)))
     swung = climb._drive_action(run, climb.stand_before_obstacle(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
     assert swung.rate[0] > 0 > swung.rate[1]
     assert np.asarray(swung.voltage) == pytest.approx([6.0, -6.0])
@@ -191,42 +200,30 @@ WHOLE = [
     (terrain.gap(0.2), 0, 0, 12),
 ]
 VERDICTS = ["over", "over", "tips", "slides", "stalls", "tips", "over"]  # into the wide gap head first
-STEPS = 1e-4, 5e-5
-
-
-@functools.cache
-def ended(step):
-    return whole_climbs(WHOLE, duration=14.0, step=step)
 
 
 @pytest.mark.nightly
-def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
-    for step in STEPS:
-        found = ended(step)
-        assert found.names[: len(VERDICTS)] == VERDICTS
-        for k in range(len(VERDICTS)):
-            left, come, _ = energy_left(found.record, k)
-            running = (found.record.time[k] > 0.4) & (found.record.time[k] < found.ended[k])
-            assert np.abs(left[running] / come[running]).max() < 1e-3, k
+@pytest.mark.parametrize("step", [1e-4, 5e-5])
+def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step(step):
+    found = whole_climbs(WHOLE, duration=14.0, step=step)
+    assert found.names[: len(VERDICTS)] == VERDICTS
+    for k in range(len(VERDICTS)):
+        is_balanced(found.record, k, found.ended[k])
 
 
 @pytest.mark.slow
 def test_how_a_run_ends_is_read_off_its_motion():
-    run = build_climb_system(
-        ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.single_step(0.08), constant_angles(0.5, 0.3)
-    )
+    run = system(terrain.single_step(0.08))
     motion, _, progress = climb.begin_climb(run)
-    _, _, passed = jax.eval_shape(lambda: climb.advance_climb(run, motion, 0.0, climb.begin_climb(run)[1]))
-    passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
+    passed = passed_by(run)
 
-    def verdict(time=1.0, body=0.0, turned=0.0, **places):
+    def verdict(time=1.0, body=0.0, **places):
         q = motion.q
         for name, value in places.items():
-            q = q.at[{"x": 0, "z": 1, "pitch": 2}[name]].set(value)
-        at = dataclasses.replace(motion, q=q.at[3].set(turned))
-        now = dataclasses.replace(passed, time=jnp.asarray(time), body=jnp.asarray(body))
-        found, after = climb._update_verdict(run, motion, now, at, progress)
-        assert np.isfinite(np.asarray(found.q)).all()
+            q = q.at[["x", "z", "pitch", "turned"].index(name)].set(value)
+        now = replace(passed, time=jnp.asarray(time), body=jnp.asarray(body))
+        found, after = climb._update_verdict(run, motion, now, replace(motion, q=q), progress)
+        assert np.isfinite(found.q).all()
         return None if after.verdict < 0 else climb.NAMES[int(after.verdict)]
 
     assert verdict() is None
@@ -241,11 +238,10 @@ def test_how_a_run_ends_is_read_off_its_motion():
 
 def test_dynamics_are_those_of_mujoco():
     """Mass matrix and bias of chassis, pulleys and levers as hinged bodies, at random states."""
-    conditions = Conditions(0, voltage=6.0, slope_deg=12.0, payload=5.0).resolved(ROBOT)
-    run = build_climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(0.5, 0.3))
+    run = system(slope_deg=12.0, payload=5.0)
     model = mujoco.MjModel.from_xml_string(_bodies(run, 12.0))
     data = mujoco.MjData(model)
-    random = np.random.default_rng(5)
+    random = default_rng(5)
     for _ in range(5):
         q, v = random.normal(size=6), 3 * random.normal(size=6)
         data.qpos[:], data.qvel[:] = TIES @ q, TIES @ v
@@ -257,70 +253,43 @@ def test_dynamics_are_those_of_mujoco():
         assert np.asarray(bias) == pytest.approx(TIES.T @ data.qfrc_bias, abs=1e-10)
 
 
-@functools.cache
-def beside_mujoco(slope, ground, angles, volts, clear):
-    """Coordinates of 10 000 steps, ours and MuJoCo's under the forces that each of ours had, impulses over its time.
-
-    Args:
-        angles: of front and rear levers at 0.1 and 0.8 s [deg].
-        clear: from the obstacle in the beginning [m].
-    """
-    conditions = Conditions(0, voltage=volts, slope_deg=slope, payload=5.0).resolved(ROBOT)
-    pairs = (jnp.radians(jnp.array(pair)) for pair in angles)
-    run = build_climb_system(
-        ROBOT, conditions, ground(), LeverSequence(jnp.array([0.1, 0.8]), *pairs, over_time=True)
-    )
-    steps = 10_000
+def beside_mujoco(slope):
+    """Coordinates of 10 000 steps of driving off and swinging the levers, ours and MuJoCo's under the forces that each of
+    ours had, impulses over its time."""
+    angles = (jnp.radians(jnp.array(pair)) for pair in ((45.0, 20.0), (-8.4, 30.0)))
+    levers = LeverSequence(jnp.array([0.1, 0.8]), *angles, over_time=True)
+    run = system(levers=levers, voltage=12.0, slope_deg=slope, payload=5.0)
 
     @jax.jit
-    def driven(run, motion, none):
+    def driven(run, motion):
         def one(motion, k):
-            after = climb.advance_climb(run, motion, k * run.step, none)[0]
+            after = climb.advance_climb(run, motion, k * run.step, NO_ENERGY)[0]
             matrix, bias, _ = climb.mass_matrix_and_bias(run, motion.q, motion.v)
             return after, (matrix @ (after.v - motion.v) / run.step + bias, after.q)
 
-        return jax.lax.scan(one, motion, jnp.arange(steps))
+        return jax.lax.scan(one, motion, jnp.arange(10_000))
 
-    start = climb.stand_before_obstacle(run, clear)
-    _, (force, ours) = jax.device_get(driven(run, start, dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))))
+    start = climb.stand_before_obstacle(run, 0.1)
+    _, (force, ours) = jax.device_get(driven(run, start))
     model = mujoco.MjModel.from_xml_string(_bodies(run, slope))
     model.opt.timestep = float(run.step)
     data = mujoco.MjData(model)
     data.qpos[:] = TIES @ np.asarray(start.q)
     shared = TIES / TIES.sum(axis=0)  # both pulleys have half of the shaft's
     theirs = np.empty_like(ours)
-    for k in range(steps):
-        data.qfrc_applied[:] = shared @ force[k]
+    for k, applied in enumerate(force):
+        data.qfrc_applied[:] = shared @ applied
         mujoco.mj_step(model, data)
         theirs[k] = data.qpos[[0, 1, 2, 3, 5, 6]]
-    return run, ours, theirs
+    return ours, theirs
 
 
 @pytest.mark.quick(1)
 @pytest.mark.parametrize("slope", [0.0, 10.0])
 def test_ten_thousand_steps_are_those_of_mujoco_under_the_same_forces(slope):
-    """Of a second of driving off and swinging the levers."""
-    _, ours, theirs = beside_mujoco(slope, terrain.flat_ground, ((45.0, 20.0), (-8.4, 30.0)), 12.0, 0.1)
+    ours, theirs = beside_mujoco(slope)
     assert np.abs(ours - theirs).max() < 1e-6
     assert ours[-1, 0] - ours[0, 0] > 0.05 and np.ptp(ours[:, 4]) > 0.3 and np.ptp(ours[:, 5]) > 0.3
-
-
-@pytest.mark.slow
-def test_steps_across_a_corner_are_those_of_mujoco_until_contacts_first_differ():
-    """Onto a step, front levers first: which pairs touch is read off the coordinates of each."""
-    ground = functools.partial(terrain.single_step, 0.06)
-    run, ours, theirs = beside_mujoco(0.0, ground, ((45.0, 45.0), (-8.4, -8.4)), 24.0, 0.01)
-
-    def touching(q):
-        at = footing.contacts_with_terrain(run.shape, run.terrain, q, 0 * q)
-        return at.force > 0, jnp.any((at.force > 0) & (at.place == 0.0))  # the corner is at 0
-
-    touch = jax.jit(jax.vmap(touching))
-    (mine, on_corner), (other, _) = jax.device_get((touch(ours), touch(theirs)))
-    differ = np.flatnonzero((mine != other).any(axis=1))
-    until = differ[0] if len(differ) else len(ours)
-    assert np.abs(ours - theirs)[:until].max() < 1e-6
-    assert on_corner[:until].sum() > 500 and np.ptp(ours[:until, 2]) > np.radians(5)
 
 
 #: Both pulleys turn as one.
@@ -352,22 +321,15 @@ def _bodies(run, slope):
 
 def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
     """Each contact moves as its distance changes, so that elastic contacts keep what they store."""
-    run = build_climb_system(
-        ROBOT,
-        Conditions(0, voltage=6.0).resolved(ROBOT),
-        terrain.single_step(0.08, nose=0.01),
-        constant_angles(0.5, 0.3),
-    )
+    run = system(terrain.single_step(0.08, nose=0.01))
     q = jnp.array([-0.12, 0.075, -0.2, 1.3, 0.6, 3.4])
     v = jnp.array([0.3, -0.2, 0.7, 2.0, 0.4, -0.5])
 
-    def gaps(t):
-        return footing.contacts_with_terrain(run.shape, run.terrain, q + t * v, v).gap
+    def at(t):
+        return contacts_with_terrain(run.shape, run.terrain, q + t * v, v)
 
-    rates = np.asarray(footing.contacts_with_terrain(run.shape, run.terrain, q, v).gap_rate)
-    numeric = np.asarray((gaps(1e-6) - gaps(-1e-6)) / 2e-6)
-    near = np.abs(np.asarray(gaps(0.0))) < 0.5
-    off = np.abs(rates - numeric)[near]
+    numeric = (at(1e-6).gap - at(-1e-6).gap) / 2e-6
+    off = np.abs(at(0.0).gap_rate - numeric)[np.abs(at(0.0).gap) < 0.5]
     # where two features are equally near, and on wheels that don't bear, there is none
     assert np.median(off) < 1e-7 and (off > 1e-5).mean() < 0.03
 
@@ -375,31 +337,25 @@ def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
 @pytest.mark.slow
 def test_polyline_of_constant_slope_is_tilted_gravity():
     angle = np.radians(10.0)
-    conditions = [Conditions(0, voltage=10.0, slope_deg=slope).resolved(ROBOT) for slope in (0.0, 10.0)]
-    end_point = terrain.FAR * np.array([np.cos(angle), np.sin(angle)])
-    grounds = terrain._terrain_of_points([-end_point, end_point], 0.0), terrain.flat_ground()
-    raised, level = (
-        build_climb_system(ROBOT, *of, constant_angles(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True)
-    )
+    along = np.array([np.cos(angle), np.sin(angle)])
+    flush = constant_angles(np.pi, np.pi)
+    raised = system(terrain._terrain_of_points([-terrain.FAR * along, terrain.FAR * along], 0.0), flush, voltage=10.0)
+    level = system(levers=flush, voltage=10.0, slope_deg=10.0)
     start = climb.stand_before_obstacle(level)
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, z = (float(a) for a in start.q[:2])
 
     @jax.jit
-    def end(sys_, motion):
-        none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
+    def end(run, motion):
         return jax.lax.fori_loop(
-            0, 500, lambda k, m: climb.advance_climb(sys_, m, 1.0 + k * sys_.step, none)[0], motion
+            0, 500, lambda k, m: climb.advance_climb(run, m, 1.0 + k * run.step, NO_ENERGY)[0], motion
         )
 
     tilted = end(level, start)
-    q = start.q.at[0].set(x * cos - z * sin).at[1].set(x * sin + z * cos).at[2].set(-angle)
-    ended = end(raised, dataclasses.replace(start, q=q))
-    along = float(ended.q[0] * cos + ended.q[1] * sin)
-    assert along == pytest.approx(float(tilted.q[0]), abs=1e-9)
+    turn = np.array([along * [1, -1], along[::-1]])  # to the coordinates of the raised ground
+    q = start.q.at[:2].set(turn @ start.q[:2]).at[2].set(-angle)
+    ended = end(raised, replace(start, q=q))
+    back = [along @ ended.q[:2], ended.q[2] + angle, ended.q[3]]
+    assert np.asarray(back) == pytest.approx(np.asarray(tilted.q)[[0, 2, 3]], abs=1e-9)
     assert float(tilted.q[3]) > 0.01  # it has been driven
-    assert float(ended.q[2]) + angle == pytest.approx(float(tilted.q[2]), abs=1e-9)
-    assert float(ended.q[3]) == pytest.approx(float(tilted.q[3]), abs=1e-9)
     assert float(ended.current) == pytest.approx(float(tilted.current), rel=1e-8)
 
 
@@ -409,15 +365,14 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
 
     `track`, whose belt yields, has another share and another ripple, and so other means (docs/explanation/climbing.md).
     """
-    conditions = Conditions(0, voltage=15.0, slope_deg=5.0).resolved(ROBOT)
-    run = build_climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(np.pi, np.pi))
-    none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
+    travel = {"voltage": 15.0, "slope_deg": 5.0}
+    run = system(levers=constant_angles(np.pi, np.pi), **travel)
 
     @jax.jit
     def driven(motion, first):
         def one(motion, k):
-            after, _, passed = climb.advance_climb(run, motion, first + k * run.step, none)
-            at = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
+            after, _, passed = climb.advance_climb(run, motion, first + k * run.step, NO_ENERGY)
+            at = contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
             load = jnp.stack([jnp.sum(at.guided * at.force), jnp.sum(at.force)])
             return after, (motion.q[3], passed.current, motion.v[0], load)
 
@@ -427,37 +382,18 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
     _, (turned, *found) = jax.device_get(driven(motion, 0.9))
     pitch = float(run.shape.main.pitch / run.shape.main.first)
     whole = np.searchsorted(turned, turned[0] + pitch * np.floor((turned[-1] - turned[0]) / pitch))
-    current, speed, load = (x[:whole].mean(axis=0) for x in found)
-    assert 0.85 < load[0] / load[1] < 0.95
-    settled = steady(params.replace(ROBOT, {"6T2A.track.guide_share": load[0] / load[1]}), conditions)
+    current, speed, (guided, load) = (x[:whole].mean(axis=0) for x in found)
+    assert 0.85 < guided / load < 0.95
+    robot = params.replace(ROBOT, {"6T2A.track.guide_share": guided / load})
+    settled = steady(robot, Conditions(0, **travel).resolved(ROBOT))
     assert current == pytest.approx(float(settled.total_current) / 2, rel=3e-3)
     assert speed == pytest.approx(float(settled.speed), rel=1e-3)
-
-
-@pytest.mark.slow
-def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometry():
-    """1680 (Section 3.4.5): grousers on the ground and teeth on two guides, of two main and four levers' belts. The climb
-    resolves the grousers alone, each beside corners of the ground. Its teeth run rigidly."""
-    run = build_climb_system(
-        ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
-    )
-    pairs = {}
-    for name, belt, count in (("main", run.shape.main, 2), ("lever", run.shape.lever, 4)):
-        teeth = round(float(belt.length) / PITCH_TOOTH)
-        assert float(belt.length) == pytest.approx(teeth * PITCH_TOOTH, abs=1e-3)
-        pairs[name] = count * belt.grousers, count * 2 * teeth
-    assert sum(pairs["main"]) == 720 and sum(pairs["main"]) + sum(pairs["lever"]) == 1680
-    at = footing.contacts_with_terrain(run.shape, run.terrain, climb.stand_before_obstacle(run).q, jnp.zeros(6))
-    # grousers of one side, then what corners of a terrain and wheels meet
-    tips = (pairs["main"][0] + pairs["lever"][0]) // 2
-    near = np.abs(np.asarray(at.gap)) < 1.0
-    assert tips == 56 and near.sum() == tips + 2  # and the wheels, which bear where there are no tracks
 
 
 @jax.jit
 def lowest(run, q):
     """Least gap of all contacts [m]."""
-    return jnp.min(footing.contacts_with_terrain(run.shape, run.terrain, q, 0 * q).gap)
+    return jnp.min(contacts_with_terrain(run.shape, run.terrain, q, 0 * q).gap)
 
 
 def leant(run, pitch):
@@ -482,8 +418,7 @@ def nose_up():
     gear = ROBOT.running_gear
     outer, inner = float(ROBOT.radius_pulley + gear.grouser_height), float(ROBOT.radius_pulley)
     front = np.radians(60.0)
-    conditions = Conditions(0, voltage=4.0).resolved(ROBOT)
-    run = build_climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(front, np.pi))
+    run = system(levers=constant_angles(front, np.pi), voltage=4.0)
     q = jnp.zeros(6).at[4].set(front).at[5].set(0.0)
     matrix, *_ = climb.mass_matrix_and_bias(run, q, jnp.zeros(6))
     ahead = float(-matrix[1, 2] / matrix[0, 0]) + float(gear.wheelbase) / 2
@@ -497,24 +432,19 @@ def nose_up():
 def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     """Slow, on a ground that holds. A robot that leans on a step with its rear levers flush gets over where the centre
     of mass comes over the edge: under the tips of grousers at the least, between two of them at the most."""
-    flush = float(np.degrees(static_limits.flush_lever_angle(ROBOT)))
+    flush = float(np.degrees(flush_lever_angle(ROBOT)))
     runs, starts = [], []
     for payload in (0.0, 8.0):
         of = HOLDS | {"payload": payload}
         side = resting_posture.side_outline(
             ROBOT, Conditions(0, payload=payload, levers_front_deg=180.0, levers_rear_deg=flush).resolved(ROBOT)
         )
-        low = static_limits.find_highest_step(side)
-        high = static_limits.find_highest_step(dataclasses.replace(side, belt=ROBOT.radius_pulley))
+        low = find_highest_step(side)
+        high = find_highest_step(replace(side, belt=ROBOT.radius_pulley))
         assert 1e3 * float(low.height) == pytest.approx({0.0: 232, 8.0: 203}[payload], abs=1)
         for height in (float(low.height) - 0.004, float(high.height) + 0.006):
             ground = terrain.single_step(height, size=POINTS)
-            run = build_climb_system(
-                ROBOT,
-                Conditions(0, voltage=4.0, **of).resolved(ROBOT),
-                ground,
-                constant_angles(np.pi, np.radians(flush)),
-            )
+            run = system(ground, constant_angles(np.pi, np.radians(flush)), voltage=4.0, **of)
             runs.append((ground, 180, flush, 4, of))
             starts.append(leant(run, float(low.pitch) - np.radians(4.0)))
     # a grouser more or less under the edge of a step that it drives up to nose up, and the way that the robot is at
@@ -523,12 +453,7 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     for front, widths in ((180.0, (0.144, 0.21)), (flush, (0.346, 0.38))):
         grounds += [(terrain.gap(width), front, front) for width in widths]
     for ground, front, rear in grounds:
-        run = build_climb_system(
-            ROBOT,
-            Conditions(0, voltage=4.0).resolved(ROBOT),
-            ground,
-            constant_angles(np.radians(front), np.radians(rear)),
-        )
+        run = system(ground, constant_angles(*np.radians([front, rear])), voltage=4.0)
         runs.append((ground, front, rear, 4, HOLDS))
         starts.append(climb.stand_before_obstacle(run).q)
     starts += starts[-1:] * (MEMBERS - len(starts))

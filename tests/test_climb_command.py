@@ -7,8 +7,8 @@ import jsonschema
 import numpy as np
 import pytest
 
-from calibration.data import terrains
 from calibration.data.input_errors import BadData
+from calibration.data.terrains import read_sequence, read_terrain
 from mmrjax.climbing.climb_simulation import LOSSES
 from sweeps.commands import climb as room
 from sweeps.report.climb_report import footing_coordinates
@@ -20,7 +20,7 @@ SCHEMA = schema_of("climb")
 @pytest.mark.parametrize("header", ["x_mm,time_s,front_deg,rear_deg", "x_mm,front_deg,rear_deg,front_V,rear_V"])
 def test_a_sequence_over_both_clocks_or_of_both_units_is_refused(tmp_path, header, robot):
     with pytest.raises(BadData, match=r"s\.csv: got columns \w+(, rear_V)? and \w+(, rear_deg)?; expected one kind"):
-        terrains.read_sequence(
+        read_sequence(
             text_file(tmp_path / "s.csv", f"{header}\n{','.join('0' * (header.count(',') + 1))}\n"),
             robot,
             (0.0, 0.0),
@@ -28,17 +28,17 @@ def test_a_sequence_over_both_clocks_or_of_both_units_is_refused(tmp_path, heade
 
 
 def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path, robot):
-    ground = terrains.read_terrain(text_file(tmp_path / "t.csv", "# a kerb\nx_mm;z_mm\n100;0\n100;80\n300,5;80\n"))
+    ground = read_terrain(text_file(tmp_path / "t.csv", "# a kerb\nx_mm;z_mm\n100;0\n100;80\n300,5;80\n"))
     assert float(ground.finish) == pytest.approx(0.2005)
     # above it, within it, and within it where the foot of the kerb is nearest
     gaps = ground.distance(jnp.array([[0.1, 0.1], [0.1, 0.05], [0.01, -0.01]]))[0]
     assert np.asarray(gaps) == pytest.approx([0.02, -0.03, -0.01 * np.sqrt(2)])
-    sequence = terrains.read_sequence(
+    sequence = read_sequence(
         text_file(tmp_path / "s.csv", "x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n"), robot, (0.0, 0.0)
     )
-    assert np.degrees(np.asarray(sequence.asked(-0.15, 0.0))) == pytest.approx([22.5, 86])
+    assert np.degrees(sequence.asked(-0.15, 0.0)) == pytest.approx([22.5, 86])
     assert not sequence.over_time
-    sequence = terrains.read_sequence(
+    sequence = read_sequence(
         text_file(tmp_path / "v.csv", "time_s,front_V,rear_V\n0,0,0\n1,6,-12\n"), robot, (0.5, 0.1)
     )
     assert np.asarray(sequence.first) == pytest.approx([0.5, np.pi - 0.1]) and sequence.over_time
@@ -71,11 +71,11 @@ FILES = {
 def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
     text, message = FILES[case]
     with pytest.raises(BadData, match=message):
-        terrains.read_terrain(text_file(tmp_path / "t.csv", text))
+        read_terrain(text_file(tmp_path / "t.csv", text))
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 3, time_s: got 1 after 1; expected increasing values"),
         ("time_s,front_deg,rear_deg\n1,0,270\n", r"row 2, rear_deg: got 270 deg; expected -180 to 180"),
@@ -85,7 +85,7 @@ def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
 )
 def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, message, robot):
     with pytest.raises(BadData, match=message):
-        terrains.read_sequence(text_file(tmp_path / "s.csv", text), robot, (0.0, 0.0))
+        read_sequence(text_file(tmp_path / "s.csv", text), robot, (0.0, 0.0))
 
 
 @pytest.mark.parametrize("limit", [87.3, 449.0, 5.0])

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mmrjax.climbing import climb_derivatives as room
-from mmrjax.climbing import climb_simulation as climb
-from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import ClimbMotion, ClimbRecord
+from mmrjax.climbing.climb_simulation import ClimbMotion, ClimbRecord, climb_batch, constant_angles
+from mmrjax.climbing.terrain import single_step
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -36,7 +35,7 @@ def passed(count, place, **other):
 
 
 def test_margins_are_shares_and_the_crest_is_between_samples():
-    ground, record = terrain.single_step(0.08), passed(4, [-0.2, -0.1, 0.3, 0.4])
+    ground, record = single_step(0.08), passed(4, [-0.2, -0.1, 0.3, 0.4])
     crest = room.crest_sample(ground, record, True)
     found = {name: float(x) for name, x in room.climb_outputs(ROBOT, ground, record, crest).items()}
     assert crest == 2 and list(found) == list(room.OUTPUTS)
@@ -56,9 +55,7 @@ def given(values):
     base = jax.tree.map(jnp.asarray, Conditions(0, voltage=6.0, adhesion=2.0).resolved(ROBOT))
     robot, conditions = Variation(ROBOT, ("payload",)).at(values[:1], base)
     angles = (jnp.radians(jnp.asarray(x)) for x in (45.0, 180.0))
-    return room.ClimbInputs(
-        robot, conditions, terrain.single_step(values[1] / 1000, size=4), climb.constant_angles(*angles)
-    )
+    return room.ClimbInputs(robot, conditions, single_step(values[1] / 1000, size=4), constant_angles(*angles))
 
 
 @pytest.mark.nightly
@@ -73,7 +70,7 @@ def test_derivatives_are_the_limits_of_finite_differences_with_contacts_at_the_e
     rows = jnp.concatenate([values + moves, values - moves])
     # as many as the slopes take, whose program serves them too
     beside = jax.vmap(given)(jnp.resize(rows, (len(values) * room.BESIDE, len(values))))
-    batch = climb.climb_batch(*beside, **options)
+    batch = climb_batch(*beside, **options)
     each = [jax.tree.map(lambda x, k=k: x[k], (beside.robot, beside.terrain)) for k in range(4)]
     ends = [room.outputs_of_run(*of, batch, k) for k, of in enumerate(each)]
     for name in ("margin_success", "margin_reach", "margin_upright", "crest_energy_J", "crest_current_rms_A"):

@@ -4,10 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import samples
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data import clock, robot_file, row_checks
-from calibration.data import runs as records
+from calibration.data import robot_file
+from calibration.data.clock import spread_shared_stamps, unwrap_counter
+from calibration.data.row_checks import drop_repeated_readings, reading_period
+from calibration.data.runs import read_runs
 from tests.commands import text_file
 
 RIG = """
@@ -57,14 +60,14 @@ def test_a_clock_is_counted_from_the_first_row(tmp_path, robot, case, as_text):
     if as_text:
         source.to_csv(tmp_path / "log.csv", index=False)
         source = tmp_path / "log.csv"
-    found = records.read_runs(source, robot)
+    found = read_runs(source, robot)
     assert_allclose(found["time_s"], TABLE["t"], rtol=0, atol=1e-6)
     assert any(says in note for note in found.notes)
 
 
 def test_each_recording_has_wraps_of_its_own():
     once = (np.arange(60.0) * 1000 + 2**32 - 20_000) % 2**32
-    found, period = clock.unwrap_counter(np.concatenate([once, once]), np.repeat([0, 1], 60))
+    found, period = unwrap_counter(np.concatenate([once, once]), np.repeat([0, 1], 60))
     assert period == 2**32 and found[60] == once[0]
     for part in (found[:60], found[60:]):
         assert_array_equal(part - part[0], np.arange(60) * 1000)
@@ -77,23 +80,23 @@ def test_each_recording_has_wraps_of_its_own():
 )
 def test_a_clock_that_does_not_wrap_stays_as_it_is(time):
     run = np.zeros(len(time), int)
-    assert clock.unwrap_counter(time, run)[1] == 0 and clock.spread_shared_stamps(time, run)[1] == 0
+    assert unwrap_counter(time, run)[1] == 0 and spread_shared_stamps(time, run)[1] == 0
 
 
 def test_stamps_that_are_rarely_shared_are_not_spread():
     time = np.sort(np.r_[np.arange(100.0), 40.0])
-    assert clock.spread_shared_stamps(time, np.zeros(101, int))[1] == 0
+    assert spread_shared_stamps(time, np.zeros(101, int))[1] == 0
 
 
 def test_a_row_that_stands_twice_is_left_out(robot):
     twice = frame(time_s=TABLE["t"]).iloc[np.sort(np.r_[np.arange(200), 77, 120])]
-    found = records.read_runs(twice, robot)
+    found = read_runs(twice, robot)
     assert len(found) == 200 and any(
         "2 rows, the first row 79, are a repetition of the row before" in n for n in found.notes
     )
     other = frame(time_s=TABLE["t"])
     other.loc[len(other) / 2 - 1, "time_s"] = other["time_s"][len(other) // 2]
-    assert len(records.read_runs(other, robot)) == 200
+    assert len(read_runs(other, robot)) == 200
 
 
 # --- readings that repeat ---------------------------------------------------------------------------
@@ -103,7 +106,7 @@ def held(values, rows):
     return np.asarray(values)[(np.arange(int(len(values) * rows)) / rows).astype(int)]
 
 
-RNG = np.random.default_rng(3)
+RNG = default_rng(3)
 WALK = 10 + np.cumsum(RNG.normal(size=200))
 T = np.arange(3000)
 #: Channels that are read in every row, though they repeat numbers.
@@ -120,30 +123,29 @@ EVERY_ROW = {
 
 @pytest.mark.parametrize("rows", [2, 2.5, 15, 40.4])
 def test_the_period_of_a_slow_sensor_is_found(rows):
-    assert row_checks.reading_period(held(WALK, rows)) == pytest.approx(rows, rel=0.02)
+    assert reading_period(held(WALK, rows)) == pytest.approx(rows, rel=0.02)
 
 
 @pytest.mark.parametrize("case", EVERY_ROW)
 def test_coarse_readings_are_no_repeats(case):
     values = EVERY_ROW[case]
-    found, rows = row_checks.drop_repeated_readings(values, np.arange(len(values)))
+    found, rows = drop_repeated_readings(values, np.arange(len(values)))
     assert rows == 0 and found is values
 
 
 def test_each_reading_of_a_slow_sensor_is_used_once():
     walk = WALK.copy()
     walk[50] = walk[49]  # the same reading twice is two readings
-    found, rows = row_checks.drop_repeated_readings(held(walk, 15), np.arange(3000))
+    found, rows = drop_repeated_readings(held(walk, 15), np.arange(3000))
     assert rows == 15
     assert_array_equal(np.flatnonzero(np.isfinite(found)), np.arange(0, 3000, 15))
     assert_array_equal(found[::15], walk)
 
 
 def test_repeats_are_reported_and_weigh_nothing(robot):
-    found = records.read_runs(frame(time_s=TABLE["t"], motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot)
+    slow = held(TABLE["rpm"][::10], 10)
+    found = read_runs(frame(time_s=TABLE["t"], motor_speed_rpm=slow), robot)
     assert any("motor_speed_rpm repeats each reading in 10 rows" in note for note in found.notes)
     assert np.isfinite(found["motor_speed_rpm"]).sum() == 20 and np.isfinite(found["total_current_A"]).all()
-    settled = records.read_runs(
-        frame(motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot
-    )  # without time they are runs
+    settled = read_runs(frame(motor_speed_rpm=slow), robot)  # without time they are runs
     assert np.isfinite(settled["motor_speed_rpm"]).all()

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from calibration.discovery import outliers
 from calibration.discovery.outliers import find_cluster
-from calibration.words import loop_words as words
+from calibration.words.loop_words import cluster_sentence
 
 ERROR = 0.01
-RNG = np.random.default_rng(0)
+RNG = default_rng(0)
 ROWS = 240
 #: Eight runs of thirty samples, at four voltages, in random order of conditions.
 TIME = np.tile(np.linspace(0.0, 1.45, 30), 8)
@@ -30,7 +31,7 @@ def found(rows, axes=AXES, levels=LEVELS, error=ERROR, included=None):
 
 def drawn(mask, count, seed=1):
     """So many rows of a mask, at random."""
-    return np.random.default_rng(seed).choice(np.flatnonzero(mask), count, replace=False)
+    return default_rng(seed).choice(np.flatnonzero(mask), count, replace=False)
 
 
 @pytest.mark.slow
@@ -38,7 +39,7 @@ def test_scattered_outliers_are_no_cluster(monkeypatch):
     """As seldom as stated, over 200 draws. A test of the test: of outliers that lie together, nearly always."""
     monkeypatch.setattr(outliers, "PERMUTATIONS", 400)
     axes, levels, error = {"time": TIME}, {"supply_voltage_V": VOLTAGE}, 0.05
-    count = np.random.default_rng(2).integers(3, 16, 200)
+    count = default_rng(2).integers(3, 16, 200)
     false = [found(drawn(np.ones(ROWS, bool), n, k), axes, levels, error) for k, n in enumerate(count)]
     assert sum(c is not None for c in false) <= error * len(false)
     true = [found(drawn((TIME > 0.7) & (TIME < 0.85), 8, k), axes, levels, error) for k in range(10)]
@@ -65,7 +66,7 @@ def test_outliers_on_a_stretch_are_found_there(case):
     assert got.low <= x.min() and got.high >= x.max() and got.inside >= len(inside)
     assert got.high - got.low <= max(outliers.WINDOWS) * np.ptp(AXES[axis])
     assert got.of == len(np.union1d(inside, alone))
-    assert words.cluster_sentence(got).startswith(
+    assert cluster_sentence(got).startswith(
         f"{got.inside} of {got.of} outlying rows cluster at {axis} {got.low:.3g} to"
     )
 
@@ -76,7 +77,7 @@ def test_outliers_of_one_level_are_found_there():
     # 10 of 10 from a quarter of the rows, at one of four levels, in one of five columns
     expected = np.prod([(60 - k) / (ROWS - k) for k in range(10)]) * 4 * (len(AXES) + len(LEVELS))
     assert got.p == pytest.approx(expected, rel=1e-9)
-    assert "cluster at supply_voltage_V 24.0" in words.cluster_sentence(got)
+    assert "cluster at supply_voltage_V 24.0" in cluster_sentence(got)
 
 
 def test_the_least_probable_cluster_is_told():

@@ -1,14 +1,15 @@
 """Programs are shared by what equations cannot tell apart, and by nothing else."""
 
-import dataclasses
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from worlds import rigs
 
 from calibration.data import robot_file
@@ -17,8 +18,8 @@ from calibration.discovery import candidates, loop_input, scales
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
-from mmrjax import effects
 from mmrjax.compile.compiling import compiled, for_equations
+from mmrjax.effects import BY_NAME
 from mmrjax.effects.base import scaled_effect
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import paper_robots, params
@@ -32,7 +33,7 @@ def space_of(world, folder):
     robot = robot_file.read_robot(folder / "rig.toml")
     runs = records.read_runs(folder / "table.csv", robot=robot)
     observer = observers.observer_kind(runs)
-    library = scales.scale_library(robot, runs.conditions(robot), effects.BY_NAME)
+    library = scales.scale_library(robot, runs.conditions(robot), BY_NAME)
     sd = noise.noise_from_table(runs, observer.sizes(runs)).sd
     return loop_input.build_candidate_space(runs, robot, sd, settings_for(observer), library=library)
 
@@ -40,7 +41,7 @@ def space_of(world, folder):
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])
 def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
-    rng = np.random.default_rng([5, len(kind)])
+    rng = default_rng([5, len(kind)])
     one = rigs.world(rng, kind, rows=(33, 48))
     other = rigs.world(rng, like=one.rig, rows=(33, 48))
     spaces = [space_of(w, tmp_path / str(k)) for k, w in enumerate((one, other))]
@@ -59,10 +60,10 @@ def effects_sd(effect):
 @pytest.mark.slow
 def test_what_equations_read_keeps_programs_apart():
     bare = paper_robots.nominal()
-    alike = dataclasses.replace(bare, rig=Rig(priors=(("motor.resistance", 0.6, 0.01),), columns=(("a", "b", 2.0),)))
-    unsigned = dataclasses.replace(bare, rig=Rig(instruments=(Instrument("total_current", False, 0.1),)))
-    held = dataclasses.replace(bare, rig=Rig(instruments=(Instrument("total_current", True, 0.1),)))
-    speed = dataclasses.replace(bare, rig=Rig(imposed="motor_speed"))
+    alike = replace(bare, rig=Rig(priors=(("motor.resistance", 0.6, 0.01),), columns=(("a", "b", 2.0),)))
+    unsigned = replace(bare, rig=Rig(instruments=(Instrument("total_current", False, 0.1),)))
+    held = replace(bare, rig=Rig(instruments=(Instrument("total_current", True, 0.1),)))
+    speed = replace(bare, rig=Rig(imposed="motor_speed"))
     shapes = [jax.tree.structure(for_equations(r)) for r in (bare, alike, held, unsigned, speed)]
     assert shapes[0] == shapes[1] == shapes[2] and len(set(shapes)) == 3
     assert for_equations(bare) is bare
@@ -81,7 +82,7 @@ def test_what_equations_read_keeps_programs_apart():
 
 
 def test_an_effect_of_another_size_is_the_same_to_equations():
-    kind = effects.BY_NAME["churning"]
+    kind = BY_NAME["churning"]
     wide = scaled_effect(kind, (3.0, 1.0, 3.0))
     one = wide(amplitude=jnp.asarray(2e-4))
     assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))
@@ -104,10 +105,7 @@ def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypat
     def fit(space, proposals, settings):
         asked.append([(*names, *map(float, z)) for names, z in proposals])
         ends = [costs[*names, *z] for names, z in proposals]
-        return [
-            dataclasses.replace(candidate(p[0], c), z=np.array([1.0, 7.0]))
-            for p, c in zip(proposals, ends, strict=True)
-        ]
+        return [replace(candidate(p[0], c), z=np.array([1.0, 7.0])) for p, c in zip(proposals, ends, strict=True)]
 
     def start(space, at, names, settings, scores=None):
         return np.array([1.0, 9.0 if scores else 0.0])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from worlds import paper
 
-from mmrjax.model import contact
-from mmrjax.model.contact import Friction
+from mmrjax.model.contact import Friction, cubic_step, damping_contact, force_contact, smooth_sign
 
-RNG = np.random.default_rng(27)
+RNG = default_rng(27)
 LAW = dict(static=0.4, dynamic=0.3, speed_static=0.02, speed_dynamic=0.2)
 quick = settings(max_examples=60, deadline=None, derandomize=True)
 
@@ -40,7 +40,7 @@ def test_friction_speed_creep_inverts_coefficient():
 
 
 @pytest.mark.parametrize(
-    ("speed", "mu"), [(0.0, 0.0), (0.02, 0.4), (-0.02, -0.4), (0.11, 0.35), (0.2, 0.3), (5.0, 0.3), (-1e6, -0.3)]
+    "speed, mu", [(0.0, 0.0), (0.02, 0.4), (-0.02, -0.4), (0.11, 0.35), (0.2, 0.3), (5.0, 0.3), (-1e6, -0.3)]
 )
 def test_friction_coefficient_at_the_knots_of_fig7(speed, mu):
     assert_allclose(Friction(**LAW).coefficient(speed), mu, rtol=1e-12)
@@ -66,14 +66,14 @@ def test_friction_speed_creep_beyond_adhesion_is_flat_and_finite():
 @given(st.floats(-2, 3), st.floats(-1, 0), st.floats(0.1, 2), st.floats(-5, 5), st.floats(-5, 5))
 def test_step_matches_reference(x, x0, width, y0, y1):
     expected = paper.cubic_step(x, x0, y0, x0 + width, y1)
-    assert_allclose(contact.cubic_step(x, x0, y0, x0 + width, y1), expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(cubic_step(x, x0, y0, x0 + width, y1), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_direction_is_smooth_sign():
     speeds = np.array([-5.0, -0.002, -0.001, 0.0, 0.0005, 0.002, 7.0])
     expected = [paper.soft_sign(v, 0.002) for v in speeds]
-    assert_allclose(contact.smooth_sign(speeds, 0.002), expected, rtol=1e-12)
-    assert np.isfinite(jax.vmap(jax.grad(lambda v: contact.smooth_sign(v, 0.002)))(jnp.asarray(speeds))).all()
+    assert_allclose(smooth_sign(speeds, 0.002), expected, rtol=1e-12)
+    assert np.isfinite(jax.vmap(jax.grad(lambda v: smooth_sign(v, 0.002)))(jnp.asarray(speeds))).all()
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.5, 2.2])
@@ -81,7 +81,7 @@ def test_force_contact_matches_reference(exponent):
     for _ in range(100):
         q, rate, r1, r2 = RNG.uniform((0.0, -1, 0.001, 0.001), (0.02, 1, 0.01, 0.01))
         c, b, d = RNG.uniform((1e3, 0, 1e-4), (1e5, 100, 2e-3))
-        got = contact.force_contact(q, rate, r1 + r2, c, exponent, b, d)
+        got = force_contact(q, rate, r1 + r2, c, exponent, b, d)
         expected = paper.contact_force(q, rate, r1, r2, c, exponent, b, d)
         assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
 
@@ -90,13 +90,13 @@ def test_force_contact_matches_reference(exponent):
 @pytest.mark.parametrize("gap", [0.009, 0.01, 0.011, 5.0])
 def test_force_contact_derivative_is_finite_through_contact(gap, exponent):
     arguments = (gap, 0.1, 0.01, 1e4, exponent, 20.0, 1e-3)
-    gradient = jax.grad(contact.force_contact, argnums=tuple(range(7)))(*arguments)
+    gradient = jax.grad(force_contact, argnums=tuple(range(7)))(*arguments)
     assert np.isfinite(gradient).all()
 
 
 def test_force_contact_static_is_a_spring_and_never_pulls():
-    assert_allclose(contact.force_contact(0.008, 0.0, 0.01, 1e4, 1.0, 50.0, 1e-3), 20.0)
-    assert float(contact.force_contact(0.008, 100.0, 0.01, 1e4, 1.0, 50.0, 1e-3)) == 0.0
+    assert_allclose(force_contact(0.008, 0.0, 0.01, 1e4, 1.0, 50.0, 1e-3), 20.0)
+    assert float(force_contact(0.008, 100.0, 0.01, 1e4, 1.0, 50.0, 1e-3)) == 0.0
 
 
 def test_friction_rise_is_the_derivative_of_the_coefficient():
@@ -108,6 +108,6 @@ def test_friction_rise_is_the_derivative_of_the_coefficient():
 
 def test_damping_contact_is_how_the_force_falls_with_the_rate_of_the_gap():
     for gap in (0.0085, 0.0095, 0.011):  # deeper than d, within d, without contact
-        forces = [contact.force_contact(gap, rate, 0.01, 1e4, 1.0, 20.0, 1e-3) for rate in (-0.01, 0.01)]
-        damping = contact.damping_contact(forces[0], gap, 0.01, 20.0, 1e-3)
+        forces = [force_contact(gap, rate, 0.01, 1e4, 1.0, 20.0, 1e-3) for rate in (-0.01, 0.01)]
+        damping = damping_contact(forces[0], gap, 0.01, 20.0, 1e-3)
         assert_allclose(damping, (forces[0] - forces[1]) / 0.02, atol=1e-9)

@@ -1,21 +1,29 @@
 """Derivatives of a step of the track model through linearised sums, against those of what is computed."""
 
-import dataclasses
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
-from mmrjax.undercarriage import contact_sums, half_robot, mjcf, side_contacts
-from mmrjax.undercarriage.half_robot import HalfRobotState, advance, build_system, generalized_forces, instant
+from mmrjax.undercarriage import mjcf
+from mmrjax.undercarriage.half_robot import (
+    HalfRobotState,
+    _implicit_step,
+    advance,
+    axle_height,
+    build_system,
+    generalized_forces,
+    instant,
+)
 from mmrjax.undercarriage.mjcf import mjx
-from mmrjax.undercarriage.running_gear import BeltPath
 
 RUNS = {
     "tracked": dict(voltage=24.0, slope_deg=5.0, payload=3.0, battery=1.0),
@@ -40,16 +48,16 @@ def eventful(recessed):
         next(e for e in BY_NAME.values() if e.balance == balance) for balance in ("inertia", "ground", "gearbox")
     ]
     effects = {e.name: e for e in [*chosen, *remembering]}
-    robot = dataclasses.replace(recessed, effects=tuple(e() for e in effects.values()))
+    robot = replace(recessed, effects=tuple(e() for e in effects.values()))
     sizes = {p.name: 0.3 * p.spec.prior_sd(0.0) for p in params.walk_parameters(robot) if p.spec.amplitude}
     return params.replace(robot, {name: jnp.asarray(size) for name, size in sizes.items()})
 
 
 def motion_of(robot, run, k):
     """In mid-run, no two parts alike. Which of the contacts slip beyond V_s differs with `k`."""
-    draw = np.random.default_rng(k)
+    draw = default_rng(k)
     setup = build_system(robot, run, STEP)
-    low = float(half_robot.axle_height(setup))
+    low = float(axle_height(setup))
     q = jnp.asarray([0.1, low - 2e-4, 1e-3 * draw.normal(), 0.3 + draw.random(), 0.0])
     q = q.at[4].set(q[3] - 1e-4)
     turning = [0.7, 25.0, 30.0][k % 3]
@@ -57,43 +65,6 @@ def motion_of(robot, run, k):
     v = jnp.asarray([speed, 2e-3 * draw.normal(), 0.02 * draw.normal(), turning, turning * 1.002])
     memory = {e.name: jnp.asarray(0.3 + 0.1 * draw.random()) for e in robot.remembering}
     return HalfRobotState(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
-
-
-def _summed(setup, given, gained):
-    """The sums over the contacts, as computed, from the inputs of `contact_sums.linearize`."""
-    gear = dataclasses.replace(setup.path.gear, **{n: given[n] for n in contact_sums.GEAR})
-    path, chassis = BeltPath(given["pulley"], gear), setup.chassis
-    laws = {n: given[f"friction_{n}"] for n in contact_sums.FRICTION}
-    ground = dataclasses.replace(chassis.ground, friction=dataclasses.replace(chassis.ground.friction, **laws))
-    own = {n: given[f"chassis_{n}"] for n in contact_sums.CHASSIS}
-    chassis = dataclasses.replace(chassis, ground=ground, **own)
-    q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
-    v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
-    at = side_contacts.compute_contacts(path, chassis, q, v)
-    return contact_sums.sums_of_contacts(path, chassis, at, given["slip"], given["adhesion"], gained)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(RUNS))
-def test_slopes_of_the_sums_are_their_derivatives(recessed, name):
-    """By the motion, the slip and every constant of the contacts, to 1e-9 of the largest of each sum's slopes."""
-    run = Conditions(**RUNS[name])
-    setup = build_system(recessed, run, STEP)
-    gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
-    constants = contact_sums.contact_inputs(setup.path, setup.chassis, run.adhesion)
-    found = jax.jit(lambda x: contact_sums.linearize(setup.path, setup.chassis, x, gained, tuple(constants)))
-    derived = jax.jit(jax.jacfwd(lambda x: _summed(setup, x, gained)))
-    for k in range(3):
-        motion = motion_of(recessed, run, k)
-        given = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True)) | constants
-        given = {name: jnp.asarray(value, float) for name, value in given.items()} | {"slip": jnp.asarray(1e-3)}
-        ours, theirs = found(given), derived(given)
-        theirs = [getattr(theirs, row.name) for row in dataclasses.fields(theirs)]
-        expected = np.asarray([[row[name] for row in theirs] for name in ours.names])
-        assert set(ours.names) == set(given)
-        assert (np.abs(expected).max(axis=1) > 0).sum() >= {"tracked": 19, "wheeled": 12}[name]
-        for row, want in zip(np.asarray(jax.tree.leaves(ours.slopes)).T, expected, strict=True):
-            assert_allclose(row, want, rtol=1e-9, atol=1e-9 * np.abs(want).max() + 1e-10)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +90,7 @@ def pushed():
 def test_impulse_is_that_of_mjx(recessed, pushed, name):
     run = Conditions(**RUNS[name])
     motion = motion_of(recessed, run, 1)
-    motion = dataclasses.replace(motion, q=motion.q.at[2].set(0.3), v=motion.v.at[2].set(2.0))
+    motion = replace(motion, q=motion.q.at[2].set(0.3), v=motion.v.at[2].set(2.0))
     force, spent = pushed(recessed, run, motion)
     assert_allclose(spent / STEP, force, rtol=1e-9, atol=1e-9 * float(jnp.abs(force).max()))
 
@@ -129,15 +100,15 @@ def _stepped(robot, run, motion, step, forward):
 
 
 def _as_computed(run, motion):
-    step = half_robot._implicit_step(run, motion)
+    step = _implicit_step(run, motion)
     return step.after, step.signals, step.guided
 
 
 def _changes(tree, seed):
     """A random change of every number, relative to its size."""
-    draw = np.random.default_rng(seed)
+    draw = default_rng(seed)
     leaves, structure = jax.tree.flatten(eqx.filter(tree, eqx.is_inexact_array))
-    changes = [jnp.asarray((np.abs(np.asarray(x)) + 1e-3) * draw.normal(size=x.shape)) for x in leaves]
+    changes = [jnp.asarray((np.abs(x) + 1e-3) * draw.normal(size=x.shape)) for x in leaves]
     return jax.tree.unflatten(structure, changes)
 
 
@@ -149,25 +120,12 @@ def _equal(ours, theirs):
 
 @pytest.fixture(scope="module")
 def forward():
-    """Derivatives of a step along a direction: as differentiated, what turns with the driving pulley by a factor, and
-    of what it computes."""
-    right, front = contact_sums.linearize, contact_sums.MOTION.index("front")
-
-    @eqx.filter_jit
-    def both(at, moved, factor):
-        def scaled(*arguments):
-            found = right(*arguments)
-            return eqx.tree_at(
-                lambda f: f.slopes, found, jax.tree.map(lambda x: x.at[front].multiply(factor), found.slopes)
-            )
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(contact_sums, "linearize", scaled)
-            return tuple(
-                eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed)
-            )
-
-    return lambda at, moved, factor=1.0: both(at, moved, jnp.asarray(factor))
+    """Derivatives of a step along a direction: as differentiated, and of what it computes."""
+    return eqx.filter_jit(
+        lambda at, moved: tuple(
+            eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed)
+        )
+    )
 
 
 def _some(after, signals, guided):
@@ -220,7 +178,7 @@ def test_second_derivatives_are_those_of_what_is_computed(recessed):
 
     def slope(v, step):
         def after(v):
-            return step(build_system(recessed, run, STEP), dataclasses.replace(motion, v=v))[0].v
+            return step(build_system(recessed, run, STEP), replace(motion, v=v))[0].v
 
         return jax.jacfwd(jax.jacfwd(after))(v)
 

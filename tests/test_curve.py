@@ -1,6 +1,6 @@
 """Curves: smooth through their ordinates, and lawful as every effect of the library, in `steady` and `drive`."""
 
-import dataclasses
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -10,13 +10,14 @@ import pytest
 import test_effects as laws
 from numpy.testing import assert_allclose
 
-from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
-from calibration.inference import bases as curves
+from calibration.data.robot_file import read_robot, write_robot
+from calibration.inference.bases import BALANCES, OF_TURNS, VARIABLES, CurveScope, curve_families, window_families
 from mmrjax import effects
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive
-from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model import balances, channels, params
+from mmrjax.model.paper_robots import blank_robot, nominal
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
@@ -41,7 +42,7 @@ def robot(amplitudes=None, kinds=CURVES):
         values = {n: v for n, v in SHAPE.items() if hasattr(effect(), n)}
         values |= {} if amplitudes is None else {"amplitude": amplitudes[k]}
         every.append(params.replace(effect(), {n: jnp.asarray(v) for n, v in values.items()}))
-    return dataclasses.replace(paper_robots.nominal(), effects=tuple(every))
+    return replace(nominal(), effects=tuple(every))
 
 
 # --- interpolation --------------------------------------------------------------------------------------
@@ -91,7 +92,7 @@ def test_curve_obeys(effect, law):
 def test_curves_at_zero_change_nothing_in_steady_and_none_is_dead():
     both = jax.jit(lambda a: jax.jacfwd(lambda a: (_steady(robot(a)),) * 2, has_aux=True)(a))
     slopes, with_them = both(jnp.zeros(len(CURVES)))
-    assert_allclose(with_them, jax.jit(_steady)(paper_robots.nominal()), rtol=1e-13, atol=1e-13)
+    assert_allclose(with_them, jax.jit(_steady)(nominal()), rtol=1e-13, atol=1e-13)
     assert np.isfinite(slopes).all()
     read = np.where(with_them == 0, np.inf, with_them)  # what this robot does not have reads 0
     moved = np.abs(slopes * SIZES / read[..., None]).max((0, 1))
@@ -115,7 +116,7 @@ def _driven(amplitudes):
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
     # but for rounding: a program with effects sums in another order
-    assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(paper_robots.nominal()), rtol=4e-15)
+    assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(nominal()), rtol=4e-15)
 
 
 @pytest.mark.slow
@@ -123,7 +124,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
     sizes = jnp.asarray([laws.size(e) for e in DRIVEN.values()])
     both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * sizes,)))
     still, slope = both(jnp.zeros(len(DRIVEN)))
-    bare = paper_robots.nominal()
+    bare = nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
     assert_allclose(still, laws.readings(bare, plain.signals)[:, 1:], rtol=1e-7, atol=1e-7)
     assert np.isfinite(slope).all() and np.abs(slope / still).max() > 1e-3
@@ -143,12 +144,13 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     robot = laws.metered(signed=False)
     each = [laws.terms(made, robot, s) for s in (laws.STATES, laws.mirrored(laws.STATES))]
     assert_allclose(*each, rtol=1e-12, atol=1e-15)
-    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("motor_current", "speed")))
+    robot = replace(robot, rig=replace(robot.rig, channels=("motor_current", "speed")))
     columns = {"order": np.tile(np.arange(9.0), 2), "supply_voltage_V": np.repeat([12.0, -12.0], 9)}
     columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
     ways = dict.fromkeys(curve.WAYS, np.repeat([1.0, -1.0], 9))
-    for looked in (curves.curve_families, curves.window_families):
-        (basis,) = (b for b in looked(columns, np.ones(18), robot, None, ways) if b.places[0] in curve.READINGS)
+    for looked in (curve_families, window_families):
+        scope = CurveScope.of(robot, columns)
+        (basis,) = (b for b in looked(columns, np.ones(18), ways, scope) if b.places[0] in curve.READINGS)
         for (place, _), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
             assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
 
@@ -156,32 +158,29 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
 @EACH
 def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
     made = params.replace(effect(), {"amplitude": 0.3})
-    floats = [f.name for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")]
+    floats = [f.name for f in fields(Signals) if f.name not in ("memory", "configuration")]
     still = Signals(**{name: jnp.asarray(0.0) for name in floats})
-    slopes = eqx.filter_grad(lambda both: both[0].term(paper_robots.nominal(), both[1]))((made, still))
+    slopes = eqx.filter_grad(lambda both: both[0].term(nominal(), both[1]))((made, still))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
 
 
 # --- where they are known -------------------------------------------------------------------------------
 
 
-def test_curves_are_no_part_of_the_library():
-    assert not set(CURVES) & set(effects.BY_NAME) and not set(CURVES.values()) & set(effects.ALL)
-
-
 def test_curves_are_those_that_the_trace_looks_for():
-    assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.ROUND) == curves.OF_TURNS
-    assert (*curve.VARIABLES, *curve.VARIABLES_ROUND) == tuple(curves.VARIABLES)
+    assert tuple(curve.BALANCES) == BALANCES and tuple(curve.ROUND) == OF_TURNS
+    assert (*curve.VARIABLES, *curve.VARIABLES_ROUND) == tuple(VARIABLES)
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
     assert set(curve.READINGS) == {c.name for c in channels.EVERY} - {*curve.ROUND}  # a heading is no `yaw` moment
     assert set(curve.READ_BY) <= set(curve.READINGS)
-    robot = dataclasses.replace(
-        paper_robots.blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
+    robot = replace(
+        blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.1)})),
         rig=Rig(channels=("output_torque", "position")),
     )
     columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}
     columns |= {"configuration": np.repeat("bench", 9), "supply_voltage_V": np.tile([6.0, 12.0, 24.0], 3)}
-    (basis,) = (b for b in curves.curve_families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
+    ways, scope = dict.fromkeys(curve.WAYS, np.ones(9)), CurveScope.of(robot, columns)
+    (basis,) = (b for b in curve_families(columns, np.ones(9), ways, scope) if b.places[0] in curve.READINGS)
     assert set(basis.names) == {("output_torque", "order"), ("output_torque", "current"), ("position", "order")}
     assert all(f"curve_{place}_{over}" in UNNAMED for place, over in basis.names)
 
@@ -195,13 +194,13 @@ def test_curve_of_any_reading_obeys(name, law):
 
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
+    def values(robot):
+        return [(p.name, float(p.value)) for p in params.walk_parameters(robot)]
+
     mine = robot(0.1 * jnp.asarray([laws.size(e) for e in UNNAMED.values()]), UNNAMED)
-    robot_file.write_robot(mine, tmp_path / "robot.toml")
+    write_robot(mine, tmp_path / "robot.toml")
     for library in ({}, effects.BY_NAME):
-        again = robot_file.read_robot(tmp_path / "robot.toml", library)
-        assert [(p.name, float(p.value)) for p in params.walk_parameters(again)] == [
-            (p.name, float(p.value)) for p in params.walk_parameters(mine)
-        ]
+        assert values(read_robot(tmp_path / "robot.toml", library)) == values(mine)
 
 
 def test_curve_without_a_range_is_refused(tmp_path):

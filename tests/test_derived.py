@@ -1,10 +1,10 @@
 """Derived outputs: the steepest slope and the start, against closed forms, other searches and finite differences."""
 
-import dataclasses
 import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -77,10 +77,7 @@ def test_steepest_slope_that_the_motors_end_is_where_the_robot_comes_to_stand(ro
     weak = changed(robot, **{"6T2A__ground__friction__static": 2.5})
     conditions = asked(0, 2.0, payload=8.0)
     found, settled = float(steepest_slope.compute(weak, conditions)["steepest_slope"]), eqx.filter_jit(steady)
-    status = [
-        int(settled(weak, dataclasses.replace(conditions, slope_deg=jnp.asarray(found + d))).status)
-        for d in (-1e-6, 1e-6)
-    ]
+    status = [int(settled(weak, replace(conditions, slope_deg=jnp.asarray(found + d))).status) for d in (-1e-6, 1e-6)]
     assert status == [CONVERGED, STALLED] and 0 < found < 45
 
 
@@ -95,7 +92,7 @@ def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_h
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("static", "voltage"), [(0.32, 24.0), (2.5, 2.0)])
+@pytest.mark.parametrize("static, voltage", [(0.32, 24.0), (2.5, 2.0)])
 def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltage):
     """As users' programs are compiled, and as those that run a few times are."""
     tuned = changed(robot, **{"6T2A__ground__friction__static": static})
@@ -138,14 +135,15 @@ CONDITIONS = asked(0, 24.0, slope_deg=5.0, payload=3.0)
 def test_start_is_that_of_a_run_kept_at_many_instants(robot):
     found = {k: float(v) for k, v in start_figures.compute(robot, CONDITIONS).items()}
     times = np.concatenate([np.linspace(0, 0.05, 5000, endpoint=False), np.linspace(0.05, 4.0, 40_000)])
-    run = eqx.filter_jit(drive)(robot, CONDITIONS, jnp.asarray(times), tolerance=1e-9)
-    current, speed = np.asarray(run.signals.total_current), np.asarray(run.signals.speed)
-    power = np.asarray(run.signals.voltage) * current
-    after = np.interp(0.95 * speed[-1], speed[times > 0.05], times[times > 0.05])
+    signals = eqx.filter_jit(drive)(robot, CONDITIONS, jnp.asarray(times), tolerance=1e-9).signals
+    current, speed = np.asarray(signals.total_current), np.asarray(signals.speed)
+    later = times > 0.05
+    after = np.interp(0.95 * speed[-1], speed[later], times[later])
     rows = times <= after
     assert found["peak_current"] == pytest.approx(current.max(), rel=2e-4)
     assert found["time_to_speed"] == pytest.approx(after, rel=5e-4)
-    assert found["energy_start"] == pytest.approx(np.trapezoid(power[rows], times[rows]), rel=1e-3)
+    energy = np.trapezoid((signals.voltage * current)[rows], times[rows])
+    assert found["energy_start"] == pytest.approx(float(energy), rel=1e-3)
 
 
 @pytest.mark.slow
@@ -161,7 +159,7 @@ def test_start_derivatives_are_finite_differences(robot):
 
 @pytest.mark.slow
 def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
-    steep = dataclasses.replace(CONDITIONS, slope_deg=jnp.asarray(25.0))
+    steep = replace(CONDITIONS, slope_deg=jnp.asarray(25.0))
     found = start_figures.compute(robot, steep)
     assert STATUSES[int(found["status"])] == "slides"
     assert all(np.isnan(found[n]) for n in ("peak_current", "time_to_speed", "energy_start"))
@@ -169,11 +167,9 @@ def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
 
 def test_peak_is_the_top_of_a_parabola():
     x = jnp.asarray([0.0, 0.1, 0.3, 0.5, 0.9, 1.0])  # at unequal distances
-    top = assert_allclose
-    top(start_figures.curve_peak(x, 3 - (x - 0.47) ** 2), 3.0, atol=1e-12)
-    top(
-        start_figures.curve_peak(x, jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)), 3.0, atol=1e-12
-    )  # of a run that has ended
+    ended = jnp.where(x < 0.8, 3 - (x - 0.37) ** 2, jnp.nan)  # of a run that has ended
+    for y in (3 - (x - 0.47) ** 2, ended):
+        assert_allclose(start_figures.curve_peak(x, y), 3.0, atol=1e-12)
     # A current that its limit holds: no overshoot between the samples at the corner.
     held = jnp.minimum(30 * x, 1.5 - 1e-3 * x)
     assert float(start_figures.curve_peak(x, held, 1.5)) == pytest.approx(1.5, abs=1e-3)
@@ -193,8 +189,10 @@ def test_crossing_is_exact_for_a_cubic():
 
 @pytest.mark.slow
 def test_steps_of_a_posture_and_of_any_are_those_of_the_static_limits(robot):
-    found = pitch_and_step.compute(robot, asked(0, 24.0, payload=8.0, levers_front_deg=-30.0, levers_rear_deg=180.0))
-    assert math.degrees(float(found["pitch"])) == pytest.approx(8.57, abs=0.01)
-    assert float(found["highest_step"]) < float(found["best_step"]) == pytest.approx(0.2456, abs=1e-4)
-    folded = pitch_and_step.compute(robot, asked(0, 24.0, payload=8.0))
-    assert float(folded["pitch"]) == 0 and float(folded["highest_step"]) == pytest.approx(0.0671, abs=1e-4)
+    raised, folded = (
+        {name: float(x) for name, x in pitch_and_step.compute(robot, asked(0, 24.0, payload=8.0, **levers)).items()}
+        for levers in ({"levers_front_deg": -30.0, "levers_rear_deg": 180.0}, {})
+    )
+    assert math.degrees(raised["pitch"]) == pytest.approx(8.57, abs=0.01) and folded["pitch"] == 0
+    assert raised["highest_step"] < raised["best_step"] == pytest.approx(0.2456, abs=1e-4)
+    assert folded["highest_step"] == pytest.approx(0.0671, abs=1e-4)

@@ -10,11 +10,11 @@ from calibration.discovery.loop_notes import MissedChannel, MissingEffect, Verdi
 from calibration.discovery.verdict import missed_channels, remaining_errors, unused_inputs
 from calibration.inference.blocks import predictable_blocks
 from calibration.inference.observers import Histories
-from calibration.words import loop_words
-from mmrjax.model import channels
+from calibration.words.loop_words import verdict_sentences
+from mmrjax.model.channels import find_channel
 
 ROWS, SD = 40, 0.02
-CURRENT, SPEED = channels.find_channel("total_current"), channels.find_channel("motor_speed")
+CURRENT, SPEED = find_channel("total_current"), find_channel("motor_speed")
 
 
 class Sized(SimpleNamespace):
@@ -42,7 +42,7 @@ def judged(refit, sd=SD, source="columns", outlier=False):
 
 
 @pytest.mark.parametrize(
-    ("said", "options"),
+    "said, options",
     [
         ((), {"refit": 0.48}),
         (("total_current",), {"refit": 0.52}),
@@ -57,7 +57,7 @@ def test_a_model_that_misses_a_quarter_of_a_channel_does_not_describe_the_runs(s
 
 
 @pytest.mark.parametrize(
-    ("refit", "found", "noise", "remains"),
+    "refit, found, noise, remains",
     [
         (0.54, 0.20, 0.0, 0.10),  # a lifted wheel: 27 %, where one effect leaves 10 %
         (0.54, 0.28, 0.0, None),  # less than half of the error is gone
@@ -99,7 +99,7 @@ def test_a_run_without_others_is_held_out_in_parts_of_its_time(configurations, m
 
 def test_the_first_sentence_has_the_error_that_remains():
     law = MissingEffect(("windage",), (), ("loss torque that changes with speed",))
-    said = loop_words.verdict_sentences(
+    said = verdict_sentences(
         VerdictSummary("named", 0.002, None, (law,), missed=(MissedChannel("total_current", 0.104, 0.0),))
     )
     assert "on unseen runs it still misses total current by 10 % of its measured rms" in said.split(". ")[0]
@@ -109,7 +109,7 @@ def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
     extras = {"brake_Nm": np.linspace(0, 1, 4), "constant": np.ones(4), "who": np.array(list("abab"))}
     assert unused_inputs(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
     missed = (MissedChannel("total_current", 0.484, 0.02),)
-    said = loop_words.verdict_sentences(
+    said = verdict_sentences(
         VerdictSummary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
     )
     assert said == (

@@ -1,6 +1,6 @@
 """The closed loop on synthetic tables: verdicts, what it sets aside, its statistics against a second implementation."""
 
-import dataclasses
+from dataclasses import replace
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy import stats
 from synthetic import FEW, SETTLED, known, parts, small, table
@@ -16,8 +17,8 @@ from worlds import settled, tables
 from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import scales
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
-from calibration.inference import bases
-from calibration.inference.held_out import hold_out_blocks
+from calibration.inference.bases import Basis
+from calibration.inference.blocks import hold_out_blocks
 from calibration.inference.linearization import PROBED, amplitude_of, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
@@ -56,11 +57,11 @@ def classes(traced):
 def changed(runs, column, row, by):
     values = runs[column].copy()
     values[row] += by
-    return dataclasses.replace(runs, columns=runs.columns | {column: values})
+    return replace(runs, columns=runs.columns | {column: values})
 
 
 def joined(runs, more):
-    return dataclasses.replace(runs, columns={k: np.concatenate([v, more[k]]) for k, v in runs.columns.items()})
+    return replace(runs, columns={k: np.concatenate([v, more[k]]) for k, v in runs.columns.items()})
 
 
 def set_aside(traced):
@@ -72,26 +73,22 @@ def set_aside(traced):
 
 def test_clean_table_lacks_nothing(clean):
     found = clean.traced
-    assert found.verdict == "none" and found.members == () and found.searched is None
-    assert found.where is None and found.standing is None and found.families == ()
+    assert found.verdict == "none" and found.members == found.families == ()
+    assert found.searched is found.where is found.standing is None
     assert found.best is clean.base and found.ends is clean.left and set_aside(found) == ((), ())
     assert clean.left.test.p_value > 0.05
     # χ² of readings and priors is what noise leaves of as many readings
-    readings = 3 * len(clean.runs)
+    readings, null = 3 * len(clean.runs), clean.left.test.null
     assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
-    null = clean.left.test.null
     assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
 
 
 def test_two_effects_are_both_found(looks):
-    found = looks.analyst.trace(
-        table(tables.narrow(["series_resistance", "mass_offset"], 12.0, seed=3, grid=looks.grid))
-    )
-    both = classes(found)
-    assert len(both) == 2
-    resistance = next(c for c in both if "series_resistance" in c)
-    assert "supply_sag" in resistance  # a common and a private resistance: one current flows in both
-    assert "mass_offset" in next(c for c in both if c is not resistance)
+    case = tables.narrow(["series_resistance", "mass_offset"], 12.0, seed=3, grid=looks.grid)
+    found = looks.analyst.trace(table(case))
+    resistance, mass = sorted(classes(found), key=lambda c: "mass_offset" in c)
+    # a common and a private resistance: one current flows in both
+    assert {"series_resistance", "supply_sag"} <= resistance and "mass_offset" in mass
     assert found.verdict == "class"
 
 
@@ -135,7 +132,7 @@ def test_rows_beyond_the_model_are_kept_out(clean, looks):
 @pytest.mark.slow
 def test_order_of_rows_does_not_matter(churning, looks):
     runs, before = churning.runs, churning.traced
-    found = looks.analyst.trace(runs.where(np.random.default_rng(0).permutation(len(runs))))
+    found = looks.analyst.trace(runs.where(default_rng(0).permutation(len(runs))))
     assert found.verdict == before.verdict and classes(found) == classes(before)
     assert_allclose(found.screened.base.candidate.cost, churning.base.cost, rtol=1e-5)
     assert_allclose(found.left.scores.single, before.left.scores.single, atol=0.02)
@@ -164,8 +161,8 @@ def test_held_out_readings_are_those_of_a_refit_without_the_block(clean, looks):
     seen = observe_at(fitted.space.bare, jnp.asarray(brute.candidate.z[: brute.space.free]))
     expected = np.asarray(seen.reading)[: len(runs)]
     assert out.converged.all() and block.sum() in (4, 6) and np.isnan(out.reading[~block]).all()
-    assert (np.abs(out.reading - expected)[block] < 0.05 * sd[block]).all()
-    assert (np.abs(fitted.reading[: len(runs)] - expected)[block] > sd[block]).any()
+    off, off_if_seen = (np.abs(x[: len(runs)] - expected)[block] / sd[block] for x in (out.reading, fitted.reading))
+    assert (off < 0.05).all() and (off_if_seen > 1).any()
 
 
 @pytest.mark.slow
@@ -177,8 +174,8 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
     names, shapes = [e.name for e in library], [free_shape_parameter(e) for e in library]
     unit = jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in library])
     instances = tuple(with_shape_grid(e, (-1.5, 0.75)) for e in library)
-    robot = dataclasses.replace(problem.robot(z), effects=library)
-    linear = jax.jit(lambda z: problem.observe.linearise(problem, z, problem.data, instances))(z)
+    robot = replace(problem.robot(z), effects=library)
+    linear = jax.jit(lambda z: problem.observe.linearise(problem, z, instances))(z)
 
     @jax.jit
     @jax.jacfwd
@@ -186,7 +183,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
         there = {f"effects.{n}.amplitude": a for n, a in zip(names, amplitude * unit, strict=True)}
         there |= {f"effects.{n}.{s.name}": v for n, s, v in zip(names, shapes, values, strict=True) if s}
         seen = problem.observe(params.replace(robot, there))
-        return problem.whitened(seen, problem.data)[: problem.data.measured.size]
+        return problem.whitened(seen)[: problem.data.measured.size]
 
     first = np.cumsum([0, *(len(c.at) for c in instances)])[:-1]
     for point in (0, 1):
@@ -205,7 +202,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
 @pytest.fixture(scope="module")
 def toy():
     """A linear problem of 8 rows and 4 coordinates with 5 instances and two curves."""
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     rows, p = 8, 4
     jacobian = np.concatenate([rng.standard_normal((3 * rows, p)), np.zeros((rows, p)), np.eye(p)])
     e = np.concatenate([rng.standard_normal(3 * rows), np.zeros(rows), rng.standard_normal(p)])
@@ -213,8 +210,8 @@ def toy():
     signatures[:, 3] = 2 * signatures[:, 0] + 1e-3 * signatures[:, 3]  # look-alikes
     defects = rng.standard_normal((len(PROBED), rows, 3))
     columns = rng.standard_normal((2, rows, 3))
-    basis = bases.Basis.of(columns, (("electrical", "a"), ("track", "b")))
-    shown = bases.Basis.of(columns, (("speed", "a"), ("total_current", "b")))
+    basis = Basis.of(columns, (("electrical", "a"), ("track", "b")))
+    shown = Basis.of(columns, (("speed", "a"), ("total_current", "b")))
     scale = rng.uniform(0.5, 2.0, (rows, 3))
     linear = SettledLinearization(
         *map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None, channels=channels.USUAL
@@ -224,22 +221,25 @@ def toy():
     )
 
 
+def long(linear, columns):
+    """Columns over the readings, and zeros over the priors."""
+    return np.pad(columns, ((0, len(linear.residual) - len(columns)), (0, 0)))
+
+
 def left(linear, columns):
     """What a least-squares fit of the free coordinates leaves of columns over the readings."""
-    jacobian = np.asarray(linear.jacobian)
-    long = np.concatenate([columns, np.zeros((len(jacobian) - len(columns), columns.shape[1]))])
-    return long - jacobian @ np.linalg.lstsq(jacobian, long, rcond=None)[0]
+    jacobian, columns = np.asarray(linear.jacobian), long(linear, columns)
+    return columns - jacobian @ np.linalg.lstsq(jacobian, columns, rcond=None)[0]
 
 
 def fall(linear, columns):
     """Fall of the sum of squares when columns over the readings are fitted beside the free coordinates."""
     e, jacobian = np.asarray(linear.residual), np.asarray(linear.jacobian)
-    long = np.concatenate([columns, np.zeros((len(jacobian) - len(columns), columns.shape[1]))])
 
     def squares(a):
         return float(np.sum((e - a @ np.linalg.lstsq(a, e, rcond=None)[0]) ** 2))
 
-    return squares(jacobian) - squares(np.concatenate([jacobian, long], 1))
+    return squares(jacobian) - squares(np.concatenate([jacobian, long(linear, columns)], 1))
 
 
 def test_scores_are_falls_of_the_sum_of_squares(toy):
@@ -286,9 +286,7 @@ def test_column_within_the_fit_scores_nothing(toy):
     """A signature that the free coordinates make by themselves, but for their priors' share, has no score."""
     linear = toy.linear
     inside = np.asarray(linear.jacobian)[:24] @ np.ones((4, 1))
-    flat = dataclasses.replace(
-        linear, jacobian=linear.jacobian.at[-4:].multiply(1e-6), signatures=jnp.asarray(inside)
-    )
+    flat = replace(linear, jacobian=linear.jacobian.at[-4:].multiply(1e-6), signatures=jnp.asarray(inside))
     scores = score_tests(flat, ())
     assert scores.single[0] == scores.amplitude[0] == 0 < abs(toy.scores.single).min()
 

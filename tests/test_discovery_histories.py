@@ -1,13 +1,14 @@
 """The closed loop on synthetic histories: verdicts, and its linear algebra against differentiated runs."""
 
-import dataclasses
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy import stats
 from synthetic import STATED, Analyst, known, parts, table
@@ -20,7 +21,8 @@ from calibration.discovery.discrepancy import fit_discrepancy, locate_discrepanc
 from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.standing import judge_names
-from calibration.inference import bases, noise
+from calibration.inference import noise
+from calibration.inference.bases import BALANCES, Basis
 from calibration.inference.linearization import PROBED, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
@@ -32,7 +34,7 @@ from mmrjax.model import params
 SEARCHED = ("rotating_inertia", "series_resistance", "churning", "grouser_polygon", "pulley_eccentricity")
 #: All histories have the same instants, and share what is compiled.
 ANALYST = Analyst(
-    dataclasses.replace(settings_for(Histories, 300), slots=1),
+    replace(settings_for(Histories, 300), slots=1),
     {n: BY_NAME[n] for n in SEARCHED},
     STATED | {f"{c}.ground.friction.dynamic": (0.48, 0.08) for c in ("6T2A", "4W2T")},
 )
@@ -57,24 +59,16 @@ def clean(runs):
     return parts(runs, ANALYST.trace(runs))
 
 
-#: One effect, which remembers and has a shape, for what needs no fit.
-ONE = dataclasses.replace(ANALYST, library={"pulley_eccentricity": BY_NAME["pulley_eccentricity"]})
-
-
-@pytest.fixture(scope="module", params=[pytest.param(x, marks=pytest.mark.slow) for x in ("prior", "fitted")])
-def seen(request, runs):
-    """Runs, space, coordinates and the linear model there: at the prior's mean, and where the loop's fit ends."""
-    if request.param == "fitted":
-        clean = request.getfixturevalue("clean")
-        z, linear, space = clean.base.z[: clean.space.free], clean.left.linear, clean.space
-    else:
-        space = ONE.space(runs)
-        z = np.zeros(space.free)
-        posed, scored_ = space.bare, space.library.scored
-        linear = jax.jit(lambda z: posed.observe.linearise(posed, z, posed.data, scored_))(jnp.asarray(z))
+@pytest.fixture(scope="module")
+def seen(runs, clean):
+    """Runs, space, coordinates and the linear model where the loop's fit ends."""
+    space, z = clean.space, clean.base.z[: clean.space.free]
     # Without the run that is already known, because robots with other effects are simulated here.
-    problem = dataclasses.replace(space.bare, observe=dataclasses.replace(space.bare.observe, known=None))
-    return SimpleNamespace(runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=linear)
+    problem = replace(space.bare, observe=replace(space.bare.observe, known=None))
+    read = jax.jit(lambda r: problem.whitened(problem.observe(r))[: problem.data.measured.size])
+    return SimpleNamespace(
+        runs=runs, space=space, problem=problem, z=jnp.asarray(z), linear=clean.left.linear, read=read
+    )
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +137,7 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     """To the simulated fit."""
     run, scored = oval.traced.run, oval.space.library.scored
     posed, z = run.space.bare, jnp.asarray(run.base.z[: run.space.free])
-    before = posed.observe.linearise(posed, z, posed.data, scored)
+    before = posed.observe.linearise(posed, z, scored)
     curve = fit_discrepancy(run.space, run.base, before, "track", "order 2 of the driving shaft")
     assert (
         curve.converged and curve.effect == "wave_track" and isinstance(curve.robot.effects[0], UNNAMED["wave_track"])
@@ -168,111 +162,104 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
 def test_sample_that_stands_alone_is_an_outlier(clean):
     speed = clean.runs["speed_mm_s"].copy()
     speed[[57, 130]] += 12 * clean.runs["speed_sd_mm_s"][57]
-    found = ANALYST.discover(dataclasses.replace(clean.runs, columns=clean.runs.columns | {"speed_mm_s": speed}))
+    found = ANALYST.discover(replace(clean.runs, columns=clean.runs.columns | {"speed_mm_s": speed}))
     assert set(found.outliers) == {58, 131} and found.verdict == "none"
 
 
 # --- linear algebra ----------------------------------------------------------------------------------
 
 
+def difference(seen, effect, size):
+    """Whitened readings per amplitude of an effect, by runs with it and with its opposite."""
+    ahead, behind = (
+        seen.read(replace(seen.problem.robot(seen.z), effects=(replace(effect, amplitude=jnp.asarray(s)),)))
+        for s in (size, -size)
+    )
+    return np.asarray(ahead - behind) / (2 * size)
+
+
 @pytest.mark.slow
 def test_signatures_are_differences_of_runs(seen):
     """At the first and the last point of each shape's grid, through everything that an effect remembers."""
-    problem, linear, library = seen.problem, seen.linear, seen.space.library
-    robot = problem.robot(seen.z)
-    read = jax.jit(lambda r: problem.whitened(problem.observe(r), problem.data)[: problem.data.measured.size])
+    linear, library = seen.linear, seen.space.library
     for k, instances in enumerate(library.scored):
         mine = np.flatnonzero(library.of == k)
         for point in {0, len(instances.at) - 1}:
             effect = instances.effect
             if instances.shape:
                 effect = params.replace(effect, {instances.shape: jnp.asarray(instances.values[point])})
-            sides = [
-                dataclasses.replace(
-                    robot, effects=(dataclasses.replace(effect, amplitude=jnp.asarray(s * effect.amplitude)),)
-                )
-                for s in (1e-3, -1e-3)
-            ]
-            expected = np.asarray(read(sides[0]) - read(sides[1])) / 2e-3
-            got = np.asarray(linear.signatures)[:, mine[point]]
-            assert np.linalg.norm(got - expected) < 5e-3 * np.linalg.norm(expected), (effect.name, point)
+            size = float(effect.amplitude)
+            expected = size * difference(seen, effect, 1e-3 * size)
+            off = np.asarray(linear.signatures)[:, mine[point]] - expected
+            assert np.linalg.norm(off) < 5e-3 * np.linalg.norm(expected), (effect.name, point)
 
 
-@pytest.mark.parametrize(
-    "balance", [b if b == "track" else pytest.param(b, marks=pytest.mark.slow) for b in bases.BALANCES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("balance", BALANCES)
 def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
     """A defect over time, laid through the samples, against the curve effect that is the same over time."""
-    problem, z, linear = seen.problem, seen.z, seen.linear
-    effect = UNNAMED[f"curve_{balance}_time"]
-    shape = {"low": 0.0, "high": 0.8, "y0": 0.5, "y1": 0.7, "y2": 0.9, "y3": 1.0, "y4": 1.2, "y5": 0.8}
+    linear, effect = seen.linear, UNNAMED[f"curve_{balance}_time"]
+    y = np.array([0.5, 0.7, 0.9, 1.0, 1.2, 0.8])
+    shape = {"low": 0.0, "high": 0.8} | {f"y{k}": x for k, x in enumerate(y)}
     size = 1e-3 * effect().amplitude + 1e-3 * {"electrical": 1.0, "track": 0.2, "ground": 4.0, "slip": 0.05}[balance]
-    read = jax.jit(lambda r: problem.whitened(problem.observe(r), problem.data)[: problem.data.measured.size])
     made = params.replace(effect(), {k: jnp.asarray(v) for k, v in shape.items()})
-    sides = [
-        dataclasses.replace(problem.robot(z), effects=(dataclasses.replace(made, amplitude=jnp.asarray(s * size)),))
-        for s in (1, -1)
-    ]
-    expected = np.asarray(read(sides[0]) - read(sides[1])) / (2 * float(size))
-    y = jnp.asarray([shape[f"y{k}"] for k in range(6)])
-    along = np.asarray(linear.signals.direction if balance != "ground" else linear.signals.direction_travel)
-    over_time = np.asarray(ordinate_weights(linear.time, 0.0, 0.8) @ y) * along
+    expected = difference(seen, made, float(size))
+    along = linear.signals.direction if balance != "ground" else linear.signals.direction_travel
+    over_time = (ordinate_weights(linear.time, 0.0, 0.8) @ y) * along
     got = np.asarray(linear.columns(PROBED.index(balance), jnp.asarray(over_time[:, None])))[:, 0]
     # linear between samples 20 ms apart; at the start the direction rises within the first of them
     assert np.linalg.norm(got - expected) < 0.05 * np.linalg.norm(expected)
     assert np.linalg.norm(expected) > 0
 
 
+def is_of_noise(null, readings):
+    """χ² of tables drawn from a fit and fitted again is that of as many readings."""
+    of_noise = stats.chi2(readings).cdf
+    assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
+    assert stats.kstest(null.chi2, of_noise).pvalue > 0.01
+    assert stats.kstest(1.1 * null.chi2, of_noise).pvalue < 0.01  # the test can fail
+
+
+@pytest.mark.slow
 def test_bootstrap_leaves_what_noise_leaves(seen):
-    """χ² of tables drawn from the fit and fitted again linearly."""
     share = np.asarray(seen.linear.time) / 0.8
-    over_time = bases.Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
+    over_time = Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
     effects = seen.space.library.scored
     null = bootstrap_statistics(seen.problem, np.asarray(seen.z), seen.linear, effects, (over_time,), 100, 0)
-    readings = 3 * len(seen.runs)
-    assert len(null.chi2) > 90 and abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
-    assert stats.kstest(null.chi2, stats.chi2(readings).cdf).pvalue > 0.01
-    assert stats.kstest(1.1 * null.chi2, stats.chi2(readings).cdf).pvalue < 0.01  # the test can fail
+    assert len(null.chi2) > 90
+    is_of_noise(null, 3 * len(seen.runs))
 
 
 @pytest.mark.slow
 def test_linear_bootstrap_is_that_of_refits(clean):
     """Statistics of replicates by the linear refit, against a few histories drawn and fitted again in full."""
-    null = clean.left.test.null
+    is_of_noise(clean.left.test.null, 3 * len(clean.runs))
     problem, z = clean.space.bare, jnp.asarray(clean.base.z[: clean.space.free])
-    key = jax.random.key(3)
-    draw = jax.random.normal(key, (6, *problem.data.measured.shape))
+    draw = jax.random.normal(jax.random.key(3), (6, *problem.data.measured.shape))
     clean_reading = problem.observation(z).reading
 
-    def chi2(noise_):
-        data = dataclasses.replace(problem.data, measured=clean_reading + problem.data.sd * noise_, centre=z)
-        back = levenberg_marquardt(problem, z, data, max_steps=6)[0].z
-        return jnp.sum(problem.misfit(back, data) ** 2) + jnp.sum((back - z) ** 2), jnp.sum(noise_**2)
+    def taken(noise_):
+        drawn = problem.with_data(measured=clean_reading + problem.data.sd * noise_, centre=z)
+        back = levenberg_marquardt(drawn, z, max_steps=6)[0].z
+        return jnp.sum(noise_**2) - jnp.sum(drawn.misfit(back) ** 2) - jnp.sum((back - z) ** 2)
 
-    after, before = jax.jit(lambda d: jax.lax.map(chi2, d))(draw)
-    taken = np.asarray(before - after)  # what a refit of so many parameters takes
-    p = len(problem.coordinates)
-    assert (taken > 0).all() and taken.mean() < p
-    readings = 3 * len(clean.runs)
-    assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
-    assert stats.kstest(null.chi2, stats.chi2(readings).cdf).pvalue > 0.01
+    of_refit = np.asarray(jax.jit(lambda d: jax.lax.map(taken, d))(draw))
+    assert (of_refit > 0).all() and of_refit.mean() < len(problem.coordinates)
 
 
+@pytest.mark.slow
 def test_memory_tells_noise_from_what_remembers(seen):
-    linear = seen.linear
-    rng = np.random.default_rng(0)
-    rows = np.asarray(linear.rows_of)
-    whole = np.asarray(linear.residual).size
+    linear, rng = seen.linear, default_rng(0)
 
     def of(x):
-        residual = np.zeros(whole)
-        residual[: 3 * linear.rows] = np.asarray(x).ravel()
-        return float(linear.with_residual(jnp.asarray(residual)).memory())
+        residual = np.zeros(linear.residual.size)
+        residual[: 3 * linear.rows] = x.ravel()
+        return float(replace(linear, residual=jnp.asarray(residual)).memory())
 
     white = [of(rng.standard_normal((linear.rows, 3))) for _ in range(60)]
     assert -1.0 < np.mean(white) < 2.0 and np.quantile(white, 0.95) < 5.0
     slow = rng.standard_normal((linear.rows, 3))
-    for run in rows:
+    for run in np.asarray(linear.rows_of):
         for a, b in itertools.pairwise(run):
             slow[b, 1] = 0.85 * slow[a, 1] + 0.53 * slow[b, 1]
     assert of(slow) > 2 * np.max(white) > 0
@@ -281,14 +268,14 @@ def test_memory_tells_noise_from_what_remembers(seen):
 @pytest.mark.slow
 def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs, robot):
     short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
-    mixed = short.where(np.random.default_rng(0).permutation(len(short)))
-    observer = Histories.of(mixed, robot)
-    times, names = mixed["time_s"], mixed["run_id"]
-    for k, name in enumerate(np.unique(names)):
-        there = times[np.asarray(observer.knots[k])]
+    mixed = short.where(default_rng(0).permutation(len(short)))
+    observer, times, names = Histories.of(mixed, robot), mixed["time_s"], mixed["run_id"]
+    for name, knots, row in zip(
+        np.unique(names), np.asarray(observer.knots), np.asarray(observer.rows_of), strict=True
+    ):
+        there = times[knots]
         assert (np.diff(there) >= 0).all() and there[-1] == times[names == name].max()
-        assert set(names[np.asarray(observer.knots[k])]) == {name}
-        row = np.asarray(observer.rows_of[k])
+        assert set(names[knots]) == {name}
         assert (np.diff(times[row[row >= 0]]) > 0).all() and (row >= 0).sum() == (names == name).sum()
 
 

@@ -1,6 +1,6 @@
 """Discrepancies outside the library: their curve, the robot that has it, and the formula that is proposed."""
 
-import dataclasses
+from dataclasses import replace
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import SETTLED, table
 from test_implausible import unnamed
 from worlds import settled, tables
 
-from calibration.data import robot_file
-from calibration.discovery import discrepancy, formula, outliers
+from calibration.data.robot_file import load_robot, write_robot
+from calibration.discovery import discrepancy, outliers
 from calibration.discovery.discrepancy import (
     BaseCurve,
     fit_discrepancy,
@@ -22,18 +23,20 @@ from calibration.discovery.discrepancy import (
     refine_window,
     similar_variables,
 )
+from calibration.discovery.formula import MOST, RATIOS, SYMBOL, Monomial, monomial_dictionary, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.projection import balance_error_by_row
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import fit_smooth_curve
-from calibration.inference import bases
-from calibration.inference.held_out import hold_out_blocks
+from calibration.inference.bases import BALANCES, OF_TURNS
+from calibration.inference.blocks import hold_out_blocks
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.words import loop_words
 from mmrjax.effects.curve import PLACES
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import channels, params
+from mmrjax.model import channels
+from mmrjax.model.params import walk_parameters
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}
@@ -106,43 +109,38 @@ def test_curve_lowers_the_error_at_slopes_that_were_not_seen(found):
 
 
 def test_blocks_that_are_left_out_are_not_seen(found):
-    first = np.arange(len(found.runs)) < 20
-    spoilt = found.what.problem.data.measured.at[:20].add(1e3)
-    other = dataclasses.replace(
-        found.what,
-        problem=dataclasses.replace(
-            found.what.problem, data=dataclasses.replace(found.what.problem.data, measured=spoilt)
-        ),
-    )
-    a, b = (hold_out_blocks(w.problem, w.z, [first]).reading for w in (found.what, other))
+    first, problem = np.arange(len(found.runs)) < 20, found.what.problem
+    spoilt = replace(problem, data=replace(problem.data, measured=problem.data.measured.at[:20].add(1e3)))
+    a, b = (hold_out_blocks(p, found.what.z, [first]).reading for p in (problem, spoilt))
     assert_array_equal(a, b)
     assert np.isnan(a[20:]).all()
 
 
+def written_and_read(robot, folder):
+    write_robot(robot, folder / "robot.toml", note="a discrepancy without a name")
+    return load_robot(str(folder / "robot.toml"))
+
+
+def readings_of(robot, runs):
+    reading = steady_batch(robot, runs.conditions(robot)).reading
+    return jnp.stack([reading[name] for name in channels.USUAL], -1)
+
+
 def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
-    path = tmp_path / "robot.toml"
-    robot_file.write_robot(found.what.robot, path, note="a discrepancy without a name")
-    robot = robot_file.load_robot(str(path))
-    assert (
-        [e.name for e in robot.effects]
-        == [found.what.effect]
-        == [f"curve_{found.what.balance}_{found.what.variable}"]
-    )
-    assert {p.name: float(p.value) for p in params.walk_parameters(robot)} == {
-        p.name: float(p.value) for p in params.walk_parameters(found.what.robot)
-    }
-    reading = steady_batch(robot, found.runs.conditions(robot)).reading
-    seen = jnp.stack([reading[name] for name in channels.USUAL], -1)
-    assert_allclose(seen, found.what.reading[: len(found.runs)], rtol=1e-10)
+    what, robot = found.what, written_and_read(found.what.robot, tmp_path)
+    assert [e.name for e in robot.effects] == [what.effect] == [f"curve_{what.balance}_{what.variable}"]
+    now, then = ({p.name: float(p.value) for p in walk_parameters(r)} for r in (robot, what.robot))
+    assert now == then
+    assert_allclose(readings_of(robot, found.runs), what.reading[: len(found.runs)], rtol=1e-10)
 
 
 def test_defect_of_each_row_shows_the_discrepancy(found):
     """Its rows scatter about the truth, less what the free parameters absorb of it, by their sds."""
     shown, rows = found.what.defect, len(found.runs)
-    k = PROBED.index(found.what.balance)
-    change = np.zeros_like(np.asarray(found.linear.defects)[k])
-    change[:rows] = np.asarray(found.linear.defects)[k][:rows] * found.term[:, None]
-    residual = np.zeros_like(np.asarray(found.linear.residual))
+    change = np.array(found.linear.defects)[PROBED.index(found.what.balance)]
+    change[:rows] *= found.term[:, None]
+    change[rows:] = 0
+    residual = np.zeros_like(found.linear.residual)
     residual[: change.size] = -change.ravel()
     clean = eqx.tree_at(lambda linear: linear.residual, found.linear, residual)
     expected = balance_error_by_row(clean, found.what.balance).value[:rows]
@@ -153,47 +151,42 @@ def test_defect_of_each_row_shows_the_discrepancy(found):
 
 def test_formula_finds_the_variable(found):
     """One term where a term explains the curve. No term does for a step of the voltage, which words describe."""
-    proposal = found.what.proposal
-    if found.what.balance == "electrical":
+    what, proposal = found.what, found.what.proposal
+    if what.balance == "electrical":
         seen = SimpleNamespace(
-            window=None, variable=found.what.variable, at=found.what.grid, value=found.what.curve, unit="V",
-            proposal=proposal,
-        )  # fmt: skip
+            window=None, variable=what.variable, at=what.grid, value=what.curve, unit="V", proposal=proposal
+        )
         assert not proposal.terms and loop_words.proposed_formula(seen).startswith("The curve rises from ")
         return
-    assert found.what.variable in proposal.variables
+    assert what.variable in proposal.variables
     assert len(proposal.terms) == 1 and proposal.mark == "a proposal, not a finding"
-    curve = fit_smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
-    assert proposal.explained >= formula.MOST * curve.explained > 100
+    curve = fit_smooth_curve(found.linear, what.balance, what.variable, found.space.included)
+    assert proposal.explained >= MOST * curve.explained > 100
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
-    unit = found.what.unit
-    assert proposal.expression.startswith(formula.SYMBOL[found.what.balance] + " = ")
-    assert proposal.expression.count(f" {unit} (") == len(proposal.terms)
+    assert proposal.expression.startswith(SYMBOL[what.balance] + " = ")
+    assert proposal.expression.count(f" {what.unit} (") == len(proposal.terms)
 
 
 @pytest.mark.slow
 def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_path):
     found = unnamed()
-    what, path = found.unnamed, tmp_path / "robot.toml"
+    what = found.unnamed
     assert found.chi2[0] - found.chi2[1] == pytest.approx(what.score) and what.score > 50
     assert found.after.adequate and not found.before.adequate
     assert what.at.shape == what.value.shape == what.sd.shape and (what.sd > 0).all()
     assert np.abs(what.value / what.sd).max() > 5
-    robot_file.write_robot(found.robot, path, note="a discrepancy without a name")
-    robot = robot_file.load_robot(str(path))
+    robot = written_and_read(found.robot, tmp_path)
     assert [e.name for e in robot.effects] == [what.effect]
-    reading = steady_batch(robot, found.runs.conditions(robot)).reading
-    seen = np.stack([np.asarray(reading[name]) for name in channels.USUAL], -1)
-    assert_allclose(seen, found.readings_of_rows.after, rtol=1e-9)
+    assert_allclose(readings_of(robot, found.runs), found.readings_of_rows.after, rtol=1e-9)
 
 
 # --- the dictionary -------------------------------------------------------------------------------------
 
 
 def test_dictionary_holds_only_what_is_safe():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     ratios = np.stack([rng.uniform(*b, 40) for b in ((0.5, 1.5), (-1, 1), (0, 2), (1, 1), (0.5, 2))], 1)
-    known = formula.monomial_dictionary(ratios)
+    known = monomial_dictionary(ratios)
     powers = {k: {p for m in known for j, p in m.factors if j == k} for k in range(5)}
     assert -1.0 in powers[0] and 0.5 in powers[0]
     assert not {-1.0, 0.5} & powers[1]  # of either sign
@@ -204,26 +197,26 @@ def test_dictionary_holds_only_what_is_safe():
 
 
 def test_dictionary_holds_no_monomial_twice():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     one = rng.uniform(0.5, 1.5, 40)
     ratios = np.stack([one, 2 * one, *rng.uniform(0.5, 1.5, (3, 40))], 1)
-    assert not any(m.variables == ("current",) for m in formula.monomial_dictionary(ratios))  # as ω_m, which is first
+    assert not any(m.variables == ("current",) for m in monomial_dictionary(ratios))  # as ω_m, which is first
 
 
 def test_formula_reads_as_text():
-    scaled = tuple(r.scaled(np.array([0.0, -x])) for r, x in zip(formula.RATIOS, (731.0, 1.9, 24.0), strict=False))
-    product = formula.Monomial(((1, 2.0), (2, 1.0)), scaled)
+    scaled = tuple(r.scaled(np.array([0.0, -x])) for r, x in zip(RATIOS, (731.0, 1.9, 24.0), strict=False))
+    product = Monomial(((1, 2.0), (2, 1.0)), scaled)
     assert str(product) == "(I/2 A)^2 (U/20 V)" and product.variables == ("current", "voltage")
 
 
 def test_every_place_of_a_curve_has_a_symbol():
-    assert set(formula.SYMBOL) == set(PLACES) >= {*bases.BALANCES, *bases.OF_TURNS, *(c.name for c in channels.EVERY)}
+    assert set(SYMBOL) == set(PLACES) >= {*BALANCES, *OF_TURNS, *(c.name for c in channels.EVERY)}
 
 
 def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
     curve = fit_smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
-    proposal = formula.propose_formula(blind, found.what.balance, found.space.included, curve)
+    proposal = propose_formula(blind, found.what.balance, found.space.included, curve)
     assert proposal.expression == "" and proposal.terms == ()
     assert np.isnan(balance_error_by_row(blind, found.what.balance).value).all()
 
@@ -241,7 +234,7 @@ def test_variables_over_which_a_curve_is_as_improbable_are_told():
 
 def test_a_window_is_refined_to_its_rows():
     """Eighty settled rows, of which 13 to 24 lack something in one balance. Coarse windows begin every 2.5 rows."""
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     rows, p = 80, 4
     defects = rng.standard_normal((len(PROBED), rows, 3))
     inside = (np.arange(rows) >= 13) & (np.arange(rows) <= 24)

@@ -50,7 +50,7 @@ def space(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("name", "amplitude", "supplies"),
+    "name, amplitude, supplies",
     [
         ("backdriving_loss", -0.2, False),  # 0.8 · 1.2 of the load's torque gets to the motor
         ("backdriving_loss", -0.3, True),  # 0.8 · 1.3

@@ -1,67 +1,76 @@
 """Reports as documents: page, terminal and CSV show the same cells. One text of each document is kept."""
 
 import csv
-import dataclasses
 import importlib
 import io
 import json
 import re
 import urllib.parse
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from pages import Tables, as_text, drawn, outside, recorded
 
-from calibration.data import requirements_file, settling
-from calibration.data import runs as records
+from calibration.data import settling
+from calibration.data.requirements_file import parse_requirements
 from calibration.data.robot_file import RobotFile
+from calibration.data.runs import Runs, read_runs
 from calibration.inference.conduct import rows_after_steps
-from calibration.sizing import sheet
 from calibration.sizing.design_search import SizedDesign, SizingResult
 from calibration.sizing.part_options import drive_options, packaged_cells
+from calibration.sizing.sheet import ParameterChange, RequirementOutcome
 from mmrjax.model import channels
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
 from sweeps.inputs import recorded_fit
-from sweeps.report import catalogue, check_report, comparison_report, page_renderer, settle_report, terminal_renderer
-from sweeps.report.check_report import CheckResult, SizeResult
-from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
+from sweeps.report import catalogue, settle_report
+from sweeps.report.check_report import CheckResult, SizeResult, check_document, size_document
+from sweeps.report.comparison_report import (
+    Comparison,
+    _over_time,
+    compare_readings,
+    comparison_document,
+)
 from sweeps.report.document import Cell, Column, Document, Note, Section, Table, remarks
+from sweeps.report.page_renderer import write_report_page
+from sweeps.report.terminal_renderer import print_document
 
 
 def outcomes():
     """A requirement that is met, one missed with two changes, and one without a value."""
-    asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
+    asked = parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
     at = {"configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 8.0, "slope_deg": 10.0}
     changes = (
-        sheet.ParameterChange("gearbox.ratio", 48.0, 45.27, "-", -0.02),
-        sheet.ParameterChange("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
+        ParameterChange("gearbox.ratio", 48.0, 45.27, "-", -0.02),
+        ParameterChange("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
     )
     speed, mass, slope = asked.each
     return (
-        sheet.RequirementOutcome(speed, 0.947, -0.053, "converged", at, changes),
-        sheet.RequirementOutcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
-        sheet.RequirementOutcome(slope, None, None, "slides", at),
+        RequirementOutcome(speed, 0.947, -0.053, "converged", at, changes),
+        RequirementOutcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
+        RequirementOutcome(slope, None, None, "slides", at),
     )
 
 
 def check():
-    asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
-    return check_report.check_document(CheckResult(asked, nominal(), outcomes()), "nominal (PM)")
+    asked = parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
+    return check_document(CheckResult(asked, nominal(), outcomes()), "nominal (PM)")
 
 
 def size():
     robot, drive = nominal(), drive_options(("RE 40 24 V",))[0]
-    asked = requirements_file.parse_requirements("mass_kg = 15\n", "aims.toml")
+    asked = parse_requirements("mass_kg = 15\n", "aims.toml")
     best = SizedDesign(
         drive, packaged_cells()[0], 12.5, 0.0414, 3, 4.0, {"mass": 14.14, "energy": 0.031},
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip
-    short = dataclasses.replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
+    short = replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
     sizing = SizingResult(
-        None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
+        None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 31000
     )  # fmt: skip
-    return check_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
+    return size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
 def test_a_design_that_meets_all_that_can_be_met_is_not_red():
@@ -73,14 +82,14 @@ def test_a_design_that_meets_all_that_can_be_met_is_not_red():
 
 def test_a_terminal_has_few_lines_of_a_sizing(capsys):
     """All tables are on the page."""
-    terminal_renderer.print_document(size(), brief=True)
+    print_document(size(), brief=True)
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "256 searches" in lines[1]
+    assert len(lines) == 2 and lines[0].startswith("RE 40 24 V") and "31,000 designs" in lines[1]
 
 
 def above_the_bench(rise):
     """The bench's rows, and what compares them with a simulation 4 % above them, the first row without one."""
-    measured = records.read_runs("measured")
+    measured = read_runs("measured")
     error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04 + rise * measured["slope_deg"])
     simulated = {c: measured[c] for c in ("configuration", *measured.axes)}
     simulated |= {c.column: error * measured[c.column] for c in measured.channels}
@@ -89,63 +98,54 @@ def above_the_bench(rise):
 
 
 def test_a_comparison_draws_the_band_of_stated_sds_and_names_no_other():
-    measured = records.read_runs("measured")
-    sds = {"speed_sd_mm_s": np.full(len(measured), 7.0)}
-    for columns, named in (({}, False), (sds, True)):
-        runs = dataclasses.replace(measured, columns=measured.columns | columns)
-        table, summary = compare_readings(runs, {**runs.columns, "status": np.repeat("converged", len(runs))})
-        found = Comparison(table, summary, runs.channels, "measured", "steady", "nominal (PM)")
-        (figure,) = comparison_report.comparison_document(found).sections[0].blocks
+    measured = read_runs("measured")
+    for columns, named in (({}, False), ({"speed_sd_mm_s": np.full(len(measured), 7.0)}, True)):
+        runs = replace(measured, columns=measured.columns | columns)
+        compared = compare_readings(runs, {**runs.columns, "status": np.repeat("converged", len(runs))})
+        (figure,) = commented(*compared).sections[0].blocks
         assert ("Band: " in figure.caption) == named
     bands = [axes.patches[0].get_y() for axes in figure.draw().axes]
     assert min(bands) == bands[-1] == -14.0 and max(bands) == 0.0
+
+
+def commented(table, summary, **more):
+    """The document of a comparison with the bench's rows."""
+    return comparison_document(
+        Comparison(table, summary, read_runs("measured").channels, "measured", "steady", "nominal (PM)", **more)
+    )
 
 
 def comparison(log=False):
     """A simulation above the bench. Of a log as its first 2.8 s."""
     measured, table, summary = above_the_bench(rise=0.001)
     time = {"time_s": 0.1 * np.arange(len(measured))} if log else {}
-    return comparison_report.comparison_document(
-        Comparison(
-            table | time, summary, measured.channels, "measured", "steady", "nominal (PM)", "" if log else "these",
-            {"time_s": "time [s]"} if log else None, ("a note",),
-        )
-    )  # fmt: skip
+    over = {"time_s": "time [s]"} if log else None
+    return commented(table | time, summary, fit="" if log else "these", over=over, notes=("a note",))
 
 
 def comparison_two():
     """The same with a second robot, 2 % below the readings, which reaches the first row but not the second."""
     measured, table, summary = above_the_bench(rise=0.0)
     error = np.where(np.arange(len(measured)) == 1, np.nan, 0.98)
-    table = add_second_robot(
-        table, measured.channels, {c.column: error * measured[c.column] for c in measured.channels}
-    )
-    return comparison_report.comparison_document(
-        Comparison(
-            table, summary, measured.channels, "measured", "steady", "nominal (PM)", against="found/robot.toml"
-        )
-    )
-
-
-def test_two_robots_are_compared_on_the_rows_that_both_reach():
-    text = as_text(comparison_two())
-    assert "This robot and found/robot.toml on the same 18 rows: total current 4.0 and 2.0 %" in text
+    table = table | {f"against_{c.column}": error * measured[c.column] for c in measured.channels}
+    return commented(table, summary, against="found/robot.toml")
 
 
 def test_fits_of_a_log_keep_the_samples_after_steps_apart():
     """Readings taken before the command make a good model look hopeless."""
     volts = np.repeat([0.0, 12.0, 6.0], 40)
-    runs = records.Runs("log.csv", {"time_s": 0.01 * np.arange(120), "supply_voltage_V": volts})
+    runs = Runs("log.csv", {"time_s": 0.01 * np.arange(120), "supply_voltage_V": volts})
     steps = np.logical_or(*rows_after_steps(runs))
     assert np.flatnonzero(steps).tolist() == [40, 41, 80, 81]
-    speed = channels.find_channel("motor_speed")
-    table = {"time_s": runs["time_s"], speed.column: volts + np.sin(np.arange(120)), "status": np.full(120, "ended")}
-    table[f"simulated_{speed.column}"] = table[speed.column] + 9.0 * steps
-    table[f"error_{speed.name}_percent"] = 9.0 * steps
+    speed, measured = channels.find_channel("motor_speed"), volts + np.sin(np.arange(120))
+    table = {
+        "time_s": runs["time_s"], speed.column: measured, f"simulated_{speed.column}": measured + 9.0 * steps,
+        f"error_{speed.name}_percent": 9.0 * steps, "status": np.full(120, "ended"),
+    }  # fmt: skip
     found = Comparison(
         table, {"all": {speed.name: {"rows": 0}}}, (speed,), "log.csv", "drive", "ours", over={}, after_steps=steps
     )
-    _, fits = comparison_report._over_time(found)[0].blocks
+    _, fits = _over_time(found)[0].blocks
     (_, every, with_steps), (_, rest, without) = fits.rows
     assert (every, rest) == ("simulated", "simulated, without the two samples after each step")
     assert with_steps < 75 and without == pytest.approx(100.0)
@@ -157,19 +157,17 @@ def comparison_log():
 
 def settle():
     """A log of two levels, the first of which still changes at its beginning, and of a third that is too short."""
-    rng = np.random.default_rng(3)
+    rng, row = default_rng(3), np.arange(412)
     volts = np.repeat([6.0, 12.0, 18.0], (200, 200, 12))
-    lag = np.where(np.arange(len(volts)) < 200, np.exp(-np.arange(len(volts)) / 40), 0.0)
-    runs = records.Runs(
-        "log.csv",
-        {
-            "configuration": np.repeat("6T2A", len(volts)), "time_s": 0.01 * np.arange(len(volts)),
-            "supply_voltage_V": volts, "payload_kg": 0.0 * volts, "slope_deg": 0.0 * volts,
-            "total_current_A": 1.2 + volts / 20 + 0.01 * rng.standard_normal(len(volts)),
-            "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(len(volts)),
-        },
-    )  # fmt: skip
-    return settle_report.settle_document(settling.settle_log(runs), "Too few for the loop.", ("a further note",))
+    lag = np.where(row < 200, np.exp(-row / 40), 0.0)
+    columns = {
+        "configuration": np.repeat("6T2A", 412), "time_s": 0.01 * row, "supply_voltage_V": volts,
+        "payload_kg": 0.0 * volts, "slope_deg": 0.0 * volts,
+        "total_current_A": 1.2 + volts / 20 + 0.01 * rng.standard_normal(412),
+        "motor_speed_rpm": 350 * volts * (1 - 0.5 * lag) + 3 * rng.standard_normal(412),
+    }  # fmt: skip
+    log = settling.settle_log(Runs("log.csv", columns))
+    return settle_report.settle_document(log, "Too few for the loop.", ("a further note",))
 
 
 DOCUMENTS = {
@@ -200,25 +198,23 @@ SMALL = Document(
 
 
 def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
-    robot, runs = tmp_path / "robot.toml", records.read_runs("measured")
+    robot, runs = tmp_path / "robot.toml", read_runs("measured")
     robot.write_text("# a robot\n")
     file = RobotFile(nominal(), str(robot))
+    hashes = {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest}
+
+    def fitted(command, text="# a robot\n", runs=runs):
+        robot.write_text(text)
+        (tmp_path / "manifest.json").write_text(json.dumps({"arguments": [command, "x.csv"], "hashes": hashes}))
+        return recorded_fit(file, runs)
+
     assert recorded_fit(file, runs) == "" == recorded_fit(RobotFile(nominal(), "nominal"), runs)
-    manifest = {
-        "arguments": ["loop", "x.csv"],
-        "hashes": {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest},
-    }
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    assert recorded_fit(file, runs) == "these"
-    assert recorded_fit(file, records.Runs("other", runs.columns)) == "others"
-    robot.write_text("# changed by hand\n")
-    assert recorded_fit(file, runs) == ""
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"arguments": ["compare", "x.csv"]}))
-    assert recorded_fit(file, runs) == ""
+    assert fitted("loop") == "these" and fitted("loop", runs=Runs("other", runs.columns)) == "others"
+    assert fitted("loop", "# changed by hand\n") == fitted("compare") == ""
 
 
 def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
-    page = page_renderer.write_report_page(tmp_path, SMALL).read_text(encoding="utf-8")
+    page = write_report_page(tmp_path, SMALL).read_text(encoding="utf-8")
     rows = Tables(page).tables["rows"]
     assert rows == [
         ["run", "current", "source"], ["measured [A]", "error [%]"], ["a", "1.2", "0.00", "<hand>"], ["b", "–", "–", "log"],
@@ -233,7 +229,7 @@ def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
         and "<code>x_m</code>" in page
         and not outside(tmp_path)
     )
-    terminal_renderer.print_document(SMALL)
+    print_document(SMALL)
     shown = capsys.readouterr().out
     assert (
         shown.startswith("Speed 0.5 m/s.\n- one x_m\n- two\n") and "page only" not in shown and "<hand>" not in shown
@@ -244,28 +240,25 @@ def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):
 def test_a_long_table_is_cut_and_names_its_file(tmp_path, capsys):
     table = Table("rows", (Column("run", form="{}"),), [(k,) for k in range(250)], file="runs.csv")
     document = Document("T", "A.", (), (Section("Rows", (table,)),))
-    page = page_renderer.write_report_page(tmp_path, document).read_text(encoding="utf-8")
+    page = write_report_page(tmp_path, document).read_text(encoding="utf-8")
     assert len(Tables(page).tables["rows"]) == 201 and "The first 200 of 250 rows" in page
     assert '<a class="csv" download href="runs.csv">' in page
-    terminal_renderer.print_document(document)
+    print_document(document)
     assert capsys.readouterr().out == "A.\n250 rows: see runs.csv\n"
 
 
 def test_the_page_of_check_draws_motor_and_gear(tmp_path):
-    page = page_renderer.write_report_page(tmp_path, check()).read_text(encoding="utf-8")
+    page = write_report_page(tmp_path, check()).read_text(encoding="utf-8")
     assert drawn(page) == {"chart_of_corners", "drive_plane"}
 
 
 def test_every_figure_of_the_catalogue_can_be_drawn():
     """A figure of turning missions named a function that was gone."""
-    draws = [
-        e["draws"].rpartition(".") for room in catalogue._content().values() for e in room.values() if "draws" in e
-    ]
-    folder = {False: "sweeps.pages", True: "sweeps"}
-    modules = [f"{folder[module.startswith('paper.')]}.{module}" for module, _, _ in draws]
+    draws = [e["draws"] for room in catalogue._content().values() for e in room.values() if "draws" in e]
     assert len(draws) > 40
-    assert [
-        n
-        for m, (_, _, n) in zip(modules, draws, strict=True)
-        if not callable(getattr(importlib.import_module(m), n, None))
-    ] == []
+    for path in draws:
+        module, _, name = path.rpartition(".")
+        room = importlib.import_module(
+            f"sweeps.{module}" if module.startswith("paper.") else f"sweeps.pages.{module}"
+        )
+        assert callable(getattr(room, name, None)), path

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from mmrjax.fidelities.drive import drive
 from mmrjax.model import channels
@@ -84,7 +85,7 @@ def test_drive_bad_members_leave_neighbours_derivatives_alone(rebuild, theta, sc
     """Along one direction in which every parameter moves."""
     keep = jnp.asarray([True, False, True, False, True, False])
     times = jnp.linspace(0.0, 0.5, 3)
-    direction = jnp.asarray(scales * np.random.default_rng(6).normal(size=scales.size))
+    direction = jnp.asarray(scales * default_rng(6).normal(size=scales.size))
 
     @jax.jit
     def slope(runs):

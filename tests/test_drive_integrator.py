@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
@@ -19,7 +20,7 @@ def decay(t, y, args):
     return jnp.stack([y[1] - y[0] ** 3, -3.0 * y[1] * (1.0 + y[0])])
 
 
-STARTS = np.random.default_rng(4).uniform(0.3, 2.0, (12, 2))  # several, lest one error cross zero
+STARTS = default_rng(4).uniform(0.3, 2.0, (12, 2))  # several, lest one error cross zero
 
 
 @jax.jit

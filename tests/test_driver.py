@@ -1,6 +1,6 @@
 """The motor driver: its current limit, its diode, its controller, and what it takes from the supply."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +8,11 @@ from numpy.testing import assert_allclose
 
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import balances, energy, paper_robots, params
+from mmrjax.model import paper_robots, params
+from mmrjax.model.balances import begin_signals, driven_signals, moving_signals, supply
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.driver import FAST, SLOW, STEEPNESS, Driver
+from mmrjax.model.energy import sink_powers, source_power
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import State
@@ -19,7 +21,7 @@ LIMITED = Driver(current_limit=5.0)
 
 
 @pytest.mark.parametrize(
-    ("duty", "current", "limited"),
+    "duty, current, limited",
     [
         (0.6, 4.9, 0.6),
         (0.6, -4.9, 0.6),
@@ -37,17 +39,12 @@ def test_the_current_limit_takes_duty_from_what_drives_the_current(duty, current
 @pytest.mark.parametrize("volts", [6.0, -6.0])
 def test_limit_and_diode_act_alike_on_a_supply_of_either_sign(robot, volts):
     """Beyond the limit the motors get less than the supply has, and a diode blocks what flows against it alone."""
-    bridge = dataclasses.replace(robot.driver, current_limit=1.0, returns_current=False)
-    limited = dataclasses.replace(robot, driver=bridge)
-    state = State(np.sign(volts) * 1.001, 0.0, 0.0, 0.0)
-    signals = [
-        balances.moving_signals(
-            limited, Conditions(voltage=volts), dataclasses.replace(state, current=way * state.current)
-        )
-        for way in (1, -1)
+    limited = replace(robot, driver=replace(robot.driver, current_limit=1.0, returns_current=False))
+    given = [
+        float(moving_signals(limited, Conditions(voltage=volts), State(current, 0.0, 0.0, 0.0)).voltage)
+        for current in (np.sign(volts) * 1.001, -np.sign(volts) * 1.001)
     ]
-    assert float(signals[0].voltage) == pytest.approx(0.5 * volts)
-    assert float(signals[1].voltage) == 0.0  # at the back-EMF of motors that stand
+    assert given == pytest.approx([0.5 * volts, 0.0])  # at the back-EMF of motors that stand
 
 
 def test_a_diode_blocks_current_against_the_duty_alone():
@@ -85,11 +82,11 @@ def test_controller_is_proportional_and_integral_with_the_back_emf_fed_forward()
 def test_supply_gives_the_duty_of_its_voltage_and_of_the_current(robot):
     """Drops on the way to the driver are before it: its share is of what they leave."""
     sagging = params.replace(BY_NAME["supply_sag"](), {"amplitude": 0.5})
-    robot = dataclasses.replace(robot, effects=(sagging,))
+    robot = replace(robot, effects=(sagging,))
     run = Conditions(voltage=24.0, duty=0.25)
-    signals = balances.begin_signals(robot, run, State(3.0, 500.0, 0.4, 0.0))
+    signals = begin_signals(robot, run, State(3.0, 500.0, 0.4, 0.0))
     assert float(signals.total_current) == pytest.approx(2 * 3.0 * 0.25)
-    assert float(balances.supply(robot, run, signals).voltage) == pytest.approx(0.25 * (24.0 - 0.5 * 1.5))
+    assert float(supply(robot, run, signals).voltage) == pytest.approx(0.25 * (24.0 - 0.5 * 1.5))
 
 
 def bench(decay, **load):
@@ -102,7 +99,7 @@ def bench(decay, **load):
         "gearbox.ratio": 1.0,
         "gearbox.efficiency_load": 1.0,
     }
-    return dataclasses.replace(params.replace(robot, motor), driver=Driver(decay=decay))
+    return replace(params.replace(robot, motor), driver=Driver(decay=decay))
 
 
 DUTIES = np.array([0.25, 0.5, 0.9, 1.0, -0.3, -1.0])
@@ -111,23 +108,22 @@ DUTIES = np.array([0.25, 0.5, 0.9, 1.0, -0.3, -1.0])
 def test_between_the_pulses_of_fast_decay_the_motors_coast():
     """Mean torque |d| k (U - k ω)/R: the speed without load does not depend on the duty, and what the supply gives is
     all of the current."""
-    runs = Conditions(voltage=8.0, duty=DUTIES)
-    found = steady_batch(bench(FAST), runs)
-    speed = np.sign(DUTIES) * (8.0 / 0.1 - 0.02 * 5.0 / (0.1**2 * np.abs(DUTIES)))
-    assert_allclose(found.motor_speed, speed, rtol=1e-9)
-    assert_allclose(found.motor_current, 0.2 * np.sign(DUTIES), rtol=1e-9)
-    assert_allclose(found.total_current, 0.2, rtol=1e-9)
-    assert_allclose(found.power_supply, 8.0 * 0.2, rtol=1e-9)
-    assert_allclose(found.efficiency_motor, 0.1 * np.abs(speed) / 8.0, rtol=1e-9)
-    short = steady_batch(bench(SLOW), runs)
-    assert_allclose(short.motor_speed, 80.0 * DUTIES - 10.0 * np.sign(DUTIES), rtol=1e-9)
-    whole = np.abs(DUTIES) == 1
+    way, share = np.sign(DUTIES), np.abs(DUTIES)
+    fast, slow = (steady_batch(bench(decay), Conditions(voltage=8.0, duty=DUTIES)) for decay in (FAST, SLOW))
+    speed = 8.0 / 0.1 - 0.02 * 5.0 / (0.1**2 * share)
+    for name, expected in {
+        "motor_speed": way * speed, "motor_current": 0.2 * way, "total_current": 0.2 + 0 * way,
+        "power_supply": 8.0 * 0.2 + 0 * way, "efficiency_motor": 0.1 * speed / 8.0,
+    }.items():  # fmt: skip
+        assert_allclose(getattr(fast, name), expected, rtol=1e-9, err_msg=name)
+    assert_allclose(slow.motor_speed, 80.0 * DUTIES - 10.0 * way, rtol=1e-9)
     for name in ("motor_speed", "power_supply", "total_current"):
-        assert_allclose(getattr(found, name)[whole], getattr(short, name)[whole], rtol=1e-12)
+        a, b = (getattr(found, name)[share == 1] for found in (fast, slow))
+        assert_allclose(a, b, rtol=1e-12)
 
 
 def test_a_driver_in_fast_decay_is_the_effect_of_its_name():
-    effect = dataclasses.replace(bench(SLOW), effects=(BY_NAME["coast_decay"](amplitude=1.0),))
+    effect = replace(bench(SLOW), effects=(BY_NAME["coast_decay"](amplitude=1.0),))
     runs = Conditions(voltage=8.0, duty=DUTIES)
     speeds = [steady_batch(robot, runs).motor_speed for robot in (effect, bench(FAST))]
     assert_allclose(*speeds, rtol=1e-9)
@@ -135,24 +131,21 @@ def test_a_driver_in_fast_decay_is_the_effect_of_its_name():
 
 @pytest.mark.parametrize("decay", [SLOW, FAST])
 @pytest.mark.parametrize("duty", [0.3, -0.6, 0.0])
-def test_power_of_the_supply_is_what_goes_into_heat_and_motion(decay, duty):
+@pytest.mark.parametrize("current, speed", [(0.4, 30.0), (-0.7, 120.0)])
+def test_power_of_the_supply_is_what_goes_into_heat_and_motion(decay, duty, current, speed):
     """Also while a load drives the motors faster than the pulses would, and with no pulses at all."""
-    robot = bench(decay, torque_constant=-0.5)
-    for state in (State(0.4, 30.0, 30.0, 0.0), State(-0.7, 120.0, 120.0, 0.0)):
-        current = 0.0 if decay == FAST and duty == 0 else state.current
-        state = dataclasses.replace(state, current=current)
-        run = Conditions(voltage=8.0, duty=duty)
-        signals = balances.moving_signals(robot, run, state)
-        goes = sum(float(x) for x in energy.sink_powers(robot, run, signals).values())
-        stored = float(signals.voltage_left * signals.current)  # in the inductance
-        inertia = robot.motor.inertia + 1e-3
-        stored += float(inertia * signals.acceleration_wheel * signals.speed_wheel)
-        assert float(energy.source_power(robot, run, signals)) == pytest.approx(goes + stored, abs=1e-9)
+    robot, run = bench(decay, torque_constant=-0.5), Conditions(voltage=8.0, duty=duty)
+    current = 0.0 if decay == FAST and duty == 0 else current
+    signals = moving_signals(robot, run, State(current, speed, speed, 0.0))
+    goes = sum(float(x) for x in sink_powers(robot, run, signals).values())
+    stored = signals.voltage_left * signals.current  # in the inductance
+    stored += (robot.motor.inertia + 1e-3) * signals.acceleration_wheel * signals.speed_wheel
+    assert float(source_power(robot, run, signals)) == pytest.approx(goes + float(stored), abs=1e-9)
 
 
-@pytest.mark.parametrize(("opened", "current"), [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
+@pytest.mark.parametrize("opened, current", [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
 def test_fast_decay_coasts_without_pulses_and_brakes_where_it_is_told_to(opened, current):
     run = Conditions(voltage=8.0, duty=0.0, open=opened)
     robot = bench(FAST)
-    signals = balances.driven_signals(robot, run, State(current, 40.0, 40.0, 0.0), None)
+    signals = driven_signals(robot, run, State(current, 40.0, 40.0, 0.0), None)
     assert float(signals.voltage_left) == pytest.approx(0.0, abs=1e-12)

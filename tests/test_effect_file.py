@@ -5,12 +5,14 @@ from pathlib import Path
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import effect_file, robot_file
+from calibration.data.effect_file import _check_effect, effect_library
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.robot_file import add_effects, load_robot, read_robot, write_robot
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import nominal
 from tests.commands import read_rig, text_file
 
 GOOD = '''
@@ -70,17 +72,15 @@ def stating(*lines):
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [GOOD, EXPLICIT], ids=["derived", "explicit"])
 def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path, text):
-    library = effect_file.effect_library([written(tmp_path, text)])
+    library = effect_library([written(tmp_path, text)])
     assert list(library) == [*BY_NAME, "seal_drag"] and "seal_drag" not in BY_NAME
-    robot = robot_file.load_robot(
-        text_file(tmp_path / "robot.toml", "[effects.seal_drag]\namplitude = 0.05\n"), library
-    )
-    more = params.replace(robot_file.load_robot("nominal"), {"6T2A.track.loss_coulomb": 0.4})
+    robot = load_robot(text_file(tmp_path / "robot.toml", "[effects.seal_drag]\namplitude = 0.05\n"), library)
+    more = params.replace(load_robot("nominal"), {"6T2A.track.loss_coulomb": 0.4})
     run = Conditions(voltage=[15.0])
     got, expected = (steady_batch(r, run).total_current for r in (robot, more))
     assert_allclose(got, expected, rtol=1e-10)
-    robot_file.write_robot(robot, tmp_path / "again.toml")
-    again = robot_file.load_robot(str(tmp_path / "again.toml"), library)
+    write_robot(robot, tmp_path / "again.toml")
+    again = load_robot(str(tmp_path / "again.toml"), library)
     assert float(again.effects[0].amplitude) == 0.05
 
 
@@ -88,7 +88,7 @@ def test_user_effect_states_what_the_library_states(tmp_path):
     text = stating(
         "transient = True", 'settles_to = "churning"', "odd_in_travel = True", 'configurations = ("4W2T",)'
     )
-    drag = effect_file.effect_library([written(tmp_path, text)])["seal_drag"]
+    drag = effect_library([written(tmp_path, text)])["seal_drag"]
     assert (drag.transient, drag.settles_to, drag.odd_in_travel, drag.needs_battery) == (
         True,
         "churning",
@@ -98,13 +98,13 @@ def test_user_effect_states_what_the_library_states(tmp_path):
     assert drag().configurations == ("4W2T",)
     power = GOOD.replace("signals.direction", "signals.direction * signals.battery")
     text = power.replace("    dissipative = True\n", "    needs_battery = True\n")
-    assert effect_file.effect_library([written(tmp_path, text, "on_battery.py")])["seal_drag"].needs_battery
+    assert effect_library([written(tmp_path, text, "on_battery.py")])["seal_drag"].needs_battery
 
 
 def test_user_effect_may_settle_to_another_of_the_users(tmp_path):
     one = stating('settles_to = "seal_wear"')
     two = GOOD.replace("SealDrag", "SealWear")
-    library = effect_file.effect_library([written(tmp_path, one), written(tmp_path, two, "other.py")])
+    library = effect_library([written(tmp_path, one), written(tmp_path, two, "other.py")])
     assert library["seal_drag"].settles_to == "seal_wear"
 
 
@@ -193,19 +193,19 @@ REFUSED = {
 def test_bad_effect_files_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
     with pytest.raises(BadConfiguration, match=sentence) as refusal:
-        effect_file.effect_library([written(tmp_path, text)])
+        effect_library([written(tmp_path, text)])
     assert "\n" not in str(refusal.value)
 
 
 def test_an_effect_may_read_the_torque_that_the_gearbox_transmits():
     """The check compared the first guess of that torque with the final one."""
-    effect_file._check_effect(Path("library"), BY_NAME["gear_load_loss"])
+    _check_effect(Path("library"), BY_NAME["gear_load_loss"])
 
 
 @pytest.mark.slow
 def test_packaged_effects_pass_the_users_checks():
     for effect in BY_NAME.values():
-        effect_file._check_effect(Path("library"), effect)
+        _check_effect(Path("library"), effect)
 
 
 # --- configurations in robot files ----------------------------------------------------------------------
@@ -219,24 +219,24 @@ def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
     )
     assert [e.configurations for e in robot.effects] == [("4W2T",), ()]
     assert float(robot.effects[0].amplitude) == 1e-4
-    robot_file.write_robot(robot, tmp_path / "again.toml")
+    write_robot(robot, tmp_path / "again.toml")
     assert "configurations" in (tmp_path / "again.toml").read_text()
-    again = robot_file.read_robot(tmp_path / "again.toml")
+    again = read_robot(tmp_path / "again.toml")
     assert [e.configurations for e in again.effects] == [("4W2T",), ()]
 
 
 def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
-    library = effect_file.effect_library([written(tmp_path, stating('configurations = ("4W2T",)'))])
-    robot = robot_file.add_effects(paper_robots.nominal(), ("seal_drag",), library)
+    library = effect_library([written(tmp_path, stating('configurations = ("4W2T",)'))])
+    robot = add_effects(nominal(), ("seal_drag",), library)
     assert robot.effects[0].configurations == ("4W2T",)
-    robot = robot_file.add_effects(paper_robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
+    robot = add_effects(nominal(), ("seal_drag",), library, {"seal_drag": []})
     assert robot.effects[0].configurations == ()
-    robot_file.write_robot(robot, tmp_path / "robot.toml")
-    assert robot_file.read_robot(tmp_path / "robot.toml", library).effects[0].configurations == ()
+    write_robot(robot, tmp_path / "robot.toml")
+    assert read_robot(tmp_path / "robot.toml", library).effects[0].configurations == ()
 
 
 @pytest.mark.parametrize(
-    ("value", "sentence"),
+    "value, sentence",
     [
         ('["4W2"]', r"got 4W2; did you mean 4W2T\? allowed: 6T2A, 4W2T$"),
         ('["6T2A", "8W"]', r"got 8W; allowed: 6T2A, 4W2T$"),

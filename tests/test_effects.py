@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from calibration.data.effect_file import readable_signals
@@ -28,8 +29,10 @@ from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.base import Periodic, scaled_effect
 from mmrjax.fidelities.drive import drive, drive_rates, drive_start, state_of_unknowns
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.model import balances, channels, paper_robots, params
+from mmrjax.model import channels, params
+from mmrjax.model.balances import BALANCES, effects_sum, moving_signals, sensor
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import blank_robot, nominal
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.rig import Instrument, RunStart, RunStarts
 from mmrjax.model.robot import Configurations
@@ -96,12 +99,12 @@ def factor(unit, change):
 
 
 def balance_unit(effect):
-    return SENSOR_UNITS[effect.channel] if effect.balance == "sensor" else balances.BALANCES[effect.balance][0]
+    return SENSOR_UNITS[effect.channel] if effect.balance == "sensor" else BALANCES[effect.balance][0]
 
 
 # --- what the laws are tried on -----------------------------------------------------------------------
 
-NOMINAL = paper_robots.nominal()
+NOMINAL = nominal()
 AMPLITUDES = (0.37, 1.9)  # of the prior's standard deviation
 #: Speed or current that a balance's term multiplies to a power.
 CONJUGATE = {
@@ -126,30 +129,23 @@ CONDITIONS = Conditions(
 
 def random_states(n=400):
     """Signals of the nominal robot at random states: either direction, either configuration, spinning."""
-    rng = np.random.default_rng(12)
+    rng = default_rng(12)
     low, high = (-20, -1200, -1.2, 0, 15, -0.3, 0, 0.5), (20, 1200, 1.2, 7000, 33, 0.3, 8, 2)
     current, motor, speed, charge, voltage, slope, payload, adhesion = rng.uniform(low, high, (n, 8)).T
     memory = {e.name: jnp.asarray(e.memory_size * rng.uniform(0, 1, n)) for e in ALL if e.memory_size is not None}
     motor[:40] *= 1e-4  # through rest
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
-    moving = jax.jit(jax.vmap(balances.moving_signals, in_axes=(None, 0, 0)))
-    straight = moving(
-        NOMINAL,
-        run,
-        State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n)),
-    )
+    moving = jax.jit(jax.vmap(moving_signals, in_axes=(None, 0, 0)))
+    state = State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n))
     turn = rng.uniform(-4, 4, n)
-    lateral = -np.sign(turn) * rng.uniform(0, 5, n)  # against the turn
+    way = np.sign(turn)
+    lateral = -way * rng.uniform(0, 5, n)  # against the turn
+    pause, side, command = rng.uniform(0, 1, n), rng.choice((-1.0, 1.0), n), default_rng(13).uniform(-1, 1, n)
     return dataclasses.replace(
-        straight,
-        pause=rng.uniform(0, 1, n),
-        command=np.random.default_rng(13).uniform(-1, 1, n),
-        side=rng.choice((-1.0, 1.0), n),
-        yaw_rate=turn,
-        direction_turn=np.sign(turn),
+        moving(NOMINAL, run, state), pause=pause, command=command, side=side, yaw_rate=turn, direction_turn=way,
         moment_lateral=lateral,
-    )
+    )  # fmt: skip
 
 
 STATES = random_states()
@@ -171,13 +167,13 @@ def with_effects(*present, robot=None):
 def terms(effect, robot=None, signals=STATES):
     """What it adds to its balance in each of the states."""
     robot = with_effects(effect, robot=robot)
-    added = jax.vmap(lambda s: balances.effects_sum(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
+    added = jax.vmap(lambda s: effects_sum(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
     return np.asarray(added(signals))
 
 
 def readings(robot, signals):
     """What the instruments show, channels last, in their order."""
-    shown = balances.sensor(robot, signals)
+    shown = sensor(robot, signals)
     return jnp.stack([shown[name] for name in channels.USUAL], -1)
 
 
@@ -230,7 +226,7 @@ def law_declared(effect):
     assert effect.name.isidentifier() and effect.name == effect.name.lower()
     assert effect.movers in ("", "tracks", "wheels")
     assert not effect.settles_to or (effect.settles_to in BY_NAME and effect.settles_to != effect.name)
-    assert effect.balance in balances.BALANCES
+    assert effect.balance in BALANCES
     assert bool(effect.channel) == (effect.balance == "sensor")
     assert not effect.channel or effect.channel in channels.channel_names(channels.EVERY)
     declared = {p.name: p for p in params.walk_parameters(effect())}
@@ -278,23 +274,17 @@ def law_family(effect):
     made = fitted(effect, size(effect))
     before = terms(made)
     if not effect.driver:
-        of = [
-            np.ones_like(before),
-            *(np.asarray(getattr(STATES, n)) for n in SHARED.get(effect.channel or effect.balance, ())),
-            *(np.asarray(c.read(NOMINAL, STATES)) for c in channels.EVERY if c.name == effect.channel),
-        ]
-        shares = [before / x for x in of]
+        of = [np.ones_like(before), *(getattr(STATES, n) for n in SHARED.get(effect.channel or effect.balance, ()))]
+        of += [c.read(NOMINAL, STATES) for c in channels.EVERY if c.name == effect.channel]
+        shares = [before / np.asarray(x) for x in of]
         assert any(np.ptp(x) < 1e-9 * np.abs(x).max() for x in shares), "varies, and says not with what"
         return
     if effect.driver == "angle" or effect.memory_size is not None:
         assert (effect.driver == "angle") == issubclass(effect, Periodic)
         return
-    moved = {
-        n: 0.5 * getattr(STATES, n) if n != "configuration" else 1 - STATES.configuration
-        for n in DRIVERS[effect.driver]
-    }
-    if effect.driver == "configuration":
-        moved["on_tracks"] = 1 - STATES.on_tracks
+    halved = {n: 0.5 * getattr(STATES, n) for n in DRIVERS[effect.driver]}
+    turned = {n: 1 - getattr(STATES, n) for n in ("configuration", "on_tracks")}
+    moved = turned if effect.driver == "configuration" else halved
     after = terms(made, signals=dataclasses.replace(STATES, **moved))
     assert np.abs(after - before).max() > 1e-3 * np.abs(before).max(), f"does not change with {effect.driver}"
 
@@ -328,7 +318,7 @@ def law_linear(effect):
 
 def law_unit(effect):
     """Under other units of mass, length, time and current the term turns as the unit of its balance."""
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     start = fitted(effect, 0.8 * size(effect))
     before = terms(start)
     for _ in range(3):
@@ -360,19 +350,16 @@ def law_dissipative(effect):
 
 #: Instants at which a term may read: settled travel (None where it has none), motion, and standstill.
 INSTANTS = {
-    "settled": (State(*map(jnp.asarray, (2.0, 700.0, 0.5, 100.0))), True),
-    "climbing": (State(*map(jnp.asarray, (2.0, 700.0, 0.5, 100.0))), False),
-    "backwards": (State(*map(jnp.asarray, (-3.0, -500.0, -0.45, 100.0))), False),
-    "standstill": (State(*map(jnp.asarray, (0.0, 0.0, 0.0, 0.0))), False),
-}
+    "settled": (2.0, 700.0, 0.5, 100.0), "climbing": (2.0, 700.0, 0.5, 100.0),
+    "backwards": (-3.0, -500.0, -0.45, 100.0), "standstill": (0.0, 0.0, 0.0, 0.0),
+}  # fmt: skip
 
 
 @functools.cache
 def known(balance, channel, instant):
     """What a term in this balance may read."""
-    state, settled = INSTANTS[instant]
-    run = jax.tree.map(lambda x: x[2], CONDITIONS)
-    return readable_signals(NOMINAL, run, state, balance, channel, settled=settled)
+    run, state = jax.tree.map(lambda x: x[2], CONDITIONS), State(*map(jnp.asarray, INSTANTS[instant]))
+    return readable_signals(NOMINAL, run, state, balance, channel, settled=instant == "settled")
 
 
 def law_readable(effect):
@@ -383,7 +370,7 @@ def law_readable(effect):
         if effect.memory_size is not None and instant != "settled":
             signals = dataclasses.replace(signals, memory={effect.name: jnp.asarray(0.3 * effect.memory_size)})
         term, slopes = eqx.filter_value_and_grad(
-            lambda both, effect=effect: jnp.sum(balances.effects_sum(*both, effect.balance, effect.channel))
+            lambda both, effect=effect: jnp.sum(effects_sum(*both, effect.balance, effect.channel))
         )((robot, signals))
         assert np.isfinite(term), f"no number: {instant}"
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes)), f"no derivative: {instant}"
@@ -432,12 +419,9 @@ SHOWN_BY_STATES = ("motor_current", "output_torque", "motor_voltage", "yaw_rate"
 @pytest.mark.parametrize("law", (law_declared, law_family, law_linear, law_unit), ids=lambda law: law.__name__[4:])
 @pytest.mark.parametrize(
     "effect",
-    [
-        *effects.OF_TURNS.values(),
-        *(effects.OF_CHANNELS[f"{n}_{what}"] for n in SHOWN_BY_STATES for what in ("gain", "offset")),
-    ],
+    [*effects.OF_TURNS.values(), *(effects.OF_CHANNELS[f"{n}_{x}"] for n in SHOWN_BY_STATES for x in ("gain", "offset"))],
     ids=lambda effect: effect.name,
-)
+)  # fmt: skip
 def test_effect_of_turns_and_of_channels_obeys(effect, law):
     law(effect)
 
@@ -455,13 +439,14 @@ def test_every_channel_has_an_error_of_its_scale_and_of_a_zero_that_it_may_miss(
     # Random numbers go by position: the errors of zeros stand behind those that were before.
     behind = [e.of_zero for e in effects.OF_CHANNELS.values() if e.channel != "winding_temperature"]
     assert behind == sorted(behind)
-    values = {f.name: 0.5 for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")}
-    signals = Signals(**values)
+    signals = Signals(
+        **{f.name: 0.5 for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")}
+    )
     for effect in effects.OF_CHANNELS.values():
         law_declared(effect)
         shown = float(channels.find_channel(effect.channel).read(NOMINAL, signals))
-        size = 1.0 if effect.of_zero else shown
-        assert shown and float(effect(amplitude=0.02).term(NOMINAL, signals)) == pytest.approx(0.02 * size)
+        error = float(effect(amplitude=0.02).term(NOMINAL, signals))
+        assert shown and error == pytest.approx(0.02 if effect.of_zero else 0.02 * shown)
 
 
 #: Readings of a motor current of 2 A both ways and at rest, of a meter 5 % and 0.18 A too high.
@@ -474,15 +459,15 @@ def metered(signed, gain=0.05, offset=0.18):
     return dataclasses.replace(with_effects(*(effects.OF_CHANNELS[n](amplitude=a) for n, a in off.items())), rig=rig)
 
 
-@pytest.mark.parametrize(("signed", "expected"), [(True, WITH_A_SIGN), (False, MAGNITUDE)])
+@pytest.mark.parametrize("signed, expected", [(True, WITH_A_SIGN), (False, MAGNITUDE)])
 def test_an_instruments_errors_are_added_to_what_it_shows(signed, expected):
     """So that what an effect changes of a reading is its term, to which the loop's scores hold."""
     robot, without = metered(signed), metered(signed, 0.0, 0.0)
     for current, shown in zip((2.0, -2.0, 0.0), expected, strict=True):
         signals = jax.tree.map(lambda x: x[0], dataclasses.replace(STATES, current=jnp.full(400, current)))
-        read, ideal = (float(balances.sensor(r, signals)["motor_current"]) for r in (robot, without))
+        read, ideal = (float(sensor(r, signals)["motor_current"]) for r in (robot, without))
         assert read == pytest.approx(shown, rel=1e-12)
-        assert read - ideal == pytest.approx(float(balances.effects_sum(robot, signals, "sensor", "motor_current")))
+        assert read - ideal == pytest.approx(float(effects_sum(robot, signals, "sensor", "motor_current")))
 
 
 @pytest.mark.quick(1)
@@ -601,80 +586,31 @@ def test_units_of_signals_are_all_known():
 def test_units_of_parameters_and_balances_are_all_known(free):
     for p in free:
         dimensions(p.spec.unit)
-    for unit, _ in balances.BALANCES.values():
+    for unit, _ in BALANCES.values():
         dimensions(unit)
-
-
-def test_dimensions_of_products():
-    assert dimensions("V/A") == dimensions("ohm")
-    assert dimensions("N·m/s") == dimensions("W") == dimensions("V·A")
-    assert dimensions("V·s") == dimensions("N·m/A")
-    with pytest.raises(ValueError, match="furlong"):
-        dimensions("furlong/s")
 
 
 # --- both fidelities feel every effect ------------------------------------------------------------------
 
 
-#: In `make test` one of a balance of the electrical side, one of the mechanical, one with a memory and one of an
-#: instrument; that every effect is alive at zero in its own balance, and in `steady`, is a law above.
-FELT = ("supply_sag", "churning", "ammeter_gain")
-#: Instants at which `drive` is read [s]: what acts at a crawl shows at the first, what warms up at the last.
-DRIVEN = (0.0, 0.003, 0.1, 1.0, 4.0)
+@pytest.mark.slow
+def test_drive_without_amplitudes_is_drive_without_effects():
+    def driven(*present):
+        robot, times = with_effects(*present), jnp.asarray([0.0, 0.003, 0.1, 1.0, 4.0])
+        run = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-11, max_steps=65_536).signals))
+        return readings(robot, run(CONDITIONS))[:, 1:]
 
-
-@pytest.fixture(scope="module")
-def drive_readings():
-    """Readings of `drive` from 3 ms to 4 s in all conditions, for a vector of amplitudes of ALL."""
-    times = jnp.asarray(DRIVEN)
-
-    @jax.jit
-    def run(amplitudes):
-        robot = with_effects(*(fitted(e, a) for e, a in zip(ALL, amplitudes, strict=True)))
-
-        def one(c):
-            answer = drive(robot, c, times, tolerance=1e-11, max_steps=65_536)
-            return readings(robot, answer.signals)[1:]
-
-        return jax.vmap(one)(CONDITIONS)
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def without_amplitudes(drive_readings):
-    return drive_readings(jnp.zeros(len(ALL)))
+    assert_allclose(driven(*(effect() for effect in ALL)), driven(), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_drive_without_amplitudes_is_drive_without_effects(without_amplitudes):
-    bare = NOMINAL
-    plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray(DRIVEN), tolerance=1e-11)))(CONDITIONS)
-    expected = readings(bare, plain.signals)[:, 1:]
-    assert_allclose(without_amplitudes, expected, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.quick(1)
-@pytest.mark.parametrize(
-    "k",
-    [k if e.name in FELT else pytest.param(k, marks=pytest.mark.slow) for k, e in enumerate(ALL)],
-    ids=[e.name for e in ALL],
-)
-def test_drive_and_steady_both_feel(k, drive_readings, without_amplitudes):
-    """At a tenth of the prior's standard deviation a reading moves by more than 1e-5, in both fidelities.
-
-    What settled travel does not show is looked for in `drive` alone, at the whole of it.
-    """
-    share = (1.0 if ALL[k].transient else 0.1) * size(ALL[k])
-    base, moved = without_amplitudes, drive_readings(jnp.zeros(len(ALL)).at[k].set(share))
-    assert np.isfinite(moved).all()
-    assert (np.abs(moved - base) / np.abs(base)).max() > (1e-6 if ALL[k].transient else 1e-5)
-    if ALL[k].transient:
-        return
-    of_steady = compiled(outputs_steady, ALL)[0]
-    base, moved = of_steady(jnp.zeros(len(ALL))), of_steady(jnp.zeros(len(ALL)).at[k].set(share))
-    count = len(channels.EVERY)  # the readings
-    assert (np.abs(moved - base)[:, :count] / np.maximum(np.abs(base[:, :count]), 1e-9)).max() > 1e-5
+def test_drive_feels_every_effect():
+    """That `steady` feels those that settled travel shows is a law above."""
+    values, slopes = at_zero(outputs_start, ALL)
+    sizes = np.array([size(effect) for effect in ALL])
+    moved = np.abs(slopes * sizes / np.maximum(np.abs(values), 1e-9)[..., None]).max((0, 1))
+    least = np.where([effect.transient for effect in ALL], 1e-6, 1e-4)
+    assert np.isfinite(slopes).all() and [e.name for e, x in zip(ALL, moved < least, strict=True) if x] == []
 
 
 # --- what single effects amount to ----------------------------------------------------------------------
@@ -696,32 +632,37 @@ def _same(a, b, channels=("total_current", "motor_speed", "speed")):
 
 
 @pytest.mark.slow
-def test_series_resistance_is_winding_resistance():
-    _same(_steady_with(series_resistance=0.4), _steady_with({"motor.resistance": 0.611 + 0.4}))
+@pytest.mark.parametrize("effect, amplitude, parameter, value", [
+    ("series_resistance", 0.4, "motor.resistance", 0.611), ("mass_offset", 1.6, "4W2T.mass", 11.5),
+])  # fmt: skip
+def test_effect_is_more_of_a_parameter(effect, amplitude, parameter, value):
+    _same(_steady_with(**{effect: amplitude}), _steady_with({parameter: value + amplitude}))
 
 
-@pytest.mark.slow
-def test_mass_offset_is_mass_of_the_wheeled_robot():
-    _same(_steady_with(mass_offset=1.6), _steady_with({"4W2T.mass": 11.5 + 1.6}))
+def _in_each_run(effect, amplitude, changes, channel):
+    """A reading with an effect is in each run that of a robot with other numbers, which follow from the result."""
+    with_it = _steady_with(**{effect: amplitude})
+    for k, reading in enumerate(getattr(with_it, channel)):
+        changed = _steady_with(changes(float(with_it.motor_current[k]), float(with_it.motor_speed[k])))
+        assert_allclose(reading, getattr(changed, channel)[k], rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_winding_heating_is_resistance_at_the_settled_temperature():
-    with_it = _steady_with(winding_heating=1.0)
-    for k in range(CONDITIONS.voltage.size):
-        current = float(with_it.motor_current[k])
-        rise = 7.7 * 0.611 * current**2
-        hot = _steady_with({"motor.resistance": 0.611 * (1 + 0.00393 * rise)})
-        assert_allclose(with_it.motor_speed[k], hot.motor_speed[k], rtol=1e-9)
+    def hot(current, _):
+        return {"motor.resistance": 0.611 * (1 + 0.00393 * 7.7 * 0.611 * current**2)}
+
+    _in_each_run("winding_heating", 1.0, hot, "motor_speed")
 
 
 def test_churning_is_viscous_loss_that_grows_with_speed():
-    with_it = _steady_with(churning=3e-4)
-    for k in range(CONDITIONS.voltage.size):
-        turn = 3e-4 * float(with_it.motor_speed[k]) / 48.0
-        viscous = {"6T2A.track.loss_viscous": 0.016 + turn, "4W2T.track.loss_viscous": 0.003 + turn}
-        more = _steady_with(viscous)
-        assert_allclose(with_it.total_current[k], more.total_current[k], rtol=1e-9)
+    def viscous(_, speed):
+        return {
+            "6T2A.track.loss_viscous": 0.016 + 3e-4 * speed / 48,
+            "4W2T.track.loss_viscous": 0.003 + 3e-4 * speed / 48,
+        }
+
+    _in_each_run("churning", 3e-4, viscous, "total_current")
 
 
 def test_rolling_radius_changes_the_distance_and_no_torque():
@@ -783,17 +724,17 @@ def test_stribeck_exponent_is_its_formula(exponent):
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 4.0])
 def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     def term(speed, fade, power):
-        effect = params.replace(BY_NAME["stribeck_exponent"](), {"speed_fade": fade, "exponent": power})
-        effect = params.replace(effect, {"amplitude": 1.0})
+        effect = params.replace(
+            BY_NAME["stribeck_exponent"](), {"speed_fade": fade, "exponent": power, "amplitude": 1.0}
+        )
         return effect.term(NOMINAL, Signals(speed_wheel=speed, direction=jnp.asarray(1.0)))
 
     slopes = jax.vmap(jax.grad(term, (0, 1, 2)), (0, None, None))
     speeds = jnp.asarray([-1e-3, -1e-12, 0.0, 1e-12, 1e-3, 1.0, 30.0])
-    found = np.stack(slopes(speeds, jnp.asarray(8.0), jnp.asarray(exponent)))
+    found = np.stack(slopes(speeds, 8.0, exponent))
     assert np.isfinite(found).all() and np.abs(found).max() < 20
-    step = 1e-6
-    at = [term(jnp.asarray(1.0 + s), jnp.asarray(8.0), jnp.asarray(exponent)) for s in (-step, step)]
-    assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
+    less, more = (term(jnp.asarray(1.0 + s), 8.0, exponent) for s in (-1e-6, 1e-6))
+    assert_allclose(found[0, 5], (more - less) / 2e-6, rtol=1e-6)
 
 
 def _torque(name, memory, **signals):
@@ -814,29 +755,28 @@ def test_presliding_is_dahls_friction_in_place_of_coulombs():
     assert (terms(settled, signals=dataclasses.replace(STATES, memory={})) == 0).all()
 
 
-@pytest.mark.parametrize(("bend", "way"), [(0.4, 1.0), (-0.9, 1.0), (0.7, -1.0)])
+@pytest.mark.parametrize("bend, way", [(0.4, 1.0), (-0.9, 1.0), (0.7, -1.0)])
 def test_load_lost_through_a_bristle_is_its_mean_and_its_difference(bend, way):
     """μ_avg |τ| z + μ_dif τ z² with μ_avg = a + b/2 and μ_dif = -b/2, whichever way the load acts."""
     average, difference = 0.12, -0.05
     amplitudes = {"bristle_load_loss": average + difference, "bristle_backdriving_loss": -2 * difference}
+
+    def at(name, amplitude, **signals):
+        given = {k: jnp.asarray(v) for k, v in (signals | {"direction": way}).items()}
+        return fitted(BY_NAME[name], amplitude), Signals(memory={name: jnp.asarray(bend)}, **given)
+
     for load in (1.5, -1.5):
-        at = dict(torque_carried=jnp.asarray(load), direction=jnp.asarray(way))
-        signals = [Signals(memory={n: jnp.asarray(bend)}, **at) for n in amplitudes]
-        found = [
-            fitted(BY_NAME[n], a).term(NOMINAL, s) for (n, a), s in zip(amplitudes.items(), signals, strict=True)
-        ]
-        assert float(sum(found)) == pytest.approx(average * abs(load) * bend + difference * load * bend**2)
-    rate = fitted(BY_NAME["bristle_load_loss"], 1.0).rate
-    at = Signals(
-        memory={"bristle_load_loss": jnp.asarray(bend)}, speed_wheel=jnp.asarray(4 * way), direction=jnp.asarray(way)
-    )
-    assert float(rate(NOMINAL, at)) == pytest.approx((4 * way - 4 * bend) / 0.02)
+        made = [at(name, a, torque_carried=load) for name, a in amplitudes.items()]
+        lost = sum(float(effect.term(NOMINAL, signals)) for effect, signals in made)
+        assert lost == pytest.approx(average * abs(load) * bend + difference * load * bend**2)
+    effect, signals = at("bristle_load_loss", 1.0, speed_wheel=4 * way)
+    assert float(effect.rate(NOMINAL, signals)) == pytest.approx((4 * way - 4 * bend) / 0.02)
 
 
 @pytest.mark.parametrize("name", ["bristle_load_loss", "bristle_backdriving_loss"])
 def test_settled_loss_through_a_bristle_is_that_of_the_load(name):
     settled = dataclasses.replace(STATES, memory={})
-    at_speed = np.abs(np.asarray(settled.direction)) == 1
+    at_speed = np.abs(settled.direction) == 1
     found, known = (_term(n, settled, amplitude=0.1)[at_speed] for n in (name, BY_NAME[name].settles_to))
     assert_allclose(found, known, rtol=1e-12, atol=1e-15)
     assert at_speed.sum() > 300 and np.abs(found).max() > 0.01
@@ -860,13 +800,12 @@ def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
 
 
 def test_friction_by_the_position_begins_where_a_history_does():
-    names = ("position_friction", "angle_friction", "presliding")
-    load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
-    robot = paper_robots.blank_robot(Configurations({"bench": load}))
-    begins = RunStarts({"begin_a": RunStart(angle=1.5), "begin_b": RunStart(angle=-2.0)})
+    names, angles = ("position_friction", "angle_friction", "presliding"), (1.5, -2.0)
+    robot = blank_robot(Configurations({"bench": Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)}))
+    begins = RunStarts({f"begin_{k}": RunStart(angle=angle) for k, angle in enumerate(angles)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
-    for begin, angle in enumerate((1.5, -2.0)):
+    for begin, angle in enumerate(angles):
         run = jax.tree.map(lambda x: x[0], Conditions([0], voltage=[0.0], begin=[begin]))
         memory = state_of_unknowns(robot, drive_start(robot, run)).memory
         assert [float(memory[n]) for n in names] == [angle, angle, 0.0]
@@ -876,22 +815,18 @@ def test_friction_by_the_position_begins_where_a_history_does():
 
 
 def test_library_declares_what_the_loop_asks_for():
-    assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
     both_ways = ["directional_friction", "directional_viscous", "torque_offset", "directional_stribeck"]
-    assert [e.name for e in ALL if e.needs_reverse] == both_ways
+    for field, names in {
+        "needs_battery": ["battery_sag"], "needs_reverse": both_ways, "odd_in_travel": [*both_ways, "slope_bias"],
+        "needs_duty": ["coast_decay", "duty_exponent", "duty_dead_band", "duty_saturation"],
+    }.items():  # fmt: skip
+        assert [e.name for e in ALL if getattr(e, field)] == names
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {
         "thermal_drift": "winding_heating", "torque_offset": "directional_friction",
         "bristle_load_loss": "gear_load_loss", "bristle_backdriving_loss": "backdriving_loss",
     }  # fmt: skip
-    assert [e.name for e in ALL if e.needs_duty] == [
-        "coast_decay",
-        "duty_exponent",
-        "duty_dead_band",
-        "duty_saturation",
-    ]
     # An effect of a balance without a probe would have a score of 0 in every table.
     assert {e.balance for e in ALL if SettledRuns.shows(e)} <= {*PROBED, "sensor"}
-    assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",
     }  # fmt: skip
@@ -913,7 +848,7 @@ def test_settled_travel_cannot_tell_an_effect_from_the_one_it_settles_to():
 
 
 @pytest.mark.parametrize(
-    ("name", "configurations", "acts"),
+    "name, configurations, acts",
     [
         ("churning", (), (1, 1)),
         ("churning", ("4W2T",), (0, 1)),

@@ -1,18 +1,19 @@
 """An elastic joint between motor and load: its frequency, its motion beside SciPy's, and a log that has one."""
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy import signal
 from scipy.integrate import solve_ivp
 from test_events import NAMES, SAMPLES
 from worlds.events import Bench, through
 
-from calibration.data import runs as records
+from calibration.data.runs import read_runs
 from calibration.discovery import discover, loop_input
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import BY_NAME
@@ -31,9 +32,9 @@ from tests.commands import read_rig
 MOTOR = Bench(inertia_motor=2e-5, torque_constant=0.02, loss_coulomb=0.02, friction_motor=2e-4)
 #: Joints of 15 and 40 Hz, one of them with play.
 JOINTS = {
-    "soft": dataclasses.replace(MOTOR, stiffness=36.0, damper=0.02),
-    "hard": dataclasses.replace(MOTOR, stiffness=260.0, damper=0.05),
-    "with play": dataclasses.replace(MOTOR, stiffness=260.0, damper=0.05, backlash=0.03),
+    "soft": replace(MOTOR, stiffness=36.0, damper=0.02),
+    "hard": replace(MOTOR, stiffness=260.0, damper=0.05),
+    "with play": replace(MOTOR, stiffness=260.0, damper=0.05, backlash=0.03),
 }
 
 
@@ -47,7 +48,7 @@ def robot_of(bench, **more):
 @pytest.mark.parametrize("name", ["soft", "hard"])
 def test_frequency_and_damping_are_those_of_two_inertias(name):
     """Eigenvalues of the rates about forward travel, without friction, beside those of the linear equations."""
-    bench = dataclasses.replace(JOINTS[name], friction_motor=0.0, loss_coulomb=0.0, efficiency=1.0)
+    bench = replace(JOINTS[name], friction_motor=0.0, loss_coulomb=0.0, efficiency=1.0)
     robot, at = robot_of(bench), Conditions(voltage=6.0)
     size = np.asarray(drive_units(robot))
     y = jnp.asarray(np.array([0.5, 100.0, 100.0 / bench.ratio, 0.0, 0.0, 0.02]) / size)
@@ -78,11 +79,11 @@ def test_a_start_against_the_joint_is_that_of_scipy(name):
 
 
 def test_settled_travel_knows_no_joint_and_a_hanging_load_begins_twisted():
-    bench = dataclasses.replace(JOINTS["soft"], backlash=0.0)
+    bench = replace(JOINTS["soft"], backlash=0.0)
     runs = Conditions(voltage=np.array([6.0, -6.0]))
     turned, rigid = (
         steady_batch(robot_of(bench), runs),
-        steady_batch(robot_of(dataclasses.replace(bench, stiffness=0.0)), runs),
+        steady_batch(robot_of(replace(bench, stiffness=0.0)), runs),
     )
     assert_allclose(turned.reading["motor_speed"], rigid.reading["motor_speed"], rtol=1e-12)
     start = drive_start(robot_of(bench, **{"bench.torque_constant": 0.6}), Conditions(voltage=0.0))
@@ -90,15 +91,10 @@ def test_settled_travel_knows_no_joint_and_a_hanging_load_begins_twisted():
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory):
+def log():
     """A log of SciPy's joint of 8.6 Hz, with current and speed of the load at 100 Hz, and what made it."""
-    bench = dataclasses.replace(MOTOR, friction_motor=1e-3, loss_coulomb=0.05, stiffness=12.0, damper=0.02)
-    random = np.random.default_rng(5)
-    held, y, lines = (
-        0.15,
-        np.zeros(4),
-        ["time_s,supply_voltage_V,total_current_A,total_current_sd_A,output_speed_rpm,output_speed_sd_rpm"],
-    )
+    bench = replace(MOTOR, friction_motor=1e-3, loss_coulomb=0.05, stiffness=12.0, damper=0.02)
+    random, held, y, rows = default_rng(5), 0.15, np.zeros(4), []
     for k, volts in enumerate(random.choice([-6.0, -4.0, -2.0, 2.0, 4.0, 6.0], size=40)):
         times = np.arange(16) * held / 15
         run = solve_ivp(
@@ -111,14 +107,14 @@ def log(tmp_path_factory):
             atol=1e-10,
         )
         y = run.y[:, -1]
-        for t, current, speed in zip(times[:-1] + k * held, run.y[0], run.y[2], strict=False):
-            noise = 0.01 * random.standard_normal(), 0.02 * random.standard_normal()
-            lines.append(
-                f"{t:.4f},{volts:g},{current + noise[0]:.6g},0.01,{(speed + noise[1]) / RPM:.6g},{0.02 / RPM:.6g}"
-            )
-    folder = tmp_path_factory.mktemp("joint")
-    (folder / "log.csv").write_text("\n".join(lines))
-    return folder, bench
+        rows.append([times[:-1] + k * held, np.full(15, volts), run.y[0, :-1], run.y[2, :-1]])
+    time, volts, current, speed = np.concatenate(rows, 1)
+    noise = random.standard_normal((len(time), 2)).T * [[0.01], [0.02]]
+    return bench, {
+        "time_s": time, "supply_voltage_V": volts, "total_current_A": current + noise[0],
+        "total_current_sd_A": np.full(len(time), 0.01), "output_speed_rpm": (speed + noise[1]) / RPM,
+        "output_speed_sd_rpm": np.full(len(time), 0.02 / RPM),
+    }  # fmt: skip
 
 
 RIG = """
@@ -145,11 +141,10 @@ loss_viscous = "0.02 ± 0.02"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", ["", 'stiffness = "20 ± 15"\ndamping = "0.03 ± 0.03"\n'], ids=["rigid", "elastic"])
-def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(log, joint):
-    folder, bench = log
-    robot = read_rig(folder, RIG + joint)
-    runs = records.read_runs(folder / "log.csv", robot=robot)
-    fit = calibrate(runs, robot, model="drive", starts=1, blocks=False, profiles=False)
+def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(log, tmp_path, joint):
+    bench, columns = log
+    robot = read_rig(tmp_path, RIG + joint)
+    fit = calibrate(read_runs(columns, robot=robot), robot, model="drive", starts=1, blocks=False, profiles=False)
     friction = fit.parameters["bench.loss_coulomb"]
     if not joint:
         assert fit.adequacy.adequate is False and friction.value < 0.1 * bench.loss_coulomb
@@ -162,14 +157,13 @@ def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(lo
 
 
 @pytest.mark.nightly
-def test_the_loop_names_no_effect_for_a_joint_that_twists(log):
+def test_the_loop_names_no_effect_for_a_joint_that_twists(log, tmp_path):
     """The strongest effect of the library passes every threshold (117 of 3 σ) and explains a tenth of the misfit."""
-    folder, _ = log
-    robot = read_rig(folder, RIG)
-    runs = records.read_runs(folder / "log.csv", robot=robot)
+    robot = read_rig(tmp_path, RIG)
+    runs = read_runs(log[1], robot=robot)
     names = ("bristle_load_loss", "stick_slip", "directional_friction", "series_resistance")
     given = loop_input.prepare_loop(runs, robot, library={n: BY_NAME[n] for n in names})
-    traced = discover.trace_verdict(dataclasses.replace(given, settings=dataclasses.replace(given.settings, slots=1)))
+    traced = discover.trace_verdict(replace(given, settings=replace(given.settings, slots=1)))
     (test,) = traced.standing.tests
     assert test.root > 10 * test.needed and not test.established
     assert traced.verdict in ("place", "undescribed") and traced.members == ()
@@ -177,7 +171,7 @@ def test_the_loop_names_no_effect_for_a_joint_that_twists(log):
 
 def test_a_frequency_response_is_that_of_the_filter_that_made_it():
     """Two runs of steps through a resonance, read at uneven times, beside the filter's own response."""
-    random, runs = np.random.default_rng(2), []
+    random, runs = default_rng(2), []
     numerator, denominator = signal.zpk2tf(*signal.bilinear_zpk([], np.array([-8 + 40j, -8 - 40j]), 1600.0, 200.0))
     for rows in (4000, 2600):
         drive = np.repeat(random.choice([-1.0, 1.0, 2.0], size=rows // 20), 20)

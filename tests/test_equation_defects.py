@@ -1,11 +1,12 @@
 """What each equation lacks, row by row: nothing is a residual over a vanishing slope, each side has its own, and what
 was found is drawn over what it depends on."""
 
-import dataclasses
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 import mmrjax as mm
@@ -16,9 +17,9 @@ from mmrjax import effects
 from mmrjax.model import channels
 from mmrjax.model.signals import Signals
 from sweeps.commands import loop as page
-from sweeps.pages import loop_figures
+from sweeps.pages.loop_figures import _defect_variable, conditions_and_readings, draw_defects, driving_variable
 
-ROWS, COUNT, RANDOM = 12, 3, np.random.default_rng(0)
+ROWS, COUNT, RANDOM = 12, 3, default_rng(0)
 #: Sizes of voltage, torque and speed; and how many sds of a reading a defect of that size is.
 SIZES, SEEN = {"voltage": 20.0, "torque_output": 2.0, "speed_theoretical": 0.5}, 200.0
 #: What turns the output, of a gearbox 16 : 1.
@@ -38,7 +39,7 @@ def linearised(kind, slopes, defects, **others):
     shape = (ROWS, sides) if sides > 1 else (ROWS,)
     signals = Signals(**{name: np.full(shape, size) for name, size in (SIZES | SHAFT | others).items()})
     way = np.broadcast_to(WAY[:, None], shape) if sides > 1 else WAY
-    signals = dataclasses.replace(signals, direction=way)
+    signals = replace(signals, direction=way)
     scale = np.ones(residual.shape)
     whole = whole if sides > 1 else whole[:, 0]
     return kind(residual.ravel(), np.zeros((residual.size, 1)), np.zeros((residual.size, 0)), whole, scale, signals,
@@ -65,7 +66,7 @@ def test_no_defect_is_a_residual_over_a_vanishing_slope(slope):
     slopes = slopes_of(1)
     slopes[2, 0, 3] *= slope  # the slip of one row
     linear = linearised(SettledLinearization, slopes, np.zeros((3, 1, ROWS)))
-    noisy = dataclasses.replace(linear, residual=RANDOM.normal(size=ROWS * COUNT))
+    noisy = replace(linear, residual=RANDOM.normal(size=ROWS * COUNT))
     found = _row_defects(noisy, np.ones(ROWS, bool))["slip"]
     assert abs(found[3]) < SIZES["speed_theoretical"]
 
@@ -105,7 +106,7 @@ def turns():
 
 
 @pytest.mark.parametrize(
-    ("change", "label"),
+    "change, label",
     [
         (lambda t: t["supply_voltage_V"] ** 2, "supply voltage [V]"),
         (lambda t: np.abs(t["motor_current_right_A"]), "motor current, right [A]"),
@@ -118,29 +119,29 @@ def test_what_was_found_is_drawn_over_what_it_depends_on(change, label):
     table = turns()
     y = change(table)
     y[3] = np.nan  # a row that does not count
-    x, said = loop_figures.driving_variable(table, y)
+    x, said = driving_variable(table, y)
     assert said == label and x.shape == y.shape
 
 
 def test_voltage_of_a_side_is_its_share_of_the_supply():
     table = turns()
     given = table["supply_voltage_V"] * table["duty_left"]
-    assert np.array_equal(loop_figures.conditions_and_readings(table)["voltage, left [V]"], given)
+    assert np.array_equal(conditions_and_readings(table)["voltage, left [V]"], given)
 
 
 def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
     duty = RANDOM.uniform(-1, 1, 8)
     table = {"configuration": np.full(8, "rig"), "supply_voltage_V": np.full(8, 48.0), "duty": duty}
     for x, label in (
-        loop_figures.driving_variable(table, duty**3),
-        loop_figures._defect_variable(table, "slope_deg", "slope [deg]"),
+        driving_variable(table, duty**3),
+        _defect_variable(table, "slope_deg", "slope [deg]"),
     ):
         assert np.array_equal(x, 48.0 * duty) and label == "voltage given to the motors [V]"
 
 
 def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
     table = turns()
-    fig = loop_figures.draw_defects(table, "none", crosses_zero=True)
+    fig = draw_defects(table, "none", crosses_zero=True)
     for axes, column in zip(
         fig.axes, ("motor_current_{}_A", "motor_speed_{}_rpm", "motor_speed_{}_rpm"), strict=True
     ):
@@ -152,13 +153,12 @@ def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
 
 def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
     """A turn's yaw rate may be next to nothing. What an effect changes of it is no share of that."""
-    robot = dataclasses.replace(mm.nominal(), effects=(effects.BY_NAME["iron_loss"](amplitude=1.0),))
-    (yaw,) = channels.channels_named(["yaw_rate"])
+    robot = replace(mm.nominal(), effects=(effects.BY_NAME["iron_loss"](amplitude=1.0),))
     rates = [np.array([1.0, -1.0, 1e-9]), np.array([1.1, -1.1, 0.1])]
     monkeypatch.setattr(page.mm, "simulate", lambda *_: SimpleNamespace(yaw_rate=rates.pop(0)))
     found = SimpleNamespace(
-        effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationErrors({}, {}), channels=(yaw,),
-        runs=SimpleNamespace(conditions=lambda robot: None), included=np.ones(3, bool),
+        effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationErrors({}, {}), included=np.ones(3, bool),
+        channels=channels.channels_named(["yaw_rate"]), runs=SimpleNamespace(conditions=lambda robot: None),
         readings_of_rows=SimpleNamespace(measured=np.array([[1.0], [-1.0], [0.0]])),
     )  # fmt: skip
     assert page.changes_by_effect(found)["iron_loss"].rms == pytest.approx(10 * np.sqrt(1.5), rel=1e-6)

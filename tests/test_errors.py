@@ -3,39 +3,35 @@
 import numpy as np
 import pytest
 
-from calibration.inference import simulation_errors
+from calibration.inference.simulation_errors import channel_errors, error_summary, r_squared, relative_error
 from mmrjax.model.channels import usual_channels
 
 
 def test_relative_error_is_equation_35_with_simulated_below():
-    assert simulation_errors.relative_error(np.array([2.22]), np.array([2.30])) == pytest.approx(
-        [-3.6], abs=0.05
-    )  # Table A1
+    assert relative_error(np.array([2.22]), np.array([2.30])) == pytest.approx([-3.6], abs=0.05)  # Table A1
 
 
 def test_summary_leaves_out_rows_without_a_simulation():
-    assert simulation_errors.error_summary(np.array([3.0, -4.0, np.nan])) == {
+    assert error_summary(np.array([3.0, -4.0, np.nan])) == {
         "rows": 2,
         "rms_percent": pytest.approx(np.sqrt(12.5)),
         "max_percent": 4.0,
     }
-    assert simulation_errors.error_summary(np.array([np.nan]))["rows"] == 0
+    assert error_summary(np.array([np.nan]))["rows"] == 0
 
 
 def test_certainty_is_equation_a1():
     y = np.array([1.0, 2.0, 4.0])
-    assert simulation_errors.r_squared(y, y) == 1.0
-    assert simulation_errors.r_squared(y, np.full(3, y.mean())) == pytest.approx(0.0)
-    assert simulation_errors.r_squared(y, y + 1) == pytest.approx(1 - 3 / (21 - 49 / 3))
-    assert np.isnan(simulation_errors.r_squared(np.ones(3), y)) and np.isnan(
-        simulation_errors.r_squared(y[:1], y[:1])
-    )
+    assert r_squared(y, y) == 1.0
+    assert r_squared(y, np.full(3, y.mean())) == pytest.approx(0.0)
+    assert r_squared(y, y + 1) == pytest.approx(1 - 3 / (21 - 49 / 3))
+    assert np.isnan(r_squared(np.ones(3), y)) and np.isnan(r_squared(y[:1], y[:1]))
 
 
 def test_channel_errors_leave_out_what_is_missing():
     measured = np.array([[2.0, np.nan, 1.0], [4.0, np.nan, np.nan]])
     simulated = np.array([[2.0, 5.0, 1.1], [5.0, 5.0, 1.1]])
-    found = simulation_errors.channel_errors(usual_channels(), simulated, measured, np.ones((2, 3)))
+    found = channel_errors(usual_channels(), simulated, measured, np.ones((2, 3)))
     assert [found[c]["rows"] for c in ("total_current", "motor_speed", "speed")] == [2, 0, 1]
     assert found["total_current"]["rms_sigma"] == pytest.approx(np.sqrt(0.5))
     assert found["total_current"]["max_percent"] == pytest.approx(100 / np.sqrt(10))
@@ -46,5 +42,5 @@ def test_channel_errors_leave_out_what_is_missing():
 
 def test_channel_errors_take_another_percentage():
     one = np.ones((2, 3))
-    found = simulation_errors.channel_errors(usual_channels(), one, one, one, percent=np.full((2, 3), -7.0))
+    found = channel_errors(usual_channels(), one, one, one, percent=np.full((2, 3), -7.0))
     assert found["speed"]["rms_percent"] == 7.0 and found["speed"]["rms_sigma"] == 0.0

@@ -20,7 +20,7 @@ DOCS = ROOT / "docs"
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize(("status", "code"), [(status, 3 if status == "failed" else 0) for status in words.STATUSES])
+@pytest.mark.parametrize("status, code", [(status, 3 if status == "failed" else 0) for status in words.STATUSES])
 def test_only_a_solver_that_failed_ends_with_3(status, code, mmrjax, monkeypatch):
     honest = run.evaluate_runs
 
@@ -52,7 +52,7 @@ PROGRAM = [sys.executable, "-c", "from sweeps.cli import main; main()"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "streams", "code"),
+    "arguments, streams, code",
     [
         ("--version", ">&-", 0),
         ("--version", "<&- >&- 2>&-", 0),

@@ -2,15 +2,16 @@
 
 import pytest
 
-from calibration.words import experiment_words as words_of
-from mmrjax import effects
+from calibration.words.experiment_words import effect_summary, effect_tests
+from mmrjax.effects import BY_NAME, OF_CHANNELS, OF_TURNS
 from mmrjax.errors import allowed_words, similar_words
-from mmrjax.model import channels, params
+from mmrjax.model import channels
+from mmrjax.model.params import walk_parameters
 from sweeps.commands import explain
-from sweeps.pages import words
+from sweeps.pages.words import FLAGS, GLOSSARY
 from tests.commands import ends
 
-EVERY = effects.BY_NAME | effects.OF_TURNS | effects.OF_CHANNELS
+EVERY = BY_NAME | OF_TURNS | OF_CHANNELS
 
 
 def said(kind, name):
@@ -24,44 +25,45 @@ def unsimulated(monkeypatch):
 
 
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
-    kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "conditions": "condition", "outputs": "output",
-             "parameters": "parameter", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb",
-             "words of the reports": "word of the reports", "keys that no fit frees": "key of a robot file"}  # fmt: skip
+    irregular = {
+        "statuses": "status", "verdicts of the loop": "verdict of the loop", "verdicts of a climb": "verdict of a climb",
+        "words of the reports": "word of the reports", "keys that no fit frees": "key of a robot file",
+    }  # fmt: skip
     for kind, those in explain.explainable_names(EVERY).items():
         for name in those:
-            lines = said(kinds[kind], name)
+            lines = said(irregular.get(kind, kind.removesuffix("s")), name)
             assert lines and all(text and "None" not in text for _, text in lines), (name, lines)
 
 
 def test_an_effect_is_explained_by_what_its_class_states(unsimulated):
     for name, effect in EVERY.items():
         lines = dict(said("effect", name))
-        spec = next(p.spec for p in params.walk_parameters(effect()) if p.spec.amplitude)
-        equation, meaning, source = words_of.effect_summary(effect)
+        spec = next(p.spec for p in walk_parameters(effect()) if p.spec.amplitude)
+        equation, meaning, source = effect_summary(effect)
         assert (lines["equation"], lines["stands for"], lines["source"]) == (equation, meaning, source)
         assert lines["typical size"].startswith(f"{spec.sd:g} {spec.unit}") and spec.source in lines["typical size"]
         assert effect.balance in lines["enters"] and lines["in data"].startswith(effect.family())
-        assert "on a bench" in lines and list(words_of.effect_tests(effect))
+        assert "on a bench" in lines and list(effect_tests(effect))
 
 
 def test_an_effect_of_ones_own_may_go_with_anything():
-    own = type("Damp", (effects.BY_NAME["churning"],), {"driver": "humidity"})
-    assert list(words_of.effect_tests(own))[-1] == "Vary the humidity"
+    own = type("Damp", (BY_NAME["churning"],), {"driver": "humidity"})
+    assert list(effect_tests(own))[-1] == "Vary the humidity"
 
 
 @pytest.mark.slow
 def test_a_typical_size_is_simulated():
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
-    changes = list(explain._change_sentences(effects.BY_NAME["series_resistance"]()))
+    changes = list(explain._change_sentences(BY_NAME["series_resistance"]()))
     assert len(changes) == 2 and changes[0].startswith(
-        "change of the readings at its typical size (6T2A, 24 V, 5°, 3 kg): total current -"
+        "change at its typical size (6T2A, 24 V, 5°, 3 kg): total current -"
     )
     assert "motor speed -3.3 %" in changes[0]
-    assert list(explain._change_sentences(effects.BY_NAME["armature_inductance"]())) == []
+    assert list(explain._change_sentences(BY_NAME["armature_inductance"]())) == []
 
 
 def test_parameters_and_channels_are_explained_by_their_rows(robot):
-    known = {p.name: p for p in params.walk_parameters(robot)}
+    known = {p.name: p for p in walk_parameters(robot)}
     lines = dict(said("parameter", "motor.resistance"))
     spec = known["motor.resistance"].spec
     assert (
@@ -78,15 +80,15 @@ def test_parameters_and_channels_are_explained_by_their_rows(robot):
 
 def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
     _, out, _ = ends(mmrjax("explain cut_off"), "cut_off: status", "cut_off: flag", code=0)
-    assert words.FLAGS["cut_off"] in " ".join(out.split())
+    assert FLAGS["cut_off"] in " ".join(out.split())
     assert max(map(len, out.splitlines())) <= 80
     _, out, _ = ends(mmrjax("explain held out"), code=0)
-    assert words.GLOSSARY["held out"] in " ".join(out.split())
+    assert GLOSSARY["held out"] in " ".join(out.split())
     ends(mmrjax("explain"), "series_resistance", "motor.resistance", "converged", code=0)
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    "name, says",
     [
         ("resistance", "did you mean one of these? battery.resistance, motor.resistance"),
         ("slidez", "did you mean slides"),
@@ -99,17 +101,7 @@ def test_an_unknown_name_is_answered_by_what_is_near(name, says, mmrjax):
 
 def test_near_words_have_the_word_as_a_part_whatever_its_capitals():
     outputs = ["total_current", "motor_speed", "peak_current", "slip"]
-    assert similar_words("current", outputs) == ["total_current"]
+    near = {"current": ["total_current"], "SLIP": ["slip"], "slop": ["slip"], "xyzzy": []}
+    assert {word: similar_words(word, outputs) for word in near} == near
     assert similar_words("current", outputs, 3) == ["total_current", "peak_current"]
-    assert (
-        similar_words("SLIP", outputs) == ["slip"]
-        and similar_words("slop", outputs) == ["slip"]
-        and similar_words("xyzzy", outputs) == []
-    )
     assert allowed_words("Motor_Speed", outputs).startswith("did you mean motor_speed? allowed: total_current")
-
-
-@pytest.mark.parametrize("name", ["established", "tentative", "held out", "noise", "voltage_limit"])
-def test_words_of_the_verdict_are_explained(name, mmrjax):
-    code, out, _ = mmrjax("explain", name)
-    assert code == 0 and words.GLOSSARY[name].split(".")[0][:40] in " ".join(out.split())

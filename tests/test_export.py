@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import csv
-import dataclasses
 import importlib
 import io
 import os
@@ -13,30 +12,63 @@ import shutil
 import subprocess
 import sys
 import types
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from worlds import servo
 
 import mmrjax as mm
-from calibration.data import posterior_file, robot_file
+from calibration.data import posterior_file
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.robot_file import find_robot_file
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import effects
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.model import balances, paper_robots, params
+from mmrjax.model import balances, paper_robots
+from mmrjax.model.params import walk_parameters
 from mmrjax.model.signals import Signals
-from sweeps.commands import rig_new
-from sweeps.export import comparison, expressions, feed_forward, formats, jax_actuator, law_source, mujoco
-from sweeps.export import joint as joints
-from tests.commands import ends, read_json
+from sweeps.commands.rig_new import joint_numbers, new_rig_text, rig_template
+from sweeps.export import comparison, mujoco
+from sweeps.export.expressions import (
+    ZERO,
+    Dialect,
+    Symbol,
+    apply_operation,
+    constant_symbol,
+    lines_of,
+    trace_function,
+)
+from sweeps.export.feed_forward import fates_in_tables, map_of_drive, table_files, table_law_function
+from sweeps.export.formats import draw_parameters, export_format, middle_run, randomization_files
+from sweeps.export.jax_actuator import (
+    actuator_law_function,
+    difference_from_jax,
+    fates_in_actuator,
+    jax_files,
+    onnx_files,
+    settled_actuator,
+)
+from sweeps.export.joint import INSIDE, channels_of, joint_of_robot
+from sweeps.export.law_source import (
+    LawConstant,
+    function_arguments,
+    jax_source,
+    law_constants,
+    mjlab_files,
+    module_from_source,
+    torch_source,
+)
+from tests.commands import ROOT, ends, read_json
 
 WHEELS, TRACKS = "4W2T", "6T2A"
+#: Comments of a model's constants.
+ABOUT = dict.fromkeys(("frictionloss", "damping", "armature"), "")
 #: Effects of the drive under test: one that MuJoCo has a term for, one that it can stand in for, one with a memory.
 AMPLITUDES = {"series_resistance": 0.3, "churning": 2e-4, "presliding": 0.05}
 
@@ -45,16 +77,24 @@ def of_effects(amplitudes):
     """The packaged robot's file with some effects."""
     known = {**effects.BY_NAME, **effects.BESIDE}
     having = tuple(known[name](amplitude=a) for name, a in amplitudes.items())
-    return dataclasses.replace(
-        robot_file.find_robot_file("nominal"), robot=dataclasses.replace(paper_robots.nominal(), effects=having)
-    )
+    return replace(find_robot_file("nominal"), robot=replace(paper_robots.nominal(), effects=having))
+
+
+def drive_of(rig):
+    """The joint of a rig's file."""
+    return joint_of_robot(find_robot_file(str(rig)))
+
+
+def law_of(drive, known=None, source=jax_source):
+    """The exported law of a drive as a module."""
+    return module_from_source(source(drive, known or law_constants(drive, None, None)))
 
 
 def compared(file):
     """A drive on wheels and the native model over Table 8."""
-    drive = joints.joint_of_robot(file, WHEELS)
+    drive = joint_of_robot(file, WHEELS)
     runs = comparison.situation_of_joint(drive, None)
-    return drive, runs, law_source.law_constants(drive, runs.signals, None)
+    return drive, runs, law_constants(drive, runs.signals, None)
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +119,8 @@ def translated(drive, runs):
         mujoco.approximated_terms,
     )
     motor = mujoco.mjcf_motor(drive, found.refitted)
-    about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
     files = {
-        "drive.xml": mujoco.mjcf_fragment(drive, motor, about, [], "motor", "drive", 33.0),
+        "drive.xml": mujoco.mjcf_fragment(drive, motor, ABOUT, [], "motor", "drive", 33.0),
         "scene.xml": mujoco.mjcf_scene(drive, 11.5, "motor", "drive", 24.0, 0.5),
     }
     return found, motor, files
@@ -94,59 +133,42 @@ def apart(a, b):
 
 def test_text_of_every_effect_computes_what_the_balances_do():
     """Values, slopes and rates of all parts of the law as written, at random signals, against the model's code."""
-    kinds = {
-        name: kind
-        for name, kind in effects.BY_NAME.items()
-        if kind.balance in joints.INSIDE and not kind.needs_battery
-    }
+    kinds = {n: k for n, k in effects.BY_NAME.items() if k.balance in INSIDE and not k.needs_battery}
     kinds |= {n: effects.UNNAMED[n] for n in ("curve_track_speed", "wave_electrical")}
-    drive = joints.joint_of_robot(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
-    assert {p.effect for p in drive.parts} - {""} == set(kinds)
-    text = expressions_text(drive)
-    rng = np.random.default_rng(1)
+    drive = joint_of_robot(of_effects(dict.fromkeys(kinds, 0.1)), TRACKS)
+    parts = [part for part in drive.parts if part.effect]
+    assert {p.effect for p in parts} == set(kinds)
+    text, rng = expressions_text(drive), default_rng(1)
     for sense in (1.0, -1.0):
         at = {
             "current": 2.0 * rng.uniform(), "voltage": 24.0, "motor_speed": sense * rng.uniform(100, 600), "angle": 0.3,
             "wheel_speed": sense * rng.uniform(2, 12), "way": sense, "load": rng.uniform(-2, 2), "pull": rng.uniform(-2, 2),
         }  # fmt: skip
-        for part in drive.parts:
-            if not part.effect:
-                continue
-            memory = float(rng.uniform(-1, 1))
-            given = {**at, "memory": memory}
+        for part in parts:
+            given = {**at, "memory": float(rng.uniform(-1, 1))}
 
-            def native(changed, part=part, given=given):
-                return term(drive, part, {**given, **changed})
+            def by(name, rate=False, part=part, given=given):
+                return jax.value_and_grad(lambda size: term(drive, part, {**given, name: size}, rate))(given[name])
 
-            assert text(part, "", given) == pytest.approx(float(native({})), rel=1e-9, abs=1e-15), part.name
-            if part.by and sense > 0:
-                slope = jax.grad(lambda x, part=part, native=native: native({part.by: x}))(given[part.by])
-                assert text(part, "_slope", given) == pytest.approx(float(slope), rel=1e-9, abs=1e-15), part.name
-            if part.rate is not None and sense > 0:
-                rate = jax.value_and_grad(
-                    lambda m, part=part, given=given: term(drive, part, {**given, "memory": m}, rate=True)
-                )(memory)
-                found = text(part, "_rate", given), text(part, "_rate_slope", given)
-                assert found == pytest.approx([float(x) for x in rate], rel=1e-9, abs=1e-15), part.name
+            value, slope = by(part.by or "memory")
+            expected = {"": value} | ({"_slope": slope} if part.by else {})
+            if part.rate is not None:
+                expected["_rate"], expected["_rate_slope"] = by("memory", rate=True)
+            found = {suffix: text(part, suffix, given) for suffix in expected}
+            assert found == pytest.approx({s: float(x) for s, x in expected.items()}, rel=1e-9, abs=1e-15), part.name
 
 
 def expressions_text(drive):
     """Function from part, suffix and signals to the number that its text computes."""
-    known = [
-        law_source.LawConstant(n, x, "", "", "")
-        for n, x in {
-            **{n: float(p.value) for n, p in drive.parameters().items()},
-            **dict.fromkeys(drive.surroundings(), 0.7),
-        }.items()
-    ]
-    source = law_source.jax_source(drive, known)
-    module = law_source.module_from_source(
+    numbers = {n: float(p.value) for n, p in drive.parameters().items()} | dict.fromkeys(drive.surroundings(), 0.7)
+    source = jax_source(drive, [LawConstant(n, x, "", "", "") for n, x in numbers.items()])
+    module = module_from_source(
         source.replace("import jax.numpy as jnp", "import numpy as jnp")
     )  # it compiles nothing
 
     def text(part, suffix, given):
         symbol = {"": part.value, "_slope": part.slope, "_rate": part.rate, "_rate_slope": part.rate_slope}[suffix]
-        words = [given[name] for name in law_source.function_arguments(symbol)]
+        words = [given[name] for name in function_arguments(symbol)]
         return float(getattr(module, part.name + suffix)(module.PARAMS, *words))
 
     return text
@@ -169,23 +191,23 @@ def term(drive, part, given, rate=False):
     )  # fmt: skip
     if rate:
         return jnp.asarray(effect.rate(robot, signals))
-    return jnp.asarray(balances.effects_sum(dataclasses.replace(robot, effects=(effect,)), signals, part.balance))
+    return jnp.asarray(balances.effects_sum(replace(robot, effects=(effect,)), signals, part.balance))
 
 
 def test_mujoco_runs_the_drive_as_the_native_model_over_table_8(plain):
     drive, runs, _ = plain
     found, motor, files = translated(drive, runs)
     rows = np.linspace(0, len(runs.command) - 1, 6).astype(int)
-    got = mujoco.settle_in_mujoco(files, motor, runs, found.exported, rows.tolist())
-    assert apart(got.current, runs.inside.current[rows]) < 1e-3
-    assert apart(got.speed, runs.inside.speed[rows]) < 1e-3
+
+    def off(motor, files, rows):
+        got = mujoco.settle_in_mujoco(files, motor, runs, found.exported, rows.tolist())
+        return apart(got.current, runs.inside.current[rows]), apart(got.speed, runs.inside.speed[rows])
+
+    assert max(off(motor, files, rows)) < 1e-3
     assert found.translated == found.refitted  # exact already: no refit changes it
-    wrong = dataclasses.replace(motor, values={**motor.values, mujoco.RESISTANCE: 0.9})
-    other = mujoco.mjcf_fragment(
-        drive, wrong, dict.fromkeys(("frictionloss", "damping", "armature"), ""), [], "motor", "drive", 33.0
-    )
-    assert apart(mujoco.settle_in_mujoco({**files, "drive.xml": other}, wrong, runs, found.exported, rows[:2].tolist()).speed,
-                 runs.inside.speed[rows[:2]]) > 1e-3  # fmt: skip
+    wrong = replace(motor, values={**motor.values, mujoco.RESISTANCE: 0.9})
+    other = mujoco.mjcf_fragment(drive, wrong, ABOUT, [], "motor", "drive", 33.0)
+    assert off(wrong, {**files, "drive.xml": other}, rows[:2])[1] > 1e-3
 
 
 def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
@@ -193,32 +215,30 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
     found, motor, files = translated(drive, runs)
     rows = np.linspace(0, len(runs.command) - 1, 8).astype(int)
     got = mujoco.settle_in_mujoco(files, motor, runs, found.exported, rows.tolist())
-    for mine, law, native in (
-        (got.current, found.exported.current, runs.inside.current),
-        (got.speed, found.exported.speed, runs.inside.speed),
-    ):
+    for name in ("current", "speed"):
+        mine, law, native = (getattr(x, name) for x in (got, found.exported, runs.inside))
         stated = apart(law[rows], native[rows])
         assert stated > 1e-4  # churning is lost in part
         assert apart(mine, native[rows]) == pytest.approx(stated, rel=0.1)
-    verdicts = {f.name: f for f in found.fates}
-    assert verdicts["series_resistance"].verdict == comparison.HELD
+    verdicts, held = {f.name: f for f in found.fates}, comparison.HELD
+    # presliding by lugre, although settled runs do not show it
+    expected = {"series_resistance": held, "presliding": held, "churning": comparison.APPROXIMATED}
+    assert {name: verdicts[name].verdict for name in expected} == expected
     assert verdicts["series_resistance"].kept > 0.97
-    assert verdicts["presliding"].verdict == comparison.HELD  # by lugre, although settled runs do not show it
-    assert verdicts["churning"].verdict == comparison.APPROXIMATED
     errors = {label: percent["total_current"] for label, percent in found.errors.items()}
     assert errors[comparison.EXPORTED] < 0.2 * min(errors[comparison.TRANSLATED], errors[comparison.WITHOUT])
 
 
 def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
     drive, runs, known = with_effects
-    law = jax_actuator.actuator_law_function(runs, known)(drive, {})
+    law = actuator_law_function(runs, known)(drive, {})
     current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert_allclose(current, runs.inside.current, rtol=1e-9)
     assert_allclose(speed, runs.inside.speed, rtol=1e-9)
-    source = law_source.jax_source(drive, known)
+    source = jax_source(drive, known)
     imported = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Import | ast.ImportFrom)]
     assert [ast.unparse(n) for n in imported] == ["import jax.numpy as jnp"]
-    module = law_source.module_from_source(source)
+    module = module_from_source(source)
 
     def power(voltage):
         state, speed = module.initial_state(), jnp.asarray(0.0)
@@ -233,9 +253,9 @@ def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
 
 def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
     drive, _, known = with_effects
-    module = law_source.module_from_source(law_source.jax_source(drive, known))
+    module = law_of(drive, known)
     speed = jnp.asarray([3.0, 8.0, -5.0])
-    torque, info = jax_actuator.settled_actuator(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
+    torque, info = settled_actuator(module, module.PARAMS, jnp.asarray([12.0, 24.0, -15.0]), speed)
     lost = sum(info[name] for name in info if name.startswith("lost"))
     assert_allclose(info["power"], torque * speed + lost, rtol=1e-9)
 
@@ -253,23 +273,19 @@ def test_serialised_actuator_has_the_same_bytes_in_every_process_and_folder(rig,
     for seed in "12":
         (folder := tmp_path / seed).mkdir()
         shutil.copy(rig, folder)
-        shutil.copytree(Path(law_source.__file__).parents[1], folder / "sweeps")
-        folders = [str(folder), str(Path(law_source.__file__).parents[2]), os.environ.get("PYTHONPATH")]
-        path = os.pathsep.join(filter(None, folders))
+        shutil.copytree(ROOT / "sweeps", folder / "sweeps")
+        path = os.pathsep.join(filter(None, [str(folder), str(ROOT), os.environ.get("PYTHONPATH")]))
         given = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path}
-        found.append(
-            subprocess.run(
-                [sys.executable, "-c", code], cwd=folder, env=given, check=True, stdout=subprocess.PIPE
-            ).stdout
-        )
+        words = [sys.executable, "-c", code]
+        found.append(subprocess.run(words, cwd=folder, env=given, check=True, capture_output=True).stdout)
     assert found[0] == found[1] and len(found[0]) > 1000
 
 
 def test_serialised_actuator_computes_what_its_source_does(with_effects):
     drive, _, known = with_effects
-    files = jax_actuator.jax_files(drive, known, [])
+    files = jax_files(drive, known, [])
     assert b".py" not in files["actuator.jaxexport"]  # no path of this machine
-    module = law_source.module_from_source(files["actuator.py"])
+    module = module_from_source(files["actuator.py"])
     with jax.enable_x64(False):
         kept = jax.export.deserialize(bytearray(files["actuator.jaxexport"]))
         numbers = {n: jnp.float32(v) for n, v in module.PARAMS.items()}
@@ -281,15 +297,15 @@ def test_serialised_actuator_computes_what_its_source_does(with_effects):
 
 def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     drive, runs, known = with_effects
-    found = feed_forward.map_of_drive(runs, known)
-    files = feed_forward.table_files(drive, found, [])
+    found = map_of_drive(runs, known)
+    files = table_files(drive, found, [])
     rows = list(csv.DictReader(io.StringIO(files["feed_forward.csv"])))
     assert len(rows) == len(found.speed) * len(found.torque)
     row = next(r for r in rows if float(r["joint_speed_rad_s"]) > 5 and float(r["joint_torque_Nm"]) > 0.5)
     given = {n: float(v) for n, v in row.items()}
     lost = sum(v for n, v in given.items() if n.startswith("lost"))
     assert given["power_W"] == pytest.approx(given["joint_speed_rad_s"] * given["joint_torque_Nm"] + lost, rel=1e-5)
-    law = feed_forward.table_law_function(runs, known)(drive, {})
+    law = table_law_function(runs, known)(drive, {})
     current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert (
         apart(np.asarray(speed), runs.inside.speed) < 2e-3 and apart(np.asarray(current), runs.inside.current) < 1e-2
@@ -312,15 +328,15 @@ def test_onnx_model_is_the_step_of_jax(with_effects):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
     drive, _, known = with_effects
-    files = jax_actuator.onnx_files(drive, known)
-    assert jax_actuator.difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
+    files = onnx_files(drive, known)
+    assert difference_from_jax(drive, known, files["actuator.onnx"]) < 1e-5
 
 
 def test_missing_onnx_library_names_the_extra(with_effects, monkeypatch):
     drive, _, known = with_effects
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(BadConfiguration, match=r'jax2onnx is not installed; pip install "mmrjax\[export\]"'):
-        jax_actuator.onnx_files(drive, known)
+        onnx_files(drive, known)
 
 
 def stand_in(monkeypatch):
@@ -342,7 +358,7 @@ def stand_in(monkeypatch):
         def reset(self, env_ids=None):
             pass
 
-    @dataclasses.dataclass(kw_only=True)
+    @dataclass(kw_only=True)
     class ActuatorCfg:
         target_names_expr: tuple[str, ...]
 
@@ -360,7 +376,7 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
 
     stand_in(monkeypatch)
     drive, _, known = with_effects
-    (tmp_path / "mjlab_actuator.py").write_text(law_source.mjlab_files(drive, known, [])["mjlab_actuator.py"])
+    (tmp_path / "mjlab_actuator.py").write_text(mjlab_files(drive, known, [])["mjlab_actuator.py"])
     monkeypatch.syspath_prepend(tmp_path)
     module = importlib.import_module("mjlab_actuator")
     cfg = module.DriveActuatorCfg(target_names_expr=("left", "right"))
@@ -373,8 +389,8 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
     model = spec.compile()
     assert model.nu == 2 and model.dof_armature[0] == pytest.approx(3.35e-6 * 48**2 * (0.74 + 1 / 0.74) / 2)
     actuator.initialize(model, None, types.SimpleNamespace(nworld=3), "cpu")
-    rng = np.random.default_rng(3)
-    native = law_source.module_from_source(law_source.jax_source(drive, known))
+    rng = default_rng(3)
+    native = law_of(drive, known)
     state = native.initial_state((3, 2))
     for _ in range(3):
         volts, speeds = rng.uniform(-24, 24, (3, 2)), rng.uniform(-8, 8, (3, 2))
@@ -392,27 +408,26 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
 
 def test_draws_are_correlated_as_the_posterior_and_in_both_formats(plain):
     drive, runs, known = plain
-    names = ("motor.resistance", "motor.friction_coulomb")
-    at = priors.parameter_coordinates(drive.file.robot, names, {})
+    at = priors.parameter_coordinates(drive.file.robot, ("motor.resistance", "motor.friction_coulomb"), {})
     spread = np.array([[0.3, 0.0], [-0.24, 0.18]])
     posterior = posterior_of_coordinates(at, np.zeros(2), spread @ spread.T)
     normal = float(np.mean(runs.signals.normal))
     law = mujoco.translate_law(drive, normal)
     refitted = dict(zip(law.names, map(float, law.start), strict=True))
     refitted[mujoco.RESISTANCE] *= 1.1  # as if a refit had found more
-    found = formats.draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
+
+    def drawn(posterior):
+        return draw_parameters(drive, posterior, known, refitted, normal, 400, 7)
+
+    found = drawn(posterior)
     resistance, friction = found["actuator/motor.resistance"], found["actuator/motor.friction_coulomb"]
     assert_allclose(found["mujoco/resistance"], 1.1 * resistance / 0.74, rtol=1e-9)
-    assert np.corrcoef(resistance, friction)[0, 1] == pytest.approx(-0.8, abs=0.06)
-    assert np.corrcoef(found["mujoco/resistance"], found["mujoco/frictionloss"])[0, 1] == pytest.approx(
-        -0.8, abs=0.06
-    )
-    files = formats.randomization_files(found)
-    kept = np.load(io.BytesIO(files["draws.npz"]))
-    assert set(kept) == set(found)
-    assert len(kept["mujoco/motorconst"]) == 400
+    for pair in ((resistance, friction), (found["mujoco/resistance"], found["mujoco/frictionloss"])):
+        assert np.corrcoef(*pair)[0, 1] == pytest.approx(-0.8, abs=0.06)
+    kept = np.load(io.BytesIO(randomization_files(found)["draws.npz"]))
+    assert set(kept) == set(found) and len(kept["mujoco/motorconst"]) == 400
     with pytest.raises(BadConfiguration, match=f"no {posterior_file.FILE} next to"):
-        formats.draw_parameters(drive, None, known, refitted, normal, 4, 0)
+        drawn(None)
 
 
 RIG = """
@@ -456,24 +471,30 @@ def rig(tmp_path):
 
 def xml_of(file):
     """MJCF of a rig by translation alone."""
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(file)))
+    drive = drive_of(file)
     law = mujoco.translate_law(drive, 0.0)
     motor = mujoco.mjcf_motor(drive, dict(zip(law.names, map(float, law.start), strict=True)))
-    about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
     return {
-        "drive.xml": mujoco.mjcf_fragment(drive, motor, about, [], "motor", "drive", 12.0),
+        "drive.xml": mujoco.mjcf_fragment(drive, motor, ABOUT, [], "motor", "drive", 12.0),
         "scene.xml": mujoco.mjcf_scene(drive, 0.0, "motor", "drive", 12.0, 0.1),
     }
+
+
+def write_models(rig):
+    """The same, written beside the rig's file."""
+    models = xml_of(rig)
+    for name, text in models.items():
+        (rig.parent / name).write_text(text)
+    return models
 
 
 def test_current_limit_of_a_driver_is_a_saturation_that_comes_back(tmp_path):
     """Its attribute was one that `<dcmotor>` rejects, so such a drive could not be exported to MuJoCo."""
     rig = tmp_path / "rig.toml"
-    rig.write_text(rig_new.rig_template("bench") + "\n[driver]\ncurrent_limit = 5.0\n")
-    for name, text in xml_of(rig).items():
-        (tmp_path / name).write_text(text)
-    back = rig_new.joint_numbers(tmp_path / "scene.xml", "drive").drive
-    efficiency = float(robot_file.find_robot_file(str(rig)).robot.gearbox.efficiency_load)
+    rig.write_text(rig_template("bench") + "\n[driver]\ncurrent_limit = 5.0\n")
+    write_models(rig)
+    back = joint_numbers(tmp_path / "scene.xml", "drive").drive
+    efficiency = float(find_robot_file(str(rig)).robot.gearbox.efficiency_load)
     assert back["driver.current_limit"].value == pytest.approx(5.0 * efficiency, rel=1e-6)
 
 
@@ -491,7 +512,7 @@ amplitude = 0.004
 """
 
 
-@pytest.mark.parametrize(("voltage", "torque"), [(12.0, 0.2), (2.0, -2.0)])
+@pytest.mark.parametrize("voltage, torque", [(12.0, 0.2), (2.0, -2.0)])
 def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, voltage, torque):
     """A start, and a load that drives the motor, in a simulator with Euler's steps.
 
@@ -499,9 +520,9 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     """
     arm = RIG.split("[effects")[0].replace("torque_gravity = 0.6", f"torque_constant = {torque}")
     rig.write_text(arm + LOSSES)
-    file = robot_file.find_robot_file(str(rig))
-    drive = joints.joint_of_robot(file)
-    module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None)))
+    file = find_robot_file(str(rig))
+    drive = joint_of_robot(file)
+    module = law_of(drive)
     step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
 
     def advance(at, _):
@@ -519,29 +540,29 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     for mine, native, begins in zip(
         found, expected, (0.0, 2e-3), strict=True
     ):  # a step is a tenth of the winding's L/R
-        error = np.interp(history.time, times, np.asarray(mine)) - native
+        error = np.interp(history.time, times, mine) - native
         assert np.max(np.abs(error[history.time > begins])) < 1e-3 * np.max(np.abs(native))
 
 
 def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
-    first = xml_of(rig)
-    for name, text in first.items():
-        (tmp_path / name).write_text(text)
-    again = tmp_path / "again.toml"
-    again.write_text(rig_new.new_rig_text(None, tmp_path / "scene.xml", "drive", None))
-    second = xml_of(again)
-    lines = [[line for line in f["drive.xml"].splitlines() if "<!--" not in line] for f in (first, second)]
+    first, again = write_models(rig), tmp_path / "again.toml"
+    again.write_text(new_rig_text(None, tmp_path / "scene.xml", "drive", None))
+    lines = [[x for x in f["drive.xml"].splitlines() if "<!--" not in x] for f in (first, xml_of(again))]
     assert lines[0] == lines[1]
-    before, after = (robot_file.find_robot_file(str(f)).robot for f in (rig, again))
-    numbers = {p.name: float(p.value) for p in params.walk_parameters(after)}
-    for p in params.walk_parameters(before):
-        name = p.name
-        if not name.startswith(("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")):
-            assert numbers[name] == pytest.approx(float(p.value), rel=1e-8), name
+    elsewhere = ("battery", "running_gear", "motor.resistance_thermal", "motor.time", "rig")
+    before, after = (
+        {
+            p.name: float(p.value)
+            for p in walk_parameters(find_robot_file(str(f)).robot)
+            if not p.name.startswith(elsewhere)
+        }
+        for f in (rig, again)
+    )
+    assert {name: after[name] for name in before} == pytest.approx(before, rel=1e-8)
 
 
 @pytest.mark.parametrize(
-    ("source", "joint", "message"),
+    "source, joint, message",
     [
         ("scene.xml", "drve", r"--joint: got drve; .* has no such joint; did you mean drive\?"),
         ("scene.obj", None, r"scene.obj: not a readable XML file \(.*\); expected URDF or MuJoCo's XML"),
@@ -553,8 +574,7 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
     ],
 )
 def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, message, rig, tmp_path):
-    for name, text in xml_of(rig).items():
-        (tmp_path / name).write_text(text)
+    write_models(rig)
     (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
     (tmp_path / "scene.obj").write_text("v 0 0 0")
     (tmp_path / "page.xml").write_text("<html/>")
@@ -562,7 +582,7 @@ def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, 
     bodies = "".join(map(body.format, ("name='drive'", "name='other'", "name='slide' type='slide'")))
     (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(BadConfiguration, match=message):
-        rig_new.new_rig_text(None, tmp_path / source, joint, None)
+        new_rig_text(None, tmp_path / source, joint, None)
 
 
 def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig):
@@ -570,64 +590,51 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 
     monkeypatch.setattr(library, "__version__", "3.6.0")
     with pytest.raises(BadConfiguration, match=r"got MuJoCo 3.6.0, which has no <dcmotor>; expected 3.7 or later"):
-        formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
+        export_format(find_robot_file(str(rig)), "mujoco")
 
 
-@pytest.mark.parametrize(
-    ("amplitudes", "configuration", "message"),
-    [
-        (
-            {"side_friction": 1e-3},
-            None,
-            r"side_friction makes the sides differ, but an export is one drive",
-        ),
-        ({}, "4W2", r"--configuration: got 4W2; .* did you mean 4W2T\?"),
-    ],
-)
+@pytest.mark.parametrize("amplitudes, configuration, message", [
+    ({"side_friction": 1e-3}, None, r"side_friction makes the sides differ; export a file for each side"),
+    ({}, "4W2", r"--configuration: got 4W2; .* did you mean 4W2T\?"),
+])  # fmt: skip
 def test_drives_that_are_no_joint_are_refused_in_a_sentence(amplitudes, configuration, message):
     with pytest.raises(BadConfiguration, match=message):
-        joints.joint_of_robot(of_effects(amplitudes), configuration)
+        joint_of_robot(of_effects(amplitudes), configuration)
 
 
-def test_rig_with_another_command_is_refused(rig):
-    rig.write_text(RIG.replace('imposed = "voltage"', 'imposed = "motor_current"'))
-    with pytest.raises(BadConfiguration, match=r"\[rig\] imposed: got motor_current; expected voltage"):
-        joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+@pytest.mark.parametrize("old, new, message", [
+    ('imposed = "voltage"', 'imposed = "motor_current"', r"\[rig\] imposed: got motor_current; expected voltage"),
+    ("voltage_limit = 12.0\n", "", r"--data: not given, and rig\.toml has no motor\."),
+])  # fmt: skip
+def test_rigs_that_cannot_be_exported_are_refused(rig, old, new, message):
+    rig.write_text(RIG.replace(old, new))
+    with pytest.raises(BadConfiguration, match=message):
+        comparison.situation_of_joint(drive_of(rig), None)
 
 
-@pytest.mark.parametrize(
-    ("header", "row", "message"),
-    [
-        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,total_current_A", f"{WHEELS},24,11.5,0,0,1,0.5,3", "differently"),
-        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,lever_front_deg,lever_rear_deg",
-         f"{TRACKS},24,13,0,0,3,30,-10", "levers"),
-        ("configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A", f"{TRACKS},24,13,0,0,3", f"no run of {WHEELS}"),
-    ],
-)  # fmt: skip
-def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path):
-    (tmp_path / "runs.csv").write_text(f"{header}\n{row}\n")
-    drive = joints.joint_of_robot(of_effects({}), TRACKS if message == "levers" else WHEELS)
+@pytest.mark.parametrize("more, values, configuration, message", [
+    (",duty_left,duty_right", f"{WHEELS},24,11.5,0,0,3,1,0.5", WHEELS, "differently"),
+    (",lever_front_deg,lever_rear_deg", f"{TRACKS},24,13,0,0,3,30,-10", TRACKS, "levers"),
+    ("", f"{TRACKS},24,13,0,0,3", WHEELS, f"no run of {WHEELS}"),
+])  # fmt: skip
+def test_runs_of_more_than_one_joint_are_refused(more, values, configuration, message, tmp_path):
+    head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A"
+    (tmp_path / "runs.csv").write_text(f"{head}{more}\n{values}\n")
     with pytest.raises(BadData, match=message):
-        comparison.situation_of_joint(drive, str(tmp_path / "runs.csv"))
-
-
-def test_a_rig_without_a_limit_of_the_voltage_needs_runs(rig):
-    rig.write_text(RIG.replace("voltage_limit = 12.0\n", ""))
-    with pytest.raises(BadConfiguration, match=r"--data: not given, and rig\.toml has no motor\."):
-        comparison.situation_of_joint(joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm"), None)
+        comparison.situation_of_joint(joint_of_robot(of_effects({}), configuration), str(tmp_path / "runs.csv"))
 
 
 def test_a_rig_whose_angle_alone_is_read_is_compared_by_its_motor(rig):
     rig.write_text(RIG.replace('["total_current", "motor_speed"]', '["output_angle"]'))
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm")
-    assert {c.name for c in joints.channels_of(drive)} == {"motor_speed", "motor_current"}
+    drive = drive_of(rig)
+    assert {c.name for c in channels_of(drive)} == {"motor_speed", "motor_current"}
 
 
 def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
     """The grid was three runs forward without load: the stated 0.01 % of current was 28 % backward."""
     losses = "[effects.gear_quadratic_loss]\namplitude = 0.05\n[effects.directional_viscous]\namplitude = 0.0012\n"
     rig.write_text(RIG.split("torque_gravity")[0].replace("efficiency_load = 1.0", "efficiency_load = 0.81") + losses)
-    found = formats.export_format(robot_file.find_robot_file(str(rig)), "mujoco")
+    found = export_format(find_robot_file(str(rig)), "mujoco")
     seen = found.comparison.situation
     for way in (-1, 1):
         assert {(v, m > 0) for v, m in zip(way * seen.command, way * seen.load, strict=True) if v > 0} >= {
@@ -635,12 +642,12 @@ def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
         }
     kept = {f.name: f.kept for f in found.comparison.fates}
     assert kept["directional_viscous"] < 0.01 and kept["gear_quadratic_loss"] < 0.95
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     volts = rng.choice((-1.0, 1.0), 8) * rng.uniform(4, 12, 8)
     grid = comparison.export_grid(found.joint)
     loads = rng.uniform(0, 0.5, 8) * np.sign(volts) * comparison.stall_torque(found.joint, np.abs(volts))
     columns = {"configuration": np.repeat("arm", 8), grid.layout.imposed_column: volts, "load_torque_Nm": loads}
-    other = comparison.situation_of_joint(found.joint, dataclasses.replace(grid, columns=columns))
+    other = comparison.situation_of_joint(found.joint, replace(grid, columns=columns))
     law = mujoco.translate_law(found.joint, 0.0)
     theta = jnp.asarray([found.comparison.refitted[n] for n in law.names])
     near = comparison.evaluate_law(law, theta, other.command, other.load, other.way)
@@ -680,22 +687,20 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
 def test_a_key_frame_of_runs_in_both_directions_moves():
     """It was at the mean of all commands, which is rest."""
     command, load = np.array([-24.0, -12.0, 12.0, 24.0, 6.0]), np.array([-2.0, -1.0, 1.0, 2.0, 0.5])
-    chosen, torque = formats.middle_run(command, load)
+    chosen, torque = middle_run(command, load)
     assert abs(chosen) == 12.0 and torque == chosen / 12
 
 
 def test_symbols_fold_numbers_and_keep_the_order_of_operations():
-    a, b = (expressions.Symbol.of("name", (), n) for n in "ab")
-    two = expressions.constant_symbol(2.0)
-    assert expressions.apply_operation("mul", a, expressions.ZERO) is expressions.ZERO
-    assert expressions.apply_operation("add", a, expressions.ZERO) is a
-    difference = expressions.apply_operation("sub", a, expressions.apply_operation("sub", b, two))
-    text = expressions.lines_of(
-        expressions.apply_operation("mul", difference, difference), expressions.Dialect("np"), str
-    )
+    a, b = (Symbol.of("name", (), n) for n in "ab")
+    two = constant_symbol(2.0)
+    assert apply_operation("mul", a, ZERO) is ZERO
+    assert apply_operation("add", a, ZERO) is a
+    difference = apply_operation("sub", a, apply_operation("sub", b, two))
+    text = lines_of(apply_operation("mul", difference, difference), Dialect("np"), str)
     assert text == ["    x1 = a - (b - 2.0)", "    return x1 * x1"]
     with pytest.raises(BadConfiguration, match="mine: its equation uses"):
-        expressions.trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")
+        trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")
 
 
 #: Servos and drives whose load turns apart: text of the file, the control, and the allowed error of the angle [rad] in
@@ -729,8 +734,8 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
     """A start from rest under one goal or voltage: MJCF in MuJoCo C, and the law in JAX beside a simulator's steps."""
     text, in_mujoco, in_jax = APART[name]
     rig.write_text(text)
-    file = robot_file.find_robot_file(str(rig))
-    drive, goal = joints.joint_of_robot(file), "servo" in name
+    file = find_robot_file(str(rig))
+    drive, goal = joint_of_robot(file), "servo" in name
     command, times = 0.5 if goal else 6.0, np.linspace(0, 0.5, 26)
     given = {"voltage": 7.4, "goal": command} if goal else {"voltage": command}
     run = drive_batch(file.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], mm.Conditions(**given)), times, 1e-8, 20_000)  # fmt: skip
@@ -738,7 +743,7 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
     if in_mujoco is not None:
         angles = mujoco.angles_in_mujoco(xml_of(rig), command * (200 if goal else 1), times, 1e-4)
         assert np.abs(angles - native).max() < in_mujoco
-    module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None)))
+    module = law_of(drive)
     inertia, step = float(drive.load.inertia) + float(module.armature(module.PARAMS)), 5e-5
     resisting = float(drive.load.torque_constant)
 
@@ -754,47 +759,36 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
 
 def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
-    known = law_source.law_constants(drive, None, None)
-    verdicts = [
+    drive = drive_of(rig)
+    in_mujoco, in_jax, in_tables = (
         {f.name: f for f in fates}
-        for fates in (mujoco.fates_in_mujoco(drive, 0.0), jax_actuator.fates_in_actuator(drive), feed_forward.fates_in_tables(drive, known))
-    ]  # fmt: skip
+        for fates in (mujoco.fates_in_mujoco(drive, 0.0), fates_in_actuator(drive), fates_in_tables(drive, law_constants(drive, None, None)))
+    )  # fmt: skip
     held, near, lost = comparison.HELD, comparison.APPROXIMATED, comparison.DROPPED
-    assert [v[mujoco.PLAY].verdict for v in verdicts] == [held, held, lost]
-    assert [v[mujoco.CONTROLLER].verdict for v in verdicts] == [near, held, lost]
-    assert "lag of 0.005 s is dropped" in verdicts[0][mujoco.CONTROLLER].how
+    for name, verdicts in ((mujoco.PLAY, [held, held, lost]), (mujoco.CONTROLLER, [near, held, lost])):
+        assert [v[name].verdict for v in (in_mujoco, in_jax, in_tables)] == verdicts
+    assert "lag of 0.005 s is dropped" in in_mujoco[mujoco.CONTROLLER].how
+    assert "0.03 rad of play" in in_tables[mujoco.PLAY].how
     rig.write_text(APART["servo at 50 Hz"][0])
-    sampled = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
-    fates = {f.name: f for f in mujoco.fates_in_mujoco(sampled, 0.0)}
-    assert "acts at each step, not at 50 Hz" in fates[mujoco.CONTROLLER].how
-    assert "0.03 rad of play" in verdicts[2][mujoco.PLAY].how
+    (how,) = (f.how for f in mujoco.fates_in_mujoco(drive_of(rig), 0.0) if f.name == mujoco.CONTROLLER)
+    assert "acts at each step, not at 50 Hz" in how
     rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
-    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; the exported controller"):
-        joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; add it"):
+        drive_of(rig)
 
 
 def test_mjlab_actuator_of_a_servo_with_play_is_that_of_jax(monkeypatch, rig):
     stand_in(monkeypatch)
     rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
-    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
-    known = law_source.law_constants(drive, None, None)
-    ours, theirs = (
-        law_source.module_from_source(f(drive, known)) for f in (law_source.jax_source, law_source.torch_source)
-    )
-    states, angle, speed = (
-        [ours.initial_state((3,)), theirs.initial_state((3,))],
-        np.array([0.0, 0.1, -0.2]),
-        np.zeros(3),
-    )
+    drive = drive_of(rig)
+    modules = [law_of(drive, source=source) for source in (jax_source, torch_source)]
+    states = [module.initial_state((3,)) for module in modules]
+    goal, angle, speed = np.array([[1.0, -0.5, 0.3], [0.0, 0.1, -0.2], [0.0, 0.0, 0.0]])
     for _ in range(40):
-        torques = []
-        for k, module in enumerate((ours, theirs)):
-            torque, states[k], _ = module.actuator(
-                module.PARAMS, states[k], np.array([1.0, -0.5, 0.3]), angle, speed, 2e-3
-            )
-            torques.append(np.asarray(torque))
-        assert_allclose(torques[0], torques[1], rtol=1e-9, atol=1e-12)
-        speed = speed + 2e-3 * torques[0] / float(drive.load.inertia)
+        (ours, states[0], _), (theirs, states[1], _) = (
+            m.actuator(m.PARAMS, s, goal, angle, speed, 2e-3) for m, s in zip(modules, states, strict=True)
+        )
+        assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
+        speed = speed + 2e-3 * np.asarray(ours) / float(drive.load.inertia)
         angle = angle + 2e-3 * speed
-    assert np.abs(torques[0]).max() > 0.01
+    assert np.abs(ours).max() > 0.01

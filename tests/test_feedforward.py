@@ -1,10 +1,11 @@
 """Feedforward constants of WPILib: against an independent least squares, and with seeded faults."""
 
-import dataclasses
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from test_more_formats import wpilog
 
@@ -12,7 +13,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
 from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
-from sweeps.commands import calibrate as feedforward_fit
+from sweeps.commands.calibrate import voltage_fit
 from sweeps.report import calibration_report
 from tests.commands import read_json
 
@@ -22,26 +23,20 @@ STEP, FINE = 0.02, 5
 
 def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
     """A log of a drive by explicit steps of 1 ms. Returns it with kS, kV, kA."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     kS, kV, kA = rng.uniform(0.1, 0.4), rng.uniform(0.1, 0.2), rng.uniform(0.04, 0.08)
-    rows, battery, currents = [], [], []
+    rows, scale, dt = [], 60 if fault == "unit" else 1, STEP / FINE
     for test in tests:
         sign = 1 if test.endswith("forward") else -1
-        x = v = filtered = 0.0
+        x = v = 0.0
         places, speeds, past = [0.0] * 200, [0.0] * 200, []
         for k in range(int((6 if test[0] == "q" else 2) / STEP)):
             u = sign * (min(1.0 * k * STEP, 7.0) if test[0] == "q" else 7.0)
-            shown = 60 * v if fault == "unit" else filtered if fault == "filter" else v
-            if fault == "delay":
-                x_read, shown = places[-20], speeds[-20]
-            else:
-                x_read = x
-            rows.append([test, k * STEP, -u if fault == "sign" else u, x_read + rng.normal(0, 2e-4),
-                         shown + rng.normal(0, 0.02) * (60 if fault == "unit" else 1)])  # fmt: skip
+            shown = np.mean(past or 0.0) if fault == "filter" else v
+            x_read, shown = (places[-20], speeds[-20]) if fault == "delay" else (x, scale * shown)
+            reading = x_read + rng.normal(0, 2e-4), shown + scale * rng.normal(0, 0.02)
             past = [*past[-4:], v]
-            filtered = np.mean(past)
             for _ in range(FINE):
-                dt = STEP / FINE
                 supply = 12.5 - 0.4 * abs(u - kV * v) if fault == "sag" else 12.5
                 half = v
                 for part in (dt / 2, dt):  # the midpoint rule
@@ -52,30 +47,22 @@ def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
                     half, before = v + net / kA * part, half
                 x, v = x + before * dt, half
                 places, speeds = [*places[1:], x], [*speeds[1:], v]
-            battery.append(supply)
-            currents.append(abs(net) * 10)
-    run, time, voltage, place, speed = map(np.array, zip(*rows, strict=True))
-    log = DriveLog(run, time, voltage, place, speed, battery=np.array(battery) if fault == "sag" else None)
-    return log, (kS, kV, kA)
+            rows.append([test, k * STEP, -u if fault == "sign" else u, *reading, supply])
+    *columns, battery = map(np.array, zip(*rows, strict=True))
+    return DriveLog(*columns, battery=battery if fault == "sag" else None), (kS, kV, kA)
 
 
 def least_squares(log):
-    """Next speed on speed, voltage and direction: the exact law of a held voltage. Returns constants and sds."""
+    """Next speed on speed, voltage and direction: the exact law of a held voltage."""
     rows = []
     for name in TESTS:
         v, u = log.velocity[log.run == name], log.voltage[log.run == name]
         moves = np.flatnonzero((np.abs(v[:-1]) > 1.0) & (np.abs(v[1:]) > 1.0))
         rows += [(v[k + 1], v[k], u[k], np.sign(v[k])) for k in moves]
-    y, x = np.array(rows)[:, 0], np.array(rows)[:, 1:]
-    solved, cost, *_ = np.linalg.lstsq(x, y, rcond=None)
-
-    def constants(b):
-        kV = (1 - b[0]) / b[1]
-        return np.array([-b[2] / b[1], kV, -kV * STEP / np.log(b[0])])
-
-    jacobian = np.array([(constants(solved + d) - constants(solved - d)) / 2e-7 for d in 1e-7 * np.eye(3)]).T
-    spread = cost / (len(y) - 3) * np.linalg.inv(x.T @ x)
-    return constants(solved), np.sqrt(np.diag(jacobian @ spread @ jacobian.T))
+    after, *of = np.array(rows).T
+    speed, voltage, direction = np.linalg.lstsq(np.transpose(of), after, rcond=None)[0]
+    kV = (1 - speed) / voltage
+    return np.array([-direction / voltage, kV, -kV * STEP / np.log(speed)])
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -83,34 +70,27 @@ def test_constants_are_those_of_an_independent_least_squares(seed):
     log, true = simulated(seed)
     found = fit_feedforward(log)
     values, sds = np.array([*found.constants.values()]), np.array([*found.sds.values()])
-    other, spread = least_squares(log)
-    assert (np.abs(values - other) < spread).all()
+    assert (np.abs(values - least_squares(log)) < sds).all()
     assert (np.abs(values - true) < 4 * sds).all()
     assert not found.remarks
 
 
-@pytest.mark.parametrize(("fault", "code"), [
-    ("sign", "feedforward_sign"), ("unit", "feedforward_unit"), ("sag", "feedforward_sag"),
-    ("limit", "feedforward_limit"), ("delay", "feedforward_delay"), ("skid", "feedforward_skid"),
-    ("filter", "feedforward_filter"), ("missing", "feedforward_missing"),
-])  # fmt: skip
+@pytest.mark.parametrize("fault", ["sign", "unit", "sag", "limit", "delay", "skid", "filter", "missing"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_seeded_faults_are_named(seed, fault, code):
+def test_seeded_faults_are_named(seed, fault):
     log, true = simulated(seed, fault, TESTS[:2] if fault == "missing" else TESTS)
     found = fit_feedforward(log)
-    codes = [r.code for r in found.remarks]
-    also = {"delay": ["feedforward_gains_delayed"], "filter": ["feedforward_gains_delayed"],
-            }.get(fault, [])  # fmt: skip
-    assert [c for c in codes if c != "feedforward_no_kA" or fault != "missing"] == [code, *also]
-    if fault != "sag" and fault != "missing":
+    codes = [r.code for r in found.remarks if fault != "missing" or r.code != "feedforward_no_kA"]
+    assert codes == [f"feedforward_{fault}"] + ["feedforward_gains_delayed"] * (fault in ("delay", "filter"))
+    if fault not in ("sag", "missing"):
         assert_allclose([*found.constants.values()], true, rtol=0.08, atol=0.02)
     assert all(sentences(found.remarks))
 
 
-@pytest.mark.parametrize(("mechanism", "arm"), [("elevator", False), ("arm", True)])
+@pytest.mark.parametrize("mechanism, arm", [("elevator", False), ("arm", True)])
 def test_weight_of_a_lift_and_of_an_arm(mechanism, arm):
     log, true = simulated(3, kG=0.5, arm=arm)
-    found = fit_feedforward(dataclasses.replace(log, unit="degree"), mechanism)
+    found = fit_feedforward(replace(log, unit="degree"), mechanism)
     assert_allclose([*found.constants.values()], [*true, 0.5], rtol=0.03)
 
 
@@ -123,14 +103,14 @@ def test_friction_that_differs_by_direction_is_named():
 
 def test_constant_of_acceleration_that_is_not_determined_gives_no_gains():
     log, _ = simulated(1, tests=TESTS[:2])
-    noise = np.random.default_rng(0).normal(0, 0.5, len(log.time))
-    found = fit_feedforward(dataclasses.replace(log, velocity=log.velocity + noise))
+    noise = default_rng(0).normal(0, 0.5, len(log.time))
+    found = fit_feedforward(replace(log, velocity=log.velocity + noise))
     assert "feedforward_no_kA" in [r.code for r in found.remarks] and not found.gains
 
 
 def test_log_at_rest_says_which_tests_are_missing():
     log, _ = simulated(1, tests=TESTS[1:2])
-    still = dataclasses.replace(log, position=None, velocity=0 * log.time)
+    still = replace(log, position=None, velocity=0 * log.time)
     with pytest.raises(BadData, match="missing: quasistatic-forward, dynamic-forward, dynamic-reverse"):
         fit_feedforward(still)
 
@@ -152,32 +132,29 @@ def test_a_log_of_voltage_and_speed_has_two_plots_on_any_page():
     log, _ = simulated(1)
     columns = {"run_id": log.run, "time_s": log.time, "supply_voltage_V": log.voltage}
     runs = records.Runs("log.csv", columns | {"output_speed_rpm": 60.0 * log.velocity})
-    found = feedforward_fit.voltage_fit(runs)
-    direct = fit_feedforward(dataclasses.replace(log, position=None))
+    found = voltage_fit(runs)
+    direct = fit_feedforward(replace(log, position=None))
     assert found.constants == pytest.approx(direct.constants, rel=1e-6)
     quasistatic, dynamic, constants = calibration_report.voltage_section(found).blocks
     assert (quasistatic.name, dynamic.name) == ("quasistatic", "dynamic")
     assert [row[1] for row in constants.rows] == list(found.constants.values())
     rest = records.Runs("rest.csv", columns | {"output_speed_rpm": 0.0 * log.velocity})
-    assert feedforward_fit.voltage_fit(rest) is feedforward_fit.voltage_fit(records.read_runs("measured")) is None
+    assert voltage_fit(rest) is voltage_fit(records.read_runs("measured")) is None
 
 
 def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):
     log, true = simulated(4)
-    records = [(1, 0, ("sysid-test-state-drive", "string"))]
-    records += [(k, 0, (f"{q}-drive", "double")) for k, q in ((2, "voltage"), (3, "position"), (4, "velocity"))]
-    before = 0.0
-    for k, name in enumerate(log.run):
-        before += 0.1 if k and name != log.run[k - 1] else 0.0
-        stamp = round(1e6 * (before + 0.02 * k))
-        values = (log.voltage[k], log.position[k], log.velocity[k])
-        records.append((1, stamp, name.encode()))
-        records += [(e, stamp, struct.pack("<d", v)) for e, v in zip((2, 3, 4), values, strict=True)]
-        if k + 1 == len(log.run) or log.run[k + 1] != name:
-            records.append((1, stamp, b"none"))
-    records += [(5, 0, ("NT:/SystemStats/BatteryVoltage", "double"))]
-    records += [(5, stamp, struct.pack("<d", v)) for stamp, v in ((10, 12.5), (20, 9.8))]
-    (tmp_path / "robot.wpilog").write_bytes(wpilog(*records))
+    entries = [(1, 0, ("sysid-test-state-drive", "string")), (5, 0, ("NT:/SystemStats/BatteryVoltage", "double"))]
+    entries += [(k, 0, (f"{q}-drive", "double")) for k, q in ((2, "voltage"), (3, "position"), (4, "velocity"))]
+    ends = log.run != np.roll(log.run, -1)  # last rows of tests
+    stamps = np.round(1e6 * (0.02 * np.arange(len(ends)) + 0.1 * (np.cumsum(ends) - ends))).astype(int).tolist()
+    rows = zip(stamps, log.run, ends, log.voltage, log.position, log.velocity, strict=True)
+    for stamp, name, last, *values in rows:
+        entries.append((1, stamp, name.encode()))
+        entries += [(e, stamp, struct.pack("<d", v)) for e, v in zip((2, 3, 4), values, strict=True)]
+        entries += [(1, stamp, b"none")] * bool(last)
+    entries += [(5, stamp, struct.pack("<d", v)) for stamp, v in ((10, 12.5), (20, 9.8))]
+    (tmp_path / "robot.wpilog").write_bytes(wpilog(*entries))
     code, out, error = mmrjax("calibrate robot.wpilog --feedforward simple --out fit")
     assert code == 0 and "kS = " in out, error
     found = read_json(tmp_path / "fit/feedforward.json")

@@ -1,9 +1,9 @@
 """The registry of fidelities: every one keeps the contract, broken ones do not, and a new one is a file and a line."""
 
-import dataclasses
 import subprocess
 import sys
 import types
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, chec
 
 @pytest.mark.quick(3)
 @pytest.mark.parametrize(
-    ("name", "law"),
+    "name, law",
     [
         pytest.param(n, law, marks=pytest.mark.slow)
         # a program of its own; what drive keeps is looked at by test_drive, test_start and test_cli
@@ -108,7 +108,7 @@ def _one_row(robot, conditions):
 
 
 def _no_readings(robot, conditions, options, progress=None):
-    return RunBatch(dataclasses.replace(steady_batch(robot, conditions), reading={}))
+    return RunBatch(replace(steady_batch(robot, conditions), reading={}))
 
 
 def _from_the_middle(robot, conditions, options, progress=None):
@@ -117,7 +117,7 @@ def _from_the_middle(robot, conditions, options, progress=None):
 
 
 @pytest.mark.parametrize(
-    ("law", "of", "change"),
+    "law, of, change",
     [
         (knows_itself, "steady", {"histories": _from_the_middle}),
         (settles_traceably, "steady", {"settled": _one_row}),
@@ -128,7 +128,7 @@ def _from_the_middle(robot, conditions, options, progress=None):
 )
 def test_contract_can_be_broken(law, of, change, robot):
     with pytest.raises(AssertionError):
-        law(dataclasses.replace(fidelities.get_fidelity(of), **change), robot)
+        law(replace(fidelities.get_fidelity(of), **change), robot)
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_new_fidelity_is_a_file_and_a_line(toy, robot):
 
 
 @pytest.mark.parametrize(
-    ("code", "absent"),
+    "code, absent",
     [
         (
             "from mmrjax import fidelities; fidelities.NAMES, fidelities.fidelity_facts('track').resolved()",
@@ -194,21 +194,8 @@ def test_facts_need_no_jax_and_steady_no_mujoco(code, absent):
     subprocess.run([sys.executable, "-c", code, *absent.split()], cwd=ROOT, check=True, timeout=120)
 
 
-def test_facts_state_what_the_command_line_needs():
-    assert fidelities.NAMES == ("steady", "drive", "track")
-    assert [fidelities.fidelity_facts(name).chunk for name in fidelities.NAMES] == [
-        (262144, 4194304),
-        (4096, 65536),
-        (512, 16384),
-    ]
-    assert [fidelities.fidelity_facts(name).resolved() for name in fidelities.NAMES] == [
-        {}, {"duration": 30.0}, {"duration": 1.5, "step": 1e-4},
-    ]  # fmt: skip
-    assert fidelities.fidelity_facts("drive").resolved(duration=None) == {"duration": 30.0}
-
-
 @pytest.mark.parametrize(
-    ("name", "given", "message"),
+    "name, given, message",
     [
         ("steady", {"duration": 5.0}, "duration: got 5.0; this fidelity has the options: none"),
         ("drive", {"step": 1e-4}, "step: got 0.0001; this fidelity has the options: duration"),

@@ -3,12 +3,13 @@
 import jax
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model.gearmotor import Gearbox
 
-RNG = np.random.default_rng(19)
+RNG = default_rng(19)
 
 
 def test_gearbox_laws_match_reference():

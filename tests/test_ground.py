@@ -3,13 +3,14 @@
 import jax
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from worlds import paper
 
-from mmrjax.model import chassis, contact, paper_robots
-from mmrjax.model.contact import Friction, Ground
+from mmrjax.model import chassis, paper_robots
+from mmrjax.model.contact import Friction, Ground, force_gravity, slip_ratio
 
-RNG = np.random.default_rng(5)
+RNG = default_rng(5)
 G = 9.80665
 
 
@@ -25,18 +26,18 @@ def test_ground_forces_match_reference():
         demand = RNG.uniform(-0.99, 0.99) * ratio * mu * normal
         expected = paper.friction_speed(demand / normal / ratio, mu, 0.02)
         assert_allclose(surface.speed_creep(demand, normal, ratio), expected, rtol=1e-9)
-        assert_allclose(contact.force_gravity(m, alpha, G), m * G * np.sin(alpha), rtol=1e-9)
+        assert_allclose(force_gravity(m, alpha, G), m * G * np.sin(alpha), rtol=1e-9)
 
 
 def test_slip_matches_reference():
     for V, w, r in RNG.uniform((0.1, 1, 0.01), (1, 20, 0.1), (50, 3)):
         theoretical = paper.theoretical_speed(w, r)
-        assert_allclose(contact.slip_ratio(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12)
+        assert_allclose(slip_ratio(V, theoretical), paper.slip(V, theoretical), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize(("speed", "theoretical", "slip"), [(0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
+@pytest.mark.parametrize("speed, theoretical, slip", [(0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
 def test_slip_limits_are_finite(speed, theoretical, slip):
-    value, gradient = jax.value_and_grad(contact.slip_ratio, argnums=(0, 1))(speed, theoretical)
+    value, gradient = jax.value_and_grad(slip_ratio, argnums=(0, 1))(speed, theoretical)
     assert float(value) == slip and np.isfinite(gradient).all()
 
 
@@ -48,7 +49,7 @@ def test_ground_traction_equals_adhesion_at_its_largest(robot):
 
 
 @pytest.mark.parametrize(
-    ("surface", "tracked", "wheeled"),
+    "surface, tracked, wheeled",
     [
         ("lacquered_wood", 0.32, 0.38),
         ("linoleum", 0.42, 0.52),

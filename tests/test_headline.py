@@ -9,7 +9,7 @@ from calibration.described import describe
 from calibration.discovery.loop_notes import Mechanism, MissingEffect, VerdictSummary
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.verdict import headline
-from calibration.words import loop_words
+from calibration.words.loop_words import loop_answer, verdict_sentences
 
 DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"
 
@@ -31,7 +31,7 @@ def nothing(verdict="none"):
 
 
 @pytest.mark.parametrize(
-    ("own", "others", "level", "claims"),
+    "own, others, level, claims",
     [
         (law("a"), (law("a"), law("a")), "named", (("a",),)),
         (law("a"), (law("a", "b"), law("a")), "class", (("a", "b"),)),
@@ -54,11 +54,11 @@ def test_it_is_the_deepest_claim_that_all_verdicts_hold(own, others, level, clai
 
 
 def test_it_is_said_with_the_noises_at_which_it_holds():
-    said = loop_words.loop_answer(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
+    said = loop_answer(headline(law("a"), [(0.7, of_mechanism(DROP)), (1.4, law("a"))]))
     assert said == f"No: a {DROP} is missing at 0.7, 1 and 1.4 times the noise. Its exact law is not established."
-    weak = loop_words.loop_answer(headline(law("a"), [(0.7, law("a", established=False))]))
+    weak = loop_answer(headline(law("a"), [(0.7, law("a", established=False))]))
     assert weak == "No: a voltage drop is missing at 0.7 and 1 times the noise. No more is established."
-    assert loop_words.loop_answer(headline(law("a", "b"))) == (
+    assert loop_answer(headline(law("a", "b"))) == (
         f"No: a {DROP} (a or b, which these data cannot distinguish) is missing."
     )
 
@@ -66,19 +66,17 @@ def test_it_is_said_with_the_noises_at_which_it_holds():
 def test_a_law_that_an_ammeter_imitates_is_stated_with_it():
     both = "loss torque that changes with speed", "reading of total current that changes with speed"
     found = headline(law("windage", families=both))
-    assert found.level == "class" and loop_words.loop_answer(found) == (
+    assert found.level == "class" and loop_answer(found) == (
         f"No: a {both[0]} or a {both[1]} (windage, which these data cannot distinguish) is missing."
     )
-    verdict = loop_words.verdict_sentences(law("windage", families=both))
+    verdict = verdict_sentences(law("windage", families=both))
     assert verdict.startswith(f"Missing: windage, or a {both[1]} (these data cannot distinguish them) (")
 
 
 def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
     found = headline(of_mechanism(SLIP, DROP), [(0.7, of_mechanism(DROP)), (1.4, of_mechanism(DROP, "x that is"))])
     assert found.claims == ((DROP, SLIP, "x that is"),) and found.shared == (1,)
-    assert f"At some of these noise levels it may be a {SLIP} or a x that is instead." in loop_words.loop_answer(
-        found
-    )
+    assert f"At some of these noise levels it may be a {SLIP} or a x that is instead." in loop_answer(found)
 
 
 def test_one_mechanism_is_claimed_once():

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from test_shaft import DRIVE, bench
 
 import mmrjax as mm
-from calibration.data import rig_facts
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.rig_facts import doubtful_current
+from calibration.data.runs import read_runs
 from calibration.discovery import scales
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import Histories, SettledRuns
@@ -22,7 +23,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES
 from sweeps.commands import rig_check
-from tests.commands import read_rig
+from tests.commands import csv_text, read_rig, text_file
 
 AMPERES = np.array([-8.0, -2.0, 0.5, 5.0])
 #: Friction of motor (N·m) and efficiency of `bench`; its load has none here.
@@ -108,20 +109,22 @@ def rig(tmp_path, imposed, channels):
     return read_rig(tmp_path, RIG_HELD.format(imposed=imposed, channels=channels))
 
 
-def table(held=True, **more):
-    """Columns of a test of sixteen currents: constant 0.12, friction 0.03 N·m, resistance 0.25 ohm."""
-    current = np.r_[-np.arange(2.0, 18, 2)[::-1], np.arange(2.0, 18, 2)]
-    rng = np.random.default_rng(5)
-    torque = 5 * (0.12 * current - 0.03 * np.sign(current)) + rng.normal(0, 0.01, 16)
-    volts = 0.25 * current + rng.normal(0, 0.01, 16)
-    columns = {"motor_current_A": current, "motor_voltage_V": volts, "output_torque_Nm": torque}
-    return {**columns, **({"held": np.ones(16)} if held else {}), **more}
+#: Of a test of the motor, both ways [A].
+CURRENT = np.r_[-16.0:0:2, 2.0:18:2]
+
+
+def table(**more):
+    """Columns of a test with the shaft held: constant 0.12, friction 0.03 N·m, resistance 0.25 ohm."""
+    rng = default_rng(5)
+    torque = 5 * (0.12 * CURRENT - 0.03 * np.sign(CURRENT)) + rng.normal(0, 0.01, 16)
+    columns = {"motor_current_A": CURRENT, "motor_voltage_V": 0.25 * CURRENT + rng.normal(0, 0.01, 16)}
+    return {**columns, "output_torque_Nm": torque, "held": np.ones(16), **more}
 
 
 def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     noise = "motor_voltage=0.01V,output_torque=0.01Nm"
-    found = calibrate(records.read_runs(table(), robot=robot), robot, free=FREED, noise=noise, profiles=False)
+    found = calibrate(read_runs(table(), robot=robot), robot, free=FREED, noise=noise, profiles=False)
     for name, right in (("resistance", 0.25), ("torque_constant", 0.12), ("friction_coulomb", 0.03)):
         p = found.parameters[f"motor.{name}"]
         assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)
@@ -138,56 +141,51 @@ def test_a_gearbox_that_loses_nothing_by_its_file_has_no_effect(tmp_path):
 
 @pytest.mark.slow
 def test_a_locked_rotor_with_voltage_alone_gives_the_resistance(tmp_path):
-    robot = rig(tmp_path, "voltage", '"motor_current"')
-    columns = table()
-    rows = {"supply_voltage_V": columns["motor_voltage_V"], "motor_current_A": columns["motor_current_A"]}
-    runs = records.read_runs({**rows, "held": columns["held"]}, robot=robot)
-    found = mm.calibrate(runs, robot, free=("motor.resistance",))
+    robot, columns = rig(tmp_path, "voltage", '"motor_current"'), table()
+    rows = {"supply_voltage_V": columns["motor_voltage_V"], "motor_current_A": CURRENT, "held": columns["held"]}
+    found = mm.calibrate(read_runs(rows, robot=robot), robot, free=("motor.resistance",))
     assert found.parameters["motor.resistance"].value == pytest.approx(0.25, rel=0.01)
 
 
 def test_a_clamp_with_another_model_is_refused(tmp_path):
     robot = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     with pytest.raises(BadConfiguration, match="held: got model drive; expected steady"):
-        SettledRuns.of(records.read_runs(table(), robot=robot), robot, "drive")
+        SettledRuns.of(read_runs(table(), robot=robot), robot, "drive")
 
 
 def test_rows_of_a_clamp_in_tables(tmp_path):
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    with pytest.raises(
-        BadData, match=r"row 1, load_torque_Nm: got 1 although held is 1; expected 0, .* output_torque"
-    ):
-        records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
-    with pytest.raises(BadData, match=r"row 16, held: got 0\.5; expected 1 if a clamp holds the output, otherwise 0"):
-        records.read_runs({**table(), "held": np.r_[np.ones(15), 0.5]}, robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
-    with pytest.raises(
-        BadData, match=r'nothing drives the motors; .* if the shaft is locked, set imposed = "motor_current"'
-    ):
-        records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
-    rows = table(held=False, motor_speed_rpm=np.zeros(16), load_torque_Nm=np.r_[np.ones(15), 0.0])
-    assert len(records.read_runs(rows, robot=speed)) == 15
-    rows = table()
-    strong = {**rows, "motor_current_A": 5 * rows["motor_current_A"]}
-    assert rig_facts.doubtful_current(records.read_runs(strong, robot=held), held) == ""
+    still = {"held": np.zeros(16), "motor_speed_rpm": np.zeros(16)}
+    for robot, changes, says in (
+        (held, {"load_torque_Nm": np.ones(16)},
+         r"row 1, load_torque_Nm: got 1 although held is 1; expected 0, .* output_torque"),
+        (held, {"held": np.r_[np.ones(15), 0.5]},
+         r"row 16, held: got 0\.5; expected 1 if a clamp holds the output, otherwise 0"),
+        (speed, still, r'nothing drives the motors; .* if the shaft is locked, set imposed = "motor_current"'),
+    ):  # fmt: skip
+        with pytest.raises(BadData, match=says):
+            read_runs(table(**changes), robot=robot)
+    assert len(read_runs(table(**still, load_torque_Nm=np.r_[np.ones(15), 0.0]), robot=speed)) == 15
+    strong = table(motor_current_A=5 * CURRENT)
+    assert doubtful_current(read_runs(strong, robot=held), held) == ""
     strong["held"] = np.r_[np.zeros(15), 1.0]
-    assert "80 A, although by the file's numbers the load turns" in rig_facts.doubtful_current(
-        records.read_runs(strong, robot=held), held
-    )
+    doubt = doubtful_current(read_runs(strong, robot=held), held)
+    assert "80 A, although by the file's numbers the load turns" in doubt
 
 
 def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
     """Windings settle within a millisecond."""
-    rows = {"output_torque_Nm": table()["output_torque_Nm"], "motor_voltage_V": table()["motor_voltage_V"]}
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    log = records.read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)
+    time, columns = 0.02 * np.arange(16.0), table()
+    log, same = read_runs({**columns, "time_s": time}, robot=held), read_runs(columns, robot=held)
     assert not log.sampled and any("held in every row, so each row is read as a settled run" in n for n in log.notes)
-    same = records.read_runs(table(), robot=held)
-    assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
+    assert all((log[c] == same[c]).all() for c in columns)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
-    columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}
-    columns |= {"motor_speed_rpm": np.zeros(16), "load_torque_Nm": rows["output_torque_Nm"]}
-    log = records.read_runs({**columns, "time_s": 0.02 * np.arange(16.0)}, robot=speed)
+    torque = columns.pop("output_torque_Nm")
+    columns |= {"motor_speed_rpm": np.zeros(16), "load_torque_Nm": torque, "time_s": time}
+    del columns["held"]  # which the speed shows
+    log = read_runs(columns, robot=speed)
     assert not log.sampled and len(log) == 16
 
 
@@ -196,14 +194,13 @@ def test_a_clamp_holds_a_part_of_a_log(tmp_path):
 
     Held rows give R and k alone. The first row of the clamp is from before it, as after each change.
     """
-    time = 0.02 * np.arange(20)
-    held = 1.0 * ((time > 0.1 - 1e-9) & (time < 0.3 - 1e-9))
-    volts = np.where(time < 0.2 - 1e-9, 3.0, -6.0)
-    log = {"time_s": time, "supply_voltage_V": volts, "held": held, "run_id": np.full(20, "one")}
+    row = np.arange(20)
+    held, volts = 1.0 * ((row >= 5) & (row < 15)), np.where(row < 10, 3.0, -6.0)
     robot = rig(tmp_path, "voltage", '"motor_current", "motor_speed", "output_torque"')
     robot = params.replace(robot, {"motor.inertia": 4e-4, "motor.inductance": 2e-4})
-    names = ("motor_current_A", "motor_speed_rpm", "output_torque_Nm")
-    runs = records.read_runs({**log, **dict.fromkeys(names, np.ones(20))}, robot=robot)
+    log = {"time_s": 0.02 * row, "supply_voltage_V": volts, "held": held, "run_id": np.full(20, "one")}
+    log |= dict.fromkeys(("motor_current_A", "motor_speed_rpm", "output_torque_Nm"), np.ones(20))
+    runs = read_runs(log, robot=robot)
     assert runs.sampled and len(runs) == 20 and runs["held"].sum() == held.sum() == 10
     observe = Histories.of(runs, robot)
 
@@ -214,20 +211,19 @@ def test_a_clamp_holds_a_part_of_a_log(tmp_path):
     both = jax.jit(jax.jacfwd(lambda x: (read(x),) * 2, has_aux=True))
     slopes, readings = jax.device_get(both(at))
     speed, current, torque = readings.T
-    rests, step = np.r_[6:16], [10]  # the row of a change shows the state before it
-    expected = np.where(np.arange(20) <= 10, 3.0, -6.0) / 0.3
+    rests, clamped = np.r_[6:16], np.r_[6:10, 11:15]  # the row of a change shows the state before it
+    expected = np.where(row <= 10, 3.0, -6.0) / 0.3
     assert speed[5] > 25 and not speed[rests].any() and speed[19] < -25
     assert_allclose(current[rests], expected[rests], rtol=1e-6)
     load = 5 * np.sign(expected) * (0.1 * np.abs(expected) - 0.02)
-    held_rows = np.setdiff1d(np.r_[6:15], step)
-    assert_allclose(torque[held_rows], load[held_rows], rtol=1e-6)
-    assert_allclose(slopes[held_rows, 1, 0], -expected[held_rows] / 0.3, rtol=1e-6)
-    assert_allclose(slopes[held_rows, 2, 1], 5 * expected[held_rows], rtol=1e-6)
+    for found, right in (
+        (torque, load), (slopes[:, 1, 0], -expected / 0.3), (slopes[:, 2, 1], 5 * expected),
+    ):  # fmt: skip
+        assert_allclose(found[clamped], right[clamped], rtol=1e-6)
     assert not slopes[rests, 0].any()
     ends = [np.asarray(both(at + np.array([d, 0.0]))[1]) for d in (1e-6, -1e-6)]
     assert_allclose(slopes[..., 0], (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-3)
-    free = records.read_runs({**log, "held": 0 * held, **dict.fromkeys(names, np.ones(20))}, robot=robot)
-    assert not free.has("held")
+    assert not read_runs({**log, "held": 0 * held}, robot=robot).has("held")
 
 
 def test_a_log_of_a_locked_rotor_shows_its_inductance(tmp_path):
@@ -235,10 +231,10 @@ def test_a_log_of_a_locked_rotor_shows_its_inductance(tmp_path):
     robot = params.replace(rig(tmp_path, "voltage", '"motor_current"'), {"motor.inductance": 3e-3})
     time = 1e-3 * np.arange(30)
     log = {"time_s": time, "supply_voltage_V": np.full(30, 3.0), "motor_current_A": np.ones(30), "held": np.ones(30)}
-    runs = records.read_runs(log, robot=robot)
+    runs = read_runs(log, robot=robot)
     assert runs.sampled
     observe = Histories.of(runs, robot)
-    current = np.asarray(jax.jit(lambda robot: observe(robot).reading)(robot))[:, 0]
+    current = jax.jit(lambda robot: observe(robot).reading[:, 0])(robot)
     assert_allclose(current, 10 * -np.expm1(-time * 0.3 / 3e-3), atol=1e-3)
 
 
@@ -246,18 +242,16 @@ def test_a_clamp_in_a_log_of_an_elastic_joint_is_refused(tmp_path):
     text = RIG_HELD.format(imposed="voltage", channels='"motor_current"') + 'stiffness = "50 ± 5"\n'
     robot = read_rig(tmp_path, text.replace("[gearbox]", "inertia = 4e-4\n[gearbox]"))
     log = {"time_s": 1e-3 * np.arange(9), "supply_voltage_V": np.ones(9), "motor_current_A": np.ones(9)}
-    runs = records.read_runs({**log, "held": np.r_[np.zeros(4), np.ones(5)]}, robot=robot)
+    runs = read_runs({**log, "held": np.r_[np.zeros(4), np.ones(5)]}, robot=robot)
     with pytest.raises(BadConfiguration, match="a clamp on a load with backlash or an elastic joint"):
         Histories.of(runs, robot)
 
 
 def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):
     rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
-    current = np.r_[-np.arange(2.0, 18, 2)[::-1], np.arange(2.0, 18, 2)]
-    rows = zip(current, 0.25 * current, 0.6 * current, strict=True)
-    lines = ["motor_speed_rpm,motor_current_A,motor_voltage_V,load_torque_Nm"]
-    lines += [f"0,{i},{u:.4g},{t + 0.01 * k:.4g}" for k, (i, u, t) in enumerate(rows)]
-    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    assert rig_check.check_rig_file(tmp_path / "rig.toml", str(tmp_path / "runs.csv"), (), False) == 0
+    columns = {"motor_speed_rpm": 0 * CURRENT, "motor_current_A": CURRENT, "motor_voltage_V": 0.25 * CURRENT}
+    columns["load_torque_Nm"] = 0.6 * CURRENT + 0.01 * np.arange(16)
+    table = text_file(tmp_path / "runs.csv", csv_text(columns))
+    assert rig_check.check_rig_file(tmp_path / "rig.toml", str(table), (), False) == 0
     printed = capsys.readouterr().out
     assert "These data determine" in printed and "some rows have no steady state" not in printed

@@ -12,8 +12,9 @@ from numpy.testing import assert_allclose
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.histories import LONGEST, START, history_signals, linearise_run, time_grid
-from mmrjax.model import paper_robots, params
+from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.paper_robots import nominal
 
 RUNS = Conditions(
     voltage=np.array([15.0, 33.0, 24.0]),
@@ -69,7 +70,7 @@ def test_histories_follow_drive(robot):
 )
 def test_derivatives_are_those_of_what_is_computed(changes):
     """By parameters and by the amplitude of every effect with a memory, against central differences."""
-    robot = dataclasses.replace(paper_robots.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
+    robot = dataclasses.replace(nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
     robot = params.without_weak_types(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
     names = [
         "motor.resistance", "motor.inertia", "motor.inductance", "6T2A.ground.friction.static", "4W2T.radius",
@@ -113,7 +114,7 @@ def test_run_that_cannot_be_followed_is_not_finite(robot):
 
 @pytest.mark.slow
 def test_known_states_change_neither_values_nor_derivatives():
-    robot, run, times = paper_robots.nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
+    robot, run, times = nominal(), jax.tree.map(lambda x: x[0], RUNS), jnp.asarray(GRID[:60])
     friction = float(robot.motor.friction_coulomb)
 
     def current(x, known=None):

@@ -1,6 +1,6 @@
 """The Husky's table of settled turns: read, checked and calibrated as any other rig's."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +8,10 @@ import pytest
 import mmrjax as mm
 from calibration.data import configuration_tables
 from calibration.data import runs as records
-from calibration.inference import blocks, observers, priors
+from calibration.inference import blocks, observers
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import SettledTurns
+from calibration.inference.priors import loop_parameter_names
 from tests.commands import ROOT
 
 HUSKY = ROOT / "docs/rigs/husky"
@@ -43,11 +44,11 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
     """Of each surface. In straight travel nothing but a speed shows it."""
     ours = configuration_tables.with_surface_configurations(robot, runs)
     present = runs.configurations_named(ours)
-    freed = priors.loop_parameter_names(ours, present, *SettledTurns.free())
+    freed = loop_parameter_names(ours, present, *SettledTurns.free())
     of_ground = {f"{name}.ground.friction.{number}" for name in present for number in ("static", "speed_static")}
     assert len(of_ground) == 6 and of_ground < set(freed)
-    straight = dataclasses.replace(ours, rig=dataclasses.replace(ours.rig, channels=("motor_current",)))
-    assert not of_ground & set(priors.loop_parameter_names(straight, present))
+    straight = replace(ours, rig=replace(ours.rig, channels=("motor_current",)))
+    assert not of_ground & set(loop_parameter_names(straight, present))
 
 
 @pytest.mark.nightly

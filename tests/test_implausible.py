@@ -1,16 +1,17 @@
 """What would explain the data but for its size is said beside `unnamed`, with how large it is and what to check."""
 
-import dataclasses
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from synthetic import FEW, SETTLED, table
 from test_stated_values import LOOKS
 from worlds import laws, settled, tables
 
-from calibration.discovery import findings
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.findings import _alternative, found_effects, listed_alternatives
 from calibration.discovery.search import search_effects, single_p_value
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.linearization import amplitude_of
@@ -24,7 +25,7 @@ def heated(times, grid=settled.table8):
     p = dict(settled.CLIMBING)
     c = grid(p)
     readings = settled.readings(c, p, (laws.Term("winding_heating", times * LARGEST),))
-    return table(tables.table_of(c, *readings, settled.Instruments(), np.random.default_rng(1)))
+    return table(tables.table_of(c, *readings, settled.Instruments(), default_rng(1)))
 
 
 def steep(p):
@@ -65,7 +66,7 @@ def hot(looks):
 
 def listed(traced, cost):
     space, base = traced.screened.base.space, traced.screened.base.candidate
-    return findings.listed_alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
+    return listed_alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
 
 
 def test_heating_of_a_plausible_size_is_named():
@@ -97,7 +98,7 @@ def test_companions_that_explain_nothing_are_not_listed(hot):
     assert len(pairs) > 3  # there were some
     space = hot.screened.base.space
     for c in pairs:
-        why = {r.name for r in findings._alternative(space, c, 0.0, SETTLED.settings).reasons}
+        why = {r.name for r in _alternative(space, c, 0.0, SETTLED.settings).reasons}
         for name, size in zip(c.effects, c.size, strict=False):
             if 0 < size < 0.3 and not (space.library[name].dissipative and c.amplitude[c.active.index(name)] <= 0):
                 assert name not in why
@@ -118,7 +119,7 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
         of("supply_sag", cost=101.0), of("churning", "load_slip", cost=99.0), of("churning", "mass_offset", cost=90.0),
         of("supply_sag", "load_slip", cost=100.5), of("series_resistance", cost=98.0, plausible=False), best,
     )  # fmt: skip
-    plausible, ruled_out = findings.listed_alternatives(space, best, best.cost, ladder, SETTLED.settings)
+    plausible, ruled_out = listed_alternatives(space, best, best.cost, ladder, SETTLED.settings)
     assert [(tuple(a.effects), a.rise_chi2) for a in plausible] == [
         (("churning", "mass_offset"), -20.0),
         (("supply_sag",), 2.0),
@@ -138,38 +139,41 @@ def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
 
 
 @pytest.mark.parametrize(
-    ("names", "sigmas"),
+    "names, sigmas",
     [(["stribeck_track", "gear_load_loss"], 9.0), (["churning", "mass_offset"], 9.0), (["series_resistance"], 25.0)],
 )
 def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
     """Whatever stands beside a strong effect: none gives power, none is at a bound, each has a p of its own."""
-    seen = 0
-    for seed in range(4):
-        found = SETTLED.trace(table(tables.narrow(names, sigmas, seed)))
-        if found.alike is None:
-            continue
-        space, base = found.screened.base.space, found.screened.base.candidate
-        told = findings.found_effects(space, base, found.best, found.alike, found.left.test, SETTLED.settings)
-        for e in told:
-            amplitude = e.parameters["amplitude"]
-            assert e.p_value <= SETTLED.settings.family_wise_error, e.name
-            assert not BY_NAME[e.name].dissipative or amplitude.value > 0, e.name
-            spec = amplitude_of(BY_NAME[e.name]()).spec
-            assert spec.bounds[0] < amplitude.value < spec.bounds[1]
-            seen += 1
+    traces = [SETTLED.trace(table(tables.narrow(names, sigmas, seed))) for seed in range(4)]
+    seen = []
+    for found in (t for t in traces if t.alike is not None):
+        base = found.screened.base
+        seen += found_effects(base.space, base.candidate, found.best, found.alike, found.left.test, SETTLED.settings)
         assert found.best.plausible
-    assert seen >= 3
+    for e in seen:
+        kind, amplitude = BY_NAME[e.name], e.parameters["amplitude"].value
+        low, high = amplitude_of(kind()).spec.bounds
+        assert e.p_value <= SETTLED.settings.family_wise_error, e.name
+        assert low < amplitude < high and (not kind.dissipative or amplitude > 0), e.name
+    assert len(seen) >= 3
 
 
 def test_an_effect_without_a_p_of_its_own_is_not_proposed(looks):
     """The same search, once as it is and once where noise explains as much in every table of the bootstrap."""
     analyst, grid = looks
-    runs = table(tables.narrow(["churning"], 10.0, seed=4, grid=grid))
-    found = analyst.trace(runs)
+    found = analyst.trace(table(tables.narrow(["churning"], 10.0, seed=4, grid=grid)))
     assert "churning" in found.members[0]
-    space, base, left = found.screened.base.space, found.screened.base.candidate, found.left
-    quiet = lambda text: None  # noqa: E731
-    assert search_effects(space, base, left, found.screened.bases, analyst.settings, quiet).best is not None
-    loud = dataclasses.replace(left.test.null, single=np.full_like(left.test.null.single, 1e3))
-    left = dataclasses.replace(left, test=dataclasses.replace(left.test, null=loud))
-    assert search_effects(space, base, left, found.screened.bases, analyst.settings, quiet).best is None
+    base, test = found.screened.base, found.left.test
+    loud = replace(test, null=replace(test.null, single=np.full_like(test.null.single, 1e3)))
+    best = [
+        search_effects(
+            base.space,
+            base.candidate,
+            replace(found.left, test=of),
+            found.screened.bases,
+            analyst.settings,
+            lambda text: None,
+        ).best
+        for of in (test, loud)
+    ]
+    assert best[0] is not None and best[1] is None

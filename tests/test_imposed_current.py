@@ -1,28 +1,28 @@
 """Motors whose current is imposed: steady travel, histories, tables and fits against plain physics, without a winding."""
 
-import dataclasses
+from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import rig_facts, robot_file, unused_readings
+from calibration.data import unused_readings
 from calibration.data.input_errors import BadConfiguration
+from calibration.data.rig_facts import doubtful_current
+from calibration.data.robot_file import read_robot, write_robot
 from calibration.discovery import loop_input
 from calibration.inference import bases, checks, observers
 from calibration.inference import blocks as holdout
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import time_histories
-from mmrjax.fidelities import histories as integrator
 from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.histories import history_signals
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.balances import absent_balances
 from mmrjax.model.conditions import Conditions
-from sweeps.pages import comparison_figures
-from tests.commands import ends, read_rig, read_table
+from tests.commands import csv_text, ends, read_rig, read_table, rows
 
 K, RATIO, ETA = 0.05, 10.0, 0.9
 DRY, VISCOUS, INERTIA, ROTOR = 0.3, 0.02, 0.01, 2e-6
@@ -98,11 +98,11 @@ def test_a_thinned_log_of_a_varying_current_turns_the_load_as_its_rows_do(tmp_pa
     assert np.abs(simulated - runs.measured()[:, 0]).max() < 1e-4
 
 
-@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True), (1e-3, True)])
+@pytest.mark.parametrize("factor, doubted", [(1.0, False), (1e3, True), (1e-3, True)])
 def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path, robot, factor, doubted):
     """It is 0.67 A that turns the load slowly."""
     rows = "".join(f"{0.1 * k},{factor * current},0\n" for k, current in enumerate((1.5, 2.0, -1.5)))
-    said = rig_facts.doubtful_current(
+    said = doubtful_current(
         read_table(tmp_path, f"time_s,motor_current_A,motor_speed_rpm\n{rows}", robot),
         robot,
     )
@@ -116,17 +116,17 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
 
 @pytest.mark.parametrize("reading", ["motor_voltage_V", "motor_speed_rpm"])
 def test_a_large_current_without_a_measured_speed_may_be_that_of_a_held_shaft(tmp_path, robot, reading):
-    robot = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=(reading.rpartition("_")[0],)))
+    robot = replace(robot, rig=replace(robot.rig, channels=(reading.rpartition("_")[0],)))
     table = read_table(tmp_path, f"motor_current_A,{reading}\n200,1\n400,2\n700,3.5\n", robot)
-    assert ("add a column held" in rig_facts.doubtful_current(table, robot)) == (reading == "motor_voltage_V")
+    assert ("add a column held" in doubtful_current(table, robot)) == (reading == "motor_voltage_V")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "doubted"), [(1.0, False), (1e3, True)])
+@pytest.mark.parametrize("factor, doubted", [(1.0, False), (1e3, True)])
 def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor, doubted, monkeypatch):
     current = np.array([1.0, 1.5, 2.0, -1.0, -1.5, -2.0, 1.2, 1.8])
-    rows = [f"{factor * i},{x * 9.549}\n" for i, x in zip(current, settles(current), strict=True)]
-    runs = read_table(tmp_path, "motor_current_A,motor_speed_rpm\n" + "".join(rows), robot, "runs.csv")
+    columns = {"motor_current_A": factor * current, "motor_speed_rpm": 9.549 * settles(current)}
+    runs = read_table(tmp_path, csv_text(columns), robot, "runs.csv")
     monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
     ready = loop_input.prepare_loop(runs, robot)
     assert any("Is it in another unit" in str(note) for note in ready.at_first) == doubted
@@ -140,12 +140,14 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert robot.rig.imposed == "motor_current"
     assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
-    robot_file.write_robot(robot, tmp_path / "again.toml")
-    assert robot_file.read_robot(tmp_path / "again.toml").rig == robot.rig
-    with pytest.raises(BadConfiguration, match="motor_current is imposed, so it cannot be a reading"):
-        read_rig(tmp_path, RIG.replace('["motor_speed"]', '["motor_current"]'), "bad.toml")
-    with pytest.raises(BadConfiguration, match=r"motor\.torque_constant \[N·m/A\] is missing"):
-        read_rig(tmp_path, RIG.replace(f"torque_constant = {K}", ""), "bad.toml")
+    write_robot(robot, tmp_path / "again.toml")
+    assert read_robot(tmp_path / "again.toml").rig == robot.rig
+    for old, new, says in (
+        ('["motor_speed"]', '["motor_current"]', "motor_current is imposed, so it cannot be a reading"),
+        (f"torque_constant = {K}", "", r"motor\.torque_constant \[N·m/A\] is missing"),
+    ):
+        with pytest.raises(BadConfiguration, match=says):
+            read_rig(tmp_path, RIG.replace(old, new), "bad.toml")
 
 
 @pytest.mark.parametrize("resistance", [0.1, 5.0])
@@ -165,7 +167,7 @@ def test_a_run_follows_its_first_order_law(robot):
     found = driven(2.0)
     assert np.asarray(found.signals.speed_motor) == pytest.approx(followed(2.0, np.asarray(times)), abs=0.15)
     at_rest = driven(0.5)
-    assert np.abs(np.asarray(at_rest.signals.speed_motor)).max() < 1e-6
+    assert np.abs(at_rest.signals.speed_motor).max() < 1e-6
 
 
 def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_path):
@@ -189,7 +191,7 @@ def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_pat
 
     def ours(dry):
         changed = params.replace(robot, {"bench.loss_coulomb": dry, "motor.inductance": 1e-9})
-        found = integrator.history_signals(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
+        found = history_signals(changed, Conditions(motor_current=jnp.asarray(levels)), jnp.asarray(times))
         return found.speed_motor, found.speed_motor
 
     slope, shown = map(np.asarray, jax.jit(jax.jacfwd(ours, has_aux=True))(DRY))
@@ -209,9 +211,7 @@ def test_derivatives_are_those_of_the_steps_where_a_lagging_current_stops_a_shaf
     @jax.jit
     def ours(values):
         changed = params.replace(robot, {"bench.loss_coulomb": values[0], "bench.inertia": values[1]})
-        found = integrator.history_signals(
-            changed, Conditions(motor_current=jnp.asarray(current)), jnp.asarray(times)
-        )
+        found = history_signals(changed, Conditions(motor_current=jnp.asarray(current)), jnp.asarray(times))
         return found.speed_motor
 
     at = np.array([DRY, INERTIA])
@@ -229,59 +229,19 @@ def test_a_current_just_above_the_friction_hardly_turns_a_shaft(robot, excess):
     robot = params.replace(robot, {"motor.inductance": 1e-3, "motor.resistance": 1.0})
     level = DRY * (1 + excess) / (RATIO * ETA * K)
     times = jnp.arange(0.0, 0.05, 2.5e-3)
-    found = integrator.history_signals(robot, Conditions(motor_current=jnp.full(times.shape, level)), times)
+    found = history_signals(robot, Conditions(motor_current=jnp.full(times.shape, level)), times)
     speed, most = np.asarray(found.speed_motor), RATIO * DRY * excess / (INERTIA + ETA * ROTOR * RATIO**2) * 0.05
     assert 0.5 * most < speed[-1] < most
 
 
-def log(tmp_path, robot, noise, dry=DRY):
-    """A table over time of two runs at currents that step, with readings of the law itself."""
-    rng = np.random.default_rng(2)
-    times = np.arange(0, 1.2, 0.02)
-    rows = []
-    for run, levels in enumerate(((2.0, 3.0), (3.0, 1.5))):
-        first = followed(levels[0], times[times < 0.6], dry)
-        rate = VISCOUS / (INERTIA + ETA * ROTOR * RATIO**2)
-        end = RATIO * (RATIO * ETA * K * levels[1] - dry) / VISCOUS
-        begin = RATIO * (RATIO * ETA * K * levels[0] - dry) / VISCOUS * (1 - np.exp(-rate * 0.6))
-        then = end + (begin - end) * np.exp(-rate * (times[times >= 0.6] - 0.6))
-        shown = np.concatenate([first, then]) + noise * rng.standard_normal(len(times))
-        rows += [
-            f"{run},{t:.3f},{levels[int(t >= 0.6)]},{x * 30 / np.pi:.4f}" for t, x in zip(times, shown, strict=True)
-        ]
-    return read_table(tmp_path, "run_id,time_s,motor_current_A,motor_speed_rpm\n" + "\n".join(rows) + "\n", robot)
-
-
-@pytest.mark.slow
-def test_histories_follow_a_current_that_changes(robot, tmp_path):
-    runs = log(tmp_path, robot, 0.0)
-    made = observers.observer_kind(runs).of(runs, robot)
-    assert made.conditions.motor_current.shape == made.times.shape
-    shown = np.asarray(eqx.filter_jit(made)(robot).reading)[:, 0]
-    assert shown == pytest.approx(runs["motor_speed_rpm"] * np.pi / 30, abs=0.3)
-    assert made.times.shape[1] < 800  # no inrush to be followed after a change
-
-
-def settled_table(tmp_path, robot, dry):
-    rng = np.random.default_rng(5)
+def test_levels_of_the_current_are_blocks_to_hold_out_and_curves_are_over_it(robot, tmp_path):
     current = np.repeat([-3.0, -2.0, -1.2, 1.2, 1.6, 2.0, 2.5, 3.0], 3)
-    torque = RATIO * ETA * K * np.abs(current) - dry
-    speed = np.sign(current) * RATIO * torque / VISCOUS + 0.5 * rng.standard_normal(len(current))
-    rows = [f"{i},{w * 30 / np.pi:.4f},{0.5 * 30 / np.pi:.4f}" for i, w in zip(current, speed, strict=True)]
-    return read_table(
-        tmp_path, "motor_current_A,motor_speed_rpm,motor_speed_sd_rpm\n" + "\n".join(rows) + "\n", robot, "runs.csv"
-    )
-
-
-def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
-    runs = settled_table(tmp_path, robot, DRY)
-    kinds = holdout.distinct_held_out_blocks(runs, observers.observer_kind(runs).blocks)
-    assert list(kinds) == ["current"] and len(kinds["current"]) == 8
-
-
-def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
-    runs = settled_table(tmp_path, robot, DRY)
-    found = observers.observer_kind(runs).of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
+    table = csv_text({"motor_current_A": current, "motor_speed_rpm": settles(current) * 30 / np.pi})
+    runs = read_table(tmp_path, table, robot, "runs.csv")
+    kind = observers.observer_kind(runs)
+    blocks = holdout.distinct_held_out_blocks(runs, kind.blocks)
+    assert list(blocks) == ["current"] and len(blocks["current"]) == 8
+    found = kind.of(runs, robot).bases(runs.columns, np.ones(len(runs), bool), robot)
     assert ("track", "current") in bases.family_names(found)
 
 
@@ -289,27 +249,18 @@ def test_curves_are_over_a_current_that_is_imposed(robot, tmp_path):
 @pytest.mark.usefixtures("robot")
 def test_commands_take_a_current_or_say_what_to_state(tmp_path, mmrjax):
     ends(mmrjax("simulate --robot rig.toml --motor-current 2 --no-report --out one"), code=0)
-    row = (tmp_path / "one/runs.csv").read_text().splitlines()
-    cells = dict(zip(row[0].split(","), row[1].split(","), strict=True))
-    assert float(cells["motor_speed_rpm"]) == pytest.approx(settles(2.0) * 30 / np.pi, rel=1e-6)
-    assert cells["motor_current_A"] == "2"
-    code, _, err = ends(mmrjax("sweep --robot rig.toml --motor-currents 1,2,-2 --no-report --out many"), code=0)
-    for options, said in (
-        (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; give --motor-current [A]"),
-        (["simulate"], "--motor-current: not given; give it [A], such as --motor-current 2"),
-        (["simulate", "--battery"], "--battery: the motors' current is imposed on this robot"),
-        (["sensitivity"], "sensitivity: this robot imposes the motor current"),
-        (["simulate", "--model", "track", "--motor-current", "1"], "a shaft has no running gear"),
-    ):  # fmt: skip
-        code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")
-        assert code == 2 and said in " ".join(err.split()), err
-
-
-def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
-    speed, current = np.linspace(100.0, 800.0, 5), np.linspace(0.1, 2.0, 5)
-    table = {
-        "configuration": np.full(5, "bench"), "motor_current_A": current, "motor_speed_rpm": speed,
-        "simulated_motor_speed_rpm": speed + 1.0, "error_motor_speed_percent": np.ones(5),
-    }  # fmt: skip
-    figure = comparison_figures.draw_errors_over_conditions(table, robot.channels)
-    assert [axes.get_xlabel() for axes in figure.axes] == ["motor current [A]"]
+    (row,) = rows(tmp_path / "one/runs.csv")
+    assert float(row["motor_speed_rpm"]) == pytest.approx(settles(2.0) * 30 / np.pi, rel=1e-6)
+    assert row["motor_current_A"] == "2"
+    ends(mmrjax("sweep --robot rig.toml --motor-currents 1,2,-2 --no-report --out many"), code=0)
+    for words, said in (
+        (
+            "simulate --voltage 12",
+            "--voltage: the motors' current is imposed on this robot; give --motor-current [A]",
+        ),
+        ("simulate", "--motor-current: not given; give it [A], such as --motor-current 2"),
+        ("simulate --battery", "--battery: the motors' current is imposed on this robot"),
+        ("sensitivity", "sensitivity: this robot imposes the motor current"),
+        ("simulate --model track --motor-current 1", "a shaft has no running gear"),
+    ):
+        ends(mmrjax(f"{words} --robot rig.toml --out none"), said)

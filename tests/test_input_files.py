@@ -8,12 +8,13 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from calibration.data import input_files
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
+from calibration.data.runs import Path, read_runs
 from calibration.discovery.loop_input import remove_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun
+from mmrjax.model.channels import channels_named
 from sweeps.pages import comparison_figures
 from tests.commands import read_rig, read_table
 
@@ -85,7 +86,7 @@ def test_what_is_no_table_is_refused_in_one_short_sentence(tmp_path, case):
     content, says = TABLES[case]
     (tmp_path / "t.csv").write_bytes(content)
     with pytest.raises(BadData, match=says) as refusal:
-        records.read_runs(tmp_path / "t.csv", robot=bench(tmp_path))
+        read_runs(tmp_path / "t.csv", robot=bench(tmp_path))
     assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
 
 
@@ -93,9 +94,9 @@ def test_pipes_devices_and_folders_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, what in ((tmp_path / "pipe", "a pipe"), (tmp_path, "a folder"), ("/dev/zero", "a device")):
         with pytest.raises(BadData, match=f"is {what}; expected a file"):
-            records.read_runs(path)
+            read_runs(path)
         with pytest.raises(BadConfiguration, match=f"is {what}; expected a file"):
-            input_files.toml_text(records.Path(path), "x")
+            input_files.toml_text(Path(path), "x")
 
 
 @pytest.mark.parametrize("word", ["NaN", "nan", "NA", "N/A", "null", "None"])
@@ -119,7 +120,7 @@ def test_a_factor_of_few_digits_reaches_the_limit(tmp_path):
         table(tmp_path, f"{head}256,1800\n", robot)
 
 
-@pytest.mark.parametrize(("imposed", "column"), [("voltage", "supply_voltage_V"), ("motor_speed", "motor_speed_rpm")])
+@pytest.mark.parametrize("imposed, column", [("voltage", "supply_voltage_V"), ("motor_speed", "motor_speed_rpm")])
 def test_a_row_that_nothing_drives_is_left_out_with_a_note(tmp_path, imposed, column):
     robot = bench(tmp_path, f'imposed = "{imposed}"')
     found = table(tmp_path, f"{column},motor_current_A,room_C\n0,0,20\n4,0.3,21\n8,0.4,22\n", robot)
@@ -131,7 +132,7 @@ ROWS = "4,0.3,700{}\n6,0.4,1100{}\n6,0.4,1100{}\n"
 
 
 @pytest.mark.parametrize(
-    ("head", "rows", "kept"),
+    "head, rows, kept",
     [
         ("", ROWS.format("", "", ""), 3),  # repeats on a coarse display
         (",run_id", ROWS.format(",a", ",b", ",c"), 3),
@@ -159,19 +160,19 @@ def test_counts_of_numpy_are_counts(count):
     assert count_noun(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
 
 
-@pytest.mark.parametrize("column", ["motor_current_A", "motor_speed_rpm", None])
-def test_errors_are_drawn_over_what_is_imposed_or_the_rows(tmp_path, column):
-    robot = bench(tmp_path)
-    shown = robot.channels
+@pytest.mark.parametrize("column, label, shown", [
+    ("motor_current_A", "motor current [A]", ["output_speed"]),
+    ("motor_speed_rpm", "motor speed [rpm]", ["motor_current", "output_speed"]),
+    (None, "row", ["motor_current", "output_speed"]),
+])  # fmt: skip
+def test_errors_are_drawn_over_what_is_imposed_or_the_rows(column, label, shown):
     rows = {"configuration": np.repeat("shaft", 3)} | ({} if column is None else {column: np.arange(3.0)})
+    shown = channels_named(shown)
     for channel in shown:
         rows |= {channel.column: np.ones(3), f"simulated_{channel.column}": np.full(3, 1.1)}
         rows[f"error_{channel.name}_percent"] = np.full(3, 10.0)
-    rows.pop("simulated_motor_current_A" if column == "motor_current_A" else "", None)
-    shown = tuple(c for c in shown if f"simulated_{c.column}" in rows)
     fig = comparison_figures.draw_errors_over_conditions(rows, shown)
-    words = {"motor_current_A": "motor current [A]", "motor_speed_rpm": "motor speed [rpm]", None: "row"}
-    assert fig.axes[-1].get_xlabel() == words[column]
+    assert fig.axes[-1].get_xlabel() == label
 
 
 def test_echoes_of_input_are_short():

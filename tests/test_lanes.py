@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 
 from mmrjax.numerics import batch_flow
@@ -19,7 +20,7 @@ def halves(own):
 @pytest.mark.parametrize("size", [1, 3, 8, 50])
 def test_members_of_a_batch_end_as_each_by_itself(monkeypatch, size):
     monkeypatch.setattr(batch_flow, "LANES", 8)
-    numbers = jnp.asarray(2.0 ** np.random.default_rng(0).integers(-1, 40, size) * 1.5)
+    numbers = jnp.asarray(2.0 ** default_rng(0).integers(-1, 40, size) * 1.5)
     left, turns = jax.jit(jax.vmap(lambda x: halves((x, 2.0))))(numbers)
     alone = [halves((x, 2.0)) for x in numbers]
     assert_array_equal(turns, [int(a[1]) for a in alone])

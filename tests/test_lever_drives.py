@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from mmrjax.climbing.levers import lever_drive, step_levers
 from mmrjax.model import params
@@ -79,22 +80,25 @@ def test_worm_up_to_one_half_holds_and_a_better_one_lets_the_lever_sink():
 
 @pytest.mark.slow
 def test_rate_that_is_asked_for_is_had_until_the_voltage_or_the_current_ends():
-    rate, done = turned(ROBOT, 20.0, -12.0, 12.0, asked=0.3, time=0.1)
+    def asked(rate, load=20.0, robot=ROBOT, time=0.1):
+        return turned(robot, load, -12.0, 12.0, asked=rate, time=time)
+
+    rate, done = asked(0.3)
     assert rate == pytest.approx(0.3) and 0 < done.voltage < 12
-    rate, done = turned(ROBOT, 20.0, -12.0, 12.0, asked=1.0, time=0.1)
+    rate, done = asked(1.0)
     assert done.voltage == 12 and rate == pytest.approx(closed(20.0, 12.0, 0.5, LIFT, 1.0), rel=1e-3)
-    rate, done = turned(ROBOT, 150.0, -12.0, 12.0, asked=1.0)
+    rate, done = asked(1.0, load=150.0, time=0.05)
     assert rate == 0 and done.voltage == 12 and done.current == pytest.approx(12 / 0.611)
     limited = with_worm(0.5, current_limit=4.0)
-    assert turned(limited, 20.0, -12.0, 12.0, asked=0.3, time=0.1)[0] == pytest.approx(0.3)
-    rate, done = turned(limited, 40.0, -12.0, 12.0, asked=0.3)
+    assert asked(0.3, robot=limited)[0] == pytest.approx(0.3)
+    rate, done = asked(0.3, load=40.0, robot=limited, time=0.05)
     assert rate == 0 and done.current == pytest.approx(4.0)
 
 
 def test_both_pairs_obey_their_law_together_at_random_states():
     """What carries them and what drives them agree. A pair that moves has its friction against it, one that stands
     what friction can hold, and a voltage is at its end where a rate is not what is asked for."""
-    random = np.random.default_rng(3)
+    random = default_rng(3)
     drives = [lever_drive(with_worm(efficiency)) for efficiency in (0.5, 0.7)]
     n = 400
     whole = random.normal(size=(n, 2, 2))

@@ -1,6 +1,6 @@
 """What an instant exceeds, and how a run over time ends by its last instant."""
 
-import dataclasses
+from dataclasses import replace
 
 import jax.numpy as jnp
 import pytest
@@ -20,12 +20,12 @@ FINE = dict(
 @pytest.fixture(scope="module")
 def rated(robot):
     battery = Battery(current_limit=8.0, current_charge=2.0)
-    driver = dataclasses.replace(robot.driver, current_limit=4.0)
-    return dataclasses.replace(robot, battery=battery, driver=driver)
+    driver = replace(robot.driver, current_limit=4.0)
+    return replace(robot, battery=battery, driver=driver)
 
 
 @pytest.mark.parametrize(
-    ("changed", "flags"),
+    "changed, flags",
     [
         ({}, set()),
         ({"voltage_source": 8 * 2.99}, {"cut_off"}),
@@ -64,18 +64,14 @@ def test_travel_is_named_by_what_drives_it():
 
 def test_a_driven_robot_creeps_where_either_lags_and_one_that_gravity_drives_where_both_do():
     rest, fast, slow = 0.002, 0.01, 0.001
-    driven = [
-        bool(is_at_rest(1.0, 24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
-    ]
-    rolling = [
-        bool(is_at_rest(1.0, -24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
-    ]
+    speeds = [(a, b) for a in (fast, slow) for b in (fast, slow)]
+    driven, rolling = ([bool(is_at_rest(1.0, volts, a, b, rest)) for a, b in speeds] for volts in (24.0, -24.0))
     assert driven == [False, True, True, True] and rolling == [False, False, False, True]
     assert not bool(is_at_rest(-1.0, -24.0, -fast, -fast, rest))
 
 
 @pytest.mark.parametrize(
-    ("voltage", "slope", "way"), [(24.0, 10.0, 1.0), (-24.0, 0.0, -1.0), (0.4, 20.0, -1.0), (0.4, 5.0, 1.0)]
+    "voltage, slope, way", [(24.0, 10.0, 1.0), (-24.0, 0.0, -1.0), (0.4, 20.0, -1.0), (0.4, 5.0, 1.0)]
 )
 def test_travel_is_the_way_of_the_larger_torque_at_rest(robot, voltage, slope, way):
     """48 C_m U / R = 2.03 U [N·m] on a side, of which gravity asks 6.55 kg · g · sin α · 38.2 mm."""

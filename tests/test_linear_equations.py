@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal, assert_array_max_ulp
 from test_log_kinds import servo, written
 
@@ -28,7 +29,7 @@ LAPACK = r"\b(lu|cholesky|triangular_solve|qr|householder_product|eigh?|svd|schu
 
 
 def test_equations_are_solved_as_by_numpy_whatever_the_pivots():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     matrices = rng.standard_normal((40, 5, 5))
     matrices[:10, 0, 0] = 0.0  # nothing to begin with
     matrices[10:20] = np.eye(5)[rng.permutation(5)] * 1e-9
@@ -42,7 +43,7 @@ def test_equations_are_solved_as_by_numpy_whatever_the_pivots():
 
 
 def test_half_of_a_solution_is_that_of_a_cholesky_factor():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     a = rng.standard_normal((9, 5))
     lower = np.linalg.cholesky(a.T @ a)
     assert_allclose(solve_lower(a.T @ a, a.T), np.linalg.solve(lower, a.T), rtol=1e-9, atol=1e-12)
@@ -51,7 +52,7 @@ def test_half_of_a_solution_is_that_of_a_cholesky_factor():
 
 # --- written out, without exchanges ---------------------------------------------------------------------------------
 
-RNG = np.random.default_rng(1)
+RNG = default_rng(1)
 DIAGONAL = 3 * np.eye(3)  # added to a matrix: pivots where elimination without exchanges looks for them
 EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diagonal at all
 
@@ -80,14 +81,15 @@ def test_elimination_and_inverse_match_numpy(n):
 
 def test_elimination_leaves_out_zeros_that_are_stated():
     """The pattern of the balances: slip by speed and motor speed, voltage by current and motor speed."""
-    matrix = np.array([[-1.0, 0.0, 0.8], [0.0, -0.6, -2.6], [0.0, -0.12, -0.3]])
-    sparse = [[None if x == 0 else jnp.asarray(x) for x in row] for row in matrix]
-    vector = [jnp.asarray(x) for x in (0.3, -1.2, 0.7)]
-    found = substitute(factorise(sparse), vector)
-    assert_allclose(found, np.linalg.solve(matrix, np.asarray(vector)), rtol=1e-14)
-    alone = substitute(factorise(sparse), [vector[0], None, None])
-    assert alone[1] is None and alone[2] is None  # the slip moves neither current nor motor speed
-    assert_allclose(alone[0], -0.3, rtol=1e-14)
+    matrix, vector = (
+        np.array([[-1.0, 0.0, 0.8], [0.0, -0.6, -2.6], [0.0, -0.12, -0.3]]),
+        jnp.asarray([0.3, -1.2, 0.7]),
+    )
+    factors = factorise([[None if x == 0 else jnp.asarray(x) for x in row] for row in matrix])
+    assert_allclose(substitute(factors, [*vector]), np.linalg.solve(matrix, vector), rtol=1e-14)
+    slip, *others = substitute(factors, [vector[0], None, None])
+    assert others == [None, None]  # the slip moves neither current nor motor speed
+    assert_allclose(slip, -0.3, rtol=1e-14)
 
 
 def test_elimination_without_a_pivot_in_its_place_gives_no_number():
@@ -122,12 +124,12 @@ def test_regular_reverse_derivative_matches_numpy():
 
 def test_a_step_of_a_search_on_a_log_calls_no_lapack(tmp_path):
     """Batched calls of it, of programs side by side, have waited for each other for ever."""
-    log = {name: column[:12] for name, column in servo(np.random.default_rng(1), levels=(0.9,), hold=0.2).items()}
+    log = {name: column[:12] for name, column in servo(default_rng(1), levels=(0.9,), hold=0.2).items()}
     robot = written(tmp_path, "servo", log)
     runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
     coordinates = priors.parameter_coordinates(robot, ("motor.torque_constant", "wheel.loss_coulomb"))
     problem = observers.pose_problem(runs, robot, coordinates, known.sd)
-    step = jax.make_jaxpr(lambda z: linearise_rollout(problem, z, problem.data))(jnp.zeros(2))
+    step = jax.make_jaxpr(lambda z: linearise_rollout(problem, z))(jnp.zeros(2))
     assert re.search(LAPACK, str(jax.make_jaxpr(jnp.linalg.inv)(jnp.eye(2)))), "it can fail"
     assert not re.findall(LAPACK, str(step))

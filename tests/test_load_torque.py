@@ -1,22 +1,25 @@
 """Torque of a brake as a condition: against formulas, the same torque of the load, another implementation, differences."""
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from test_shaft import SPEEDS, bench, current_of
 from test_worlds_rigs import steady
 from worlds import rigs
 
 import mmrjax as mm
-from calibration.data import profiles, rig_facts, robot_file
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.inference import bases, blocks
+from calibration.data.profiles import read_profile
+from calibration.data.rig_facts import doubtful_torque, log_doubts
+from calibration.inference import bases
+from calibration.inference.blocks import distinct_held_out_blocks, kind_in_words
 from calibration.inference.observers import Histories, SettledRuns
+from mmrjax.effects.curve import WAYS
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
@@ -28,7 +31,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES, State
 from sweeps.config import Sweep
 from sweeps.config_campaign import campaign_of_grid
-from tests.commands import read_table, text_file
+from tests.commands import read_rig, read_table, text_file
 
 VOLTS = np.array([24.0, 6.0, -12.0, 12.0])
 TORQUE = np.array([0.5, 0.1, -0.3, 0.0])  # of a brake: against the way that each turns
@@ -54,13 +57,14 @@ def test_current_at_an_imposed_speed_follows_from_a_brake():
 @pytest.mark.parametrize("loose", [False, True])
 def test_a_brake_enters_as_a_constant_torque_of_the_load(loose):
     """Every signal of an instant, of a shaft with and without backlash, under an arm's weight."""
-    rig, load = Rig(loose=loose), {"torque_gravity": 0.4, "backlash": 0.02 * loose}
     state = State(1.0, 120.0, 7.0, 0.0, distance=0.3, gap=0.012 if loose else None)
-    moving = jax.jit(balances.moving_signals)
-    braked = moving(bench(rig, **load), Conditions(load_torque=0.3), state)
-    stated = moving(bench(rig, torque_constant=0.3, **load), Conditions(), state)
-    free = moving(bench(rig, **load), Conditions(), state)
-    jax.tree.map(assert_allclose, dataclasses.replace(braked, load_torque=None), stated)
+
+    def moving(brake=None, **load):
+        robot = bench(Rig(loose=loose), torque_gravity=0.4, backlash=0.02 * loose, **load)
+        return jax.jit(balances.moving_signals)(robot, Conditions(load_torque=brake), state)
+
+    braked, stated, free = moving(0.3), moving(torque_constant=0.3), moving()
+    jax.tree.map(assert_allclose, replace(braked, load_torque=None), stated)
     assert float(braked.acceleration) < float(free.acceleration)
 
 
@@ -71,21 +75,18 @@ def test_a_torque_above_what_stalls_the_motors_turns_them_back():
         assert float(rest.travel_direction(robot, Conditions(voltage=voltage, load_torque=torque))) == way
 
 
-def test_settled_rigs_with_a_brake_are_those_of_another_implementation():
-    for imposed in ("voltage", "motor_speed"):
-        w = rigs.world(np.random.default_rng([3, 1]), "bench", imposed)
-        size = 0.5 * rigs._nominal(w.constants, w.rig.supply)[0]
-        torque = size * np.random.default_rng(0).uniform(0, 1, len(w.conditions)) * w.conditions.direction
-        w = dataclasses.replace(w, conditions=dataclasses.replace(w.conditions, load_torque=torque))
-        found, _ = steady(w)
-        s, sound = rigs.solve(w.rig, w.conditions, w.constants)
-        free, _ = rigs.solve(w.rig, dataclasses.replace(w.conditions, load_torque=0 * torque), w.constants)
-        assert sound.all()
-        scale = np.abs(s.shown).max(1, keepdims=True)
-        assert_allclose(found / scale, s.shown / scale, atol=1e-6)
-        assert (
-            np.abs(free.shown - s.shown).max(1) > 1e-2 * scale[:, 0]
-        ).any()  # a brake without effect would be seen
+@pytest.mark.parametrize("imposed", ["voltage", "motor_speed"])
+def test_settled_rigs_with_a_brake_are_those_of_another_implementation(imposed):
+    w = rigs.world(default_rng([3, 1]), "bench", imposed)
+    size = 0.5 * rigs._nominal(w.constants, w.rig.supply)[0]
+    torque = size * default_rng(0).uniform(0, 1, len(w.conditions)) * w.conditions.direction
+    w, free = (replace(w, conditions=replace(w.conditions, load_torque=x)) for x in (torque, 0 * torque))
+    found, _ = steady(w)
+    (s, sound), (without, _) = (rigs.solve(x.rig, x.conditions, x.constants) for x in (w, free))
+    assert sound.all()
+    scale = np.abs(s.shown).max(1, keepdims=True)
+    assert_allclose(found / scale, s.shown / scale, atol=1e-6)
+    assert (np.abs(without.shown - s.shown) > 1e-2 * scale).any()  # a brake without effect would be seen
 
 
 def test_a_torque_that_changes_from_step_to_step_is_followed():
@@ -124,21 +125,24 @@ def test_every_fidelity_settles_alike_under_a_brake():
 def test_derivatives_by_a_brake_are_differences():
     """Of settled travel and of a run over time. Of a history by the load's own torque, which is the same."""
     for settles in (_steady, _driven):
-        by_torque = jax.jvp(lambda x: settles(x).motor_speed, (jnp.asarray(TORQUE),), (jnp.ones(4),))[1]  # noqa: B023
-        less, more = (settles(TORQUE + h).motor_speed for h in (-1e-4, 1e-4))
-        assert_allclose(by_torque, (more - less) / 2e-4, rtol=1e-4)
+
+        def speed(x, settles=settles):
+            return settles(TORQUE + x).motor_speed
+
+        assert_allclose(jax.jvp(speed, (0.0,), (1.0,))[1], (speed(1e-4) - speed(-1e-4)) / 2e-4, rtol=1e-4)
     times = jnp.asarray(time_grid(np.linspace(0, 0.6, 13)))
+    torque = 0.3 + 0.2 * jnp.sin(8 * times)
 
     @jax.jit
-    def both(torque):
+    def both(x):
         def shown(own):
-            return history_signals(bench(torque_constant=own), Conditions(load_torque=torque), times).speed_motor
+            conditions = Conditions(load_torque=torque + x)
+            return history_signals(bench(torque_constant=own), conditions, times).speed_motor
 
         return jax.jvp(shown, (0.0,), (1.0,))
 
-    torque = 0.3 + 0.2 * jnp.sin(8 * times)
-    less, more = (both(torque + h)[0] for h in (-1e-4, 1e-4))
-    assert_allclose(both(torque)[1], (more - less) / 2e-4, rtol=1e-3, atol=1e-3)
+    less, (_, slope), more = map(both, (-1e-4, 0.0, 1e-4))
+    assert_allclose(slope, (more[0] - less[0]) / 2e-4, rtol=1e-3, atol=1e-3)
 
 
 def test_a_brake_on_a_vehicle_is_refused(robot):
@@ -167,14 +171,12 @@ loss_coulomb = 0.0
 
 
 def read(tmp_path, lines, head=""):
-    (tmp_path / "rig.toml").write_text(RIG.format(head=head))
-    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
-    return records.read_runs(tmp_path / "runs.csv", robot=robot), robot
+    robot = read_rig(tmp_path, RIG.format(head=head))
+    return read_table(tmp_path, "\n".join(lines) + "\n", robot, "runs.csv"), robot
 
 
 @pytest.mark.parametrize(
-    ("column", "head", "factor"),
+    "column, head, factor",
     [
         ("load_torque_Nm", "", 1.0),
         ("load_torque_mNm", "", 1e-3),
@@ -201,24 +203,13 @@ def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path, robot):
 
 
 def test_a_torque_without_a_sign_is_said_to_drive_a_shaft_that_runs_backward(tmp_path):
-    lines = [
-        "supply_voltage_V,motor_speed_rpm,motor_current_A,load_torque_Nm",
-        "24,4000,4.2,0.2",
-        "-24,-4400,3.8,0.2",
-    ]
-    channels = 'channels = ["motor_speed", "motor_current"]'
-    runs, _ = read(tmp_path, lines, channels)
-    assert (
-        runs.pulled
-        and (
-            "runs.csv row 2, load_torque_Nm: got 0.2 where the shaft is driven backward: here it drives "
-            "the shaft. The torque of a brake is negative for backward motion"
+    head = "supply_voltage_V,motor_speed_rpm,motor_current_A,load_torque_Nm\n24,4000,4.2,0.2\n"
+    for row, drives in (("-24,-4400,3.8,0.2", True), ("-24,-4000,-4.2,-0.2", False)):
+        runs, _ = read(tmp_path, [head + row], 'channels = ["motor_speed", "motor_current"]')
+        assert (
+            bool(runs.pulled) == drives
+            and any("got 0.2 where the shaft is driven backward" in n for n in runs.notes) == drives
         )
-        in runs.notes
-    )
-    lines[2] = "-24,-4000,-4.2,-0.2"
-    runs, _ = read(tmp_path, lines, channels)
-    assert not runs.pulled and not any("backward" in note for note in runs.notes)
 
 
 @pytest.mark.parametrize("between", ["held", "linear"])
@@ -241,22 +232,21 @@ def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
     torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
     lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
     runs, _ = read(tmp_path, lines)
-    found = blocks.distinct_held_out_blocks(runs, SettledRuns.blocks)
+    found = distinct_held_out_blocks(runs, SettledRuns.blocks)
     assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
-    assert blocks.kind_in_words("load_torque") == "load torque"
+    assert kind_in_words("load_torque") == "load torque"
 
 
-def test_a_drift_that_goes_with_the_torque_is_none():
+@pytest.mark.parametrize("torque", [{}, {"load_torque_Nm": np.linspace(0, 0.5, 18)}])
+def test_a_drift_that_goes_with_the_torque_is_none(torque):
     """Tables of a brake are sorted by its torque. Their order then shows no drift of its own."""
     columns = {
         "configuration": np.full(18, "brake"), "order": np.arange(18.0), "supply_voltage_V": np.full(18, 24.0),
-        "total_current_A": np.linspace(0, 9, 18),
+        "total_current_A": np.linspace(0, 9, 18), **torque,
     }  # fmt: skip
-    rig = bench()
-    for with_torque in (False, True):
-        known = columns | ({"load_torque_Nm": np.linspace(0, 0.5, 18)} if with_torque else {})
-        over = {variable for basis in bases.curve_families(known, np.ones(18), rig) for _, variable in basis.names}
-        assert ("order" in over) != with_torque
+    ways, scope = dict.fromkeys(WAYS, np.ones(18)), bases.CurveScope.of(bench(), columns)
+    over = {variable for _, variable in bases.family_names(bases.curve_families(columns, np.ones(18), ways, scope))}
+    assert ("order" in over) != bool(torque)
 
 
 def test_a_torque_in_another_unit_is_doubted(tmp_path):
@@ -264,20 +254,19 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
     rows = [f"24,{4565 - 1.91 * m},{m}" for m in (0, 100, 200, 300)]
     for column, doubted in (("load_torque_Nm", True), ("load_torque_mNm", False)):
         runs, rig = read(tmp_path, [f"supply_voltage_V,motor_speed_rpm,{column}", *rows])
-        said = rig_facts.doubtful_torque(runs, rig)
-        assert bool(said) == doubted and rig_facts.log_doubts(runs, rig) == ((said,) if doubted else ())
-        assert not doubted or said == (
-            "runs.csv row 2, load_torque_Nm: got 100 N·m, but the motors stall at 2.39 N·m; is it in mN·m? then state "
-            '[columns] load_torque_mNm = "load_torque_Nm"'
-        )
+        said = doubtful_torque(runs, rig)
+        assert log_doubts(runs, rig) == (said,) * doubted
+        assert (
+            "row 2, load_torque_Nm: got 100 N·m, but the motors stall at 2.39 N·m; is it in mN·m" in said
+        ) == doubted
 
 
 def test_a_profile_and_a_sweep_state_the_torque(tmp_path, robot):
-    table = profiles.read_profile(text_file(tmp_path / "p.csv", "time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n"))
+    table = read_profile(text_file(tmp_path / "p.csv", "time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n"))
     assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
     assert table.stated == ("load_torque_Nm",)
     with pytest.raises(BadData, match=r"bad\.csv row 2, load_torque_Nm: got an empty cell; expected a number"):
-        profiles.read_profile(text_file(tmp_path / "bad.csv", "time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n"))
+        read_profile(text_file(tmp_path / "bad.csv", "time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n"))
     made = mm.sweep(bench(), voltages=[12.0, 24.0], load_torques=[0.0, 0.5])
     assert made.to_dict()["load_torque_Nm"].tolist() == [0.0, 0.5, 0.0, 0.5]
     free, braked = np.asarray(made.motor_speed).reshape(2, 2).T
@@ -291,21 +280,22 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path, robot):
 @pytest.mark.nightly
 def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
     """Of one voltage, from a file that is off by a tenth: R 0.5, k 0.05, M0 0.01."""
-    torque = np.arange(9) * 0.1
+    torque = np.round(np.arange(9) * 0.1, 1)
     current = (torque + 0.01) / 0.05
     speed = (24 - 0.5 * current) / 0.05 * 30 / np.pi
-    current += 0.003 * np.random.default_rng(1).standard_normal(9)  # an exact line would be a computed current
-    lines = ["supply_voltage_V,motor_speed_rpm,output_torque_Nm,motor_current_A"]
-    lines += [f"24,{n:.1f},{m:.1f},{i:.3f}" for n, m, i in zip(speed, torque, current, strict=True)]
+    current += 0.003 * default_rng(1).standard_normal(9)  # an exact line would be a computed current
     head = 'channels = ["motor_current", "motor_speed"]\n[columns]\nload_torque_Nm = "output_torque_Nm"'
-    off = RIG.replace("= 0.5\n", '= "0.54 ± 10 %"\n').replace("= 0.05\n", '= "0.047 ± 10 %"\n')
-    off = off.replace("= 0.01\n", '= "0.02 ± 100 %"\n').replace("load = 1.0", 'load = "1 ± 0"')
-    (tmp_path / "rig.toml").write_text(off.format(head=head))
-    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    rig = mm.read_robot(str(tmp_path / "rig.toml"))
-    runs = mm.read_runs(str(tmp_path / "runs.csv"), robot=rig)
+    off = RIG.format(head=head)
+    for true, stated in ((0.5, "0.54 ± 10 %"), (0.05, "0.047 ± 10 %"), (0.01, "0.02 ± 100 %"), ("1.0", "1 ± 0")):
+        off = off.replace(f" = {true}\n", f' = "{stated}"\n')
+    rig = read_rig(tmp_path, off)
+    columns = {
+        "supply_voltage_V": np.full(9, 24.0),
+        "motor_speed_rpm": np.round(speed, 1),
+        "output_torque_Nm": torque,
+    }
+    runs = mm.read_runs(columns | {"motor_current_A": np.round(current, 3)}, robot=rig)
     found = mm.discover(runs, rig, noise="motor_current=0.003 A,motor_speed=0.03 rpm")
     assert found.verdict == "none"
-    motor = found.robot.motor
     for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():
-        assert float(getattr(motor, name)) == pytest.approx(value, rel=0.01)
+        assert float(getattr(found.robot.motor, name)) == pytest.approx(value, rel=0.01)

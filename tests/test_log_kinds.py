@@ -2,25 +2,31 @@
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
-from calibration.data import robot_file, settling
-from calibration.data import runs as records
+from calibration.data.robot_file import change_robot
+from calibration.data.runs import read_runs
+from calibration.data.settling import settle_log
 from calibration.data.stated import EXAMPLE
 from calibration.data.unused_readings import thin_rows
 from calibration.inference import bases, observers
 from calibration.inference.preparation import prepare_input
 from sweeps.commands import rig_new
 from sweeps.points import run as points
+from tests.commands import read_rig
 
 STEP = 1e-4  # of the simulation [s]
 
 
+VOLTS = "supply_voltage_V"
+
+
 def written(tmp_path, kind, columns):
     """A file of `rig new` and a log of these columns beside it. The template's numbers are those of the log."""
-    (tmp_path / "rig.toml").write_text(rig_new.rig_template(kind).replace(EXAMPLE, "measured"), encoding="utf-8")
-    lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return robot_file.read_robot(tmp_path / "rig.toml")
+    np.savetxt(
+        tmp_path / "log.csv", np.column_stack([*columns.values()]), "%.9g", ",", header=",".join(columns), comments=""
+    )
+    return read_rig(tmp_path, rig_new.rig_template(kind).replace(EXAMPLE, "measured"))
 
 
 def sampled(rng, speed, angle, imposed, rate, delay, step, jitter=0.1):
@@ -72,23 +78,20 @@ def carriage(rng, levels=(1.2, 1.6, 2.0, -1.4, -1.8), hold=1.5):
 
 
 def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
-    rng = np.random.default_rng(1)
-    robot = written(tmp_path, "servo", servo(rng))
-    found = settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot))
+    robot = written(tmp_path, "servo", servo(default_rng(1)))
+    found = settle_log(read_runs(tmp_path / "log.csv", robot=robot))
     volts, r, k, friction, ratio, eta, viscous, dry = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005, 0.05
     duty = np.array([0.4, 0.7, 1.0, -0.6, -0.9])
     torque = ratio * eta * (k * volts * np.abs(duty) / r - friction) - dry
     exact = np.sign(duty) * torque / (viscous + ratio * eta * k * k * ratio / r) * 30 / np.pi
-    assert [s.mean["output_speed"] for s in found.kept] == pytest.approx(exact, rel=5e-3)
-    table = found.table()
-    assert table["duty"] == pytest.approx(duty) and "output_angle_deg" not in table
-    z = (np.array([s.mean["output_speed"] for s in found.kept]) - exact) / [s.sd["output_speed"] for s in found.kept]
-    assert np.abs(z).max() < 5
+    shown, sd = np.array([(s.mean["output_speed"], s.sd["output_speed"]) for s in found.kept]).T
+    assert shown == pytest.approx(exact, rel=5e-3) and np.abs((shown - exact) / sd).max() < 5
+    assert found.table()["duty"] == pytest.approx(duty) and "output_angle_deg" not in found.table()
 
 
 def test_a_carriages_log_of_current_and_position_settles(tmp_path):
-    robot = written(tmp_path, "carriage", carriage(np.random.default_rng(2)))
-    found = settling.settle_log(records.read_runs(tmp_path / "log.csv", robot=robot))
+    robot = written(tmp_path, "carriage", carriage(default_rng(2)))
+    found = settle_log(read_runs(tmp_path / "log.csv", robot=robot))
     radius = 5e-3 / (2 * np.pi)
     current = np.array([1.2, 1.6, 2.0, -1.4, -1.8])
     exact = np.sign(current) * (0.05 * np.abs(current) - 0.004 - 12.0 * radius) / (400.0 * radius**2) * radius * 1e3
@@ -97,14 +100,14 @@ def test_a_carriages_log_of_current_and_position_settles(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "make", "column", "least"), [
+@pytest.mark.parametrize("kind, make, column, least", [
     ("servo", servo, "output_angle_deg", 0.05), ("carriage", carriage, "position_mm", 0.005),
 ])  # fmt: skip
 def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_path, kind, make, column, least):
-    robot = written(tmp_path, kind, make(np.random.default_rng(3), hold=0.4))
+    robot = written(tmp_path, kind, make(default_rng(3), hold=0.4))
     if kind == "carriage":
-        robot = robot_file.change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+        robot = change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
+    runs = read_runs(tmp_path / "log.csv", robot=robot)
     ready = prepare_input(runs, robot)
     shown = points.simulate_histories(ready.robot, runs, None)
     error = np.std(shown[column] - runs[column])
@@ -114,20 +117,16 @@ def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_p
 @pytest.mark.slow
 def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_path, monkeypatch):
     """Of a servo on PWM the duty's share of the supply. While the circuit is open, the back-EMF of the run itself."""
-    log = {name: column[::2] for name, column in servo(np.random.default_rng(4), levels=(0.9,), hold=0.5).items()}
+    log = {name: column[::2] for name, column in servo(default_rng(4), levels=(0.9,), hold=0.5).items()}
     driven = np.arange(len(log["time_s"])) < 15
     log["duty"] = np.where(driven, log["duty"], 0.0)
-    written(tmp_path, "servo", log)
-    text = (tmp_path / "log.csv").read_text(encoding="utf-8").splitlines()
-    modes = ("mode", *np.where(driven, "voltage", "coast"))
-    (tmp_path / "log.csv").write_text("\n".join(map(",".join, zip(text, modes, strict=True))), encoding="utf-8")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    robot = written(tmp_path, "servo", log)
+    runs = read_runs({**log, "mode": np.where(driven, "voltage", "coast")}, robot=robot)
     observer = observers.Histories.of(runs, robot)
     seen = {}
     monkeypatch.setattr(bases, "curve_families", lambda columns, *_, **__: seen.update(columns) or ())
     observer.bases(dict(runs.columns), np.ones(len(runs), bool), robot)
-    volts = seen["supply_voltage_V"]
+    volts = seen[VOLTS]
     assert volts[driven] == pytest.approx(0.9 * 6.0)
     rolls_out = volts[~driven]
     assert 0 < rolls_out[0] < 0.9 * 6.0 and (np.diff(rolls_out) < 1e-3).all() and rolls_out[-1] < 0.5 * rolls_out[0]
@@ -135,7 +134,7 @@ def test_curves_are_over_the_voltage_at_motors_whose_speed_no_channel_reads(tmp_
 
 def test_a_thinned_log_takes_the_mean_of_its_current_and_fewer_steps(tmp_path):
     """The current changes in each of 4000 rows. It moves the load by as much, and as far, at each reading that is kept."""
-    rng, time = np.random.default_rng(4), np.arange(4000) * 1e-3
+    rng, time = default_rng(4), np.arange(4000) * 1e-3
     current = 1.6 * np.sin(5 * time) + 0.4 * np.sin(40 * time) + 0.05 * rng.standard_normal(len(time))
     current[2500:] += 1.0  # a jump, whose row stays
 
@@ -148,7 +147,7 @@ def test_a_thinned_log_takes_the_mean_of_its_current_and_fewer_steps(tmp_path):
     wanted = travelled(time, current)
     columns = {"time_s": time, "motor_current_A": current, "position_mm": 1e3 * wanted[1]}
     robot = written(tmp_path, "carriage", columns)
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot).of(robot)
+    runs = read_runs(tmp_path / "log.csv", robot=robot).of(robot)
     thinned = thin_rows(runs, 500)
     brief = observers.Histories.of(thinned, robot)
     times, amperes = np.asarray(brief.times[0]), np.asarray(brief.conditions.motor_current[0])

@@ -5,12 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from calibration.data.delimited import read_csv_columns
 from calibration.data.input_errors import BadData
-from sweeps import store
-from sweeps.commands import loop_joints
+from sweeps.commands.loop_joints import Chain, runs_of_joints
+from sweeps.store import finish_run_folder, open_folder
 from tests.commands import ends, read_json, read_rig
 
 JOINTS = ("shoulder", "elbow")
@@ -54,13 +55,12 @@ def arm(seconds=4.0, every=0.005, seed=0):
     """A log of the arm under steps of voltage, by own steps of motors and friction around MuJoCo's `mj_forward`."""
     model = mujoco.MjModel.from_xml_string(MODEL)
     model.dof_damping[:], model.dof_frictionloss[:], model.dof_armature[:] = 0, 0, 2e-6 * 50**2
-    data, rng, step = mujoco.MjData(model), np.random.default_rng(seed), 5e-5
+    data, rng, step = mujoco.MjData(model), default_rng(seed), 5e-5
     volts = np.repeat(rng.choice([-1.0, 1.0], (40, 2)) * rng.uniform(2, 7, (40, 2)), 50, 0)
     angle, speed, current, rows = np.zeros(2), np.zeros(2), np.zeros(2), []
     for k in range(round(seconds / step)):
         now = volts[int(k * step / every)] if k * step > 0.1 else np.zeros(2)
-        friction = np.where(speed > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(speed / REST) + VISCOUS * speed
-        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = angle, speed, 50 * 0.02 * current - friction
+        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = angle, speed, 50 * 0.02 * current - friction_of(speed)
         mujoco.mj_forward(model, data)
         if k % round(every / step) == 0:
             rows.append([k * step, *now, *current, *angle, *speed, *data.qacc])
@@ -75,42 +75,48 @@ def write(folder, rows, noise=0.0, model=MODEL):
     (folder / "arm.xml").write_text(model)
     for name in JOINTS:
         (folder / f"{name}.toml").write_text(RIG)
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     angle, current = (
         rows[:, k : k + 2] + sd * rng.standard_normal((len(rows), 2)) for k, sd in ((5, noise), (3, 30 * noise))
     )
-    cells = np.column_stack([rows[:, 0], rows[:, 1:3], current, np.degrees(angle)])
+    cells = np.column_stack([rows[:, :3], current, np.degrees(angle)])
     columns = [f"{j}.{c}" for c in ("supply_voltage_V", "motor_current_A", "output_angle_deg") for j in JOINTS]
     np.savetxt(folder / "log.csv", cells, "%.13g", ",", header=",".join(["time_s", *columns]), comments="")
 
 
+def runs_of(folder, joint="elbow", rig=RIG):
+    """The runs of one joint of the arm and the log in a folder."""
+    log = read_csv_columns(folder / "log.csv", "log.csv")
+    return runs_of_joints(log, Chain(folder / "arm.xml"), {joint: read_rig(folder, rig)})[joint]
+
+
+def friction_of(speed, way=None):
+    """Friction torque of each joint, smoothed at rest."""
+    way = np.tanh(speed / REST) if way is None else way
+    return np.where(speed > 0, DRY[:, 0], DRY[:, 1]) * way + VISCOUS * speed
+
+
 def test_torque_of_the_model_is_what_mujoco_was_given_without_friction_and_rotors(tmp_path):
     """At states of the arm, MuJoCo's own forward dynamics with the torque gives the acceleration."""
-    (tmp_path / "arm.xml").write_text(MODEL)
-    chain, rows = loop_joints.Chain(tmp_path / "arm.xml"), arm(0.5)[::10]
-    friction = (
-        np.where(rows[:, 7:9] > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(rows[:, 7:9] / REST) + VISCOUS * rows[:, 7:9]
-    )
-    given = 50 * 0.02 * rows[:, 3:5] - friction - 2e-6 * 50**2 * rows[:, 9:]
-    assert_allclose(chain.torques(rows[:, 5:].reshape(-1, 3, 2).swapaxes(0, 1)), given, atol=1e-9)
+    rows = arm(0.5)[::10]
+    write(tmp_path, rows)
+    given = 50 * 0.02 * rows[:, 3:5] - friction_of(rows[:, 7:9]) - 2e-6 * 50**2 * rows[:, 9:]
+    motion = rows[:, 5:].reshape(-1, 3, 2).swapaxes(0, 1)
+    assert_allclose(Chain(tmp_path / "arm.xml").torques(motion), given, atol=1e-9)
 
 
 def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
     """A smooth motion without noise, and the share of the noise of readings that ends in the torque."""
-    time = np.arange(0, 2, 0.002)
-    motion = np.stack([
-        np.column_stack([a * w**n * np.sin(w * time + n * np.pi / 2) for a, w in ((0.6, 3.0), (0.9, 2.0))])
-        for n in range(3)
-    ])  # fmt: skip
+    time, amplitude, rate = np.arange(0, 2, 0.002), np.array([0.6, 0.9]), np.array([3.0, 2.0])
+    angle = amplitude * np.sin(time[:, None] * rate)
+    motion = np.stack([angle, amplitude * rate * np.cos(time[:, None] * rate), -(rate**2) * angle])
     angle, speed, acceleration = motion[:, :, 1]
     rows = np.column_stack([time, np.ones((len(time), 4)), motion[0]])
     inner, errors = slice(100, -100), []
     for noise in (0.0, 1e-3):
         write(tmp_path, rows, noise)
-        robot = read_rig(tmp_path, RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n")
-        chain, log = loop_joints.Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
-        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"].whole
-        needed = chain.torques(motion)[:, 1]
+        runs = runs_of(tmp_path, rig=RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n").whole
+        needed = Chain(tmp_path / "arm.xml").torques(motion)[:, 1]
         given = runs["load_torque_Nm"] + 0.05 * acceleration + 0.3 * np.sin(angle - 0.2)
         errors.append(np.abs(given - needed)[inner].max() / np.abs(needed).max())
         assert_allclose(runs["motor_speed_rpm"][inner], 50 * 30 / np.pi * speed[inner], atol=3)
@@ -119,44 +125,36 @@ def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
 
 def test_units_of_a_log_reach_each_joint(tmp_path):
     """In names of columns and in a row below them. The sd of a current is that of its noise, in any unit."""
-    rng, time = np.random.default_rng(2), np.arange(0, 2, 0.005)
-    smooth = np.column_stack([np.sin(2 * time), np.cos(3 * time)])
+    rng, time = default_rng(2), np.arange(0, 2, 0.005)
     rows = np.column_stack(
-        [time, np.full((len(time), 2), 5.0), smooth + 0.01 * rng.standard_normal(smooth.shape), smooth]
+        [time, np.full((len(time), 2), 5.0), np.tile([np.sin(2 * time), np.cos(3 * time)], (2, 1)).T]
     )
-    write(tmp_path, rows)
-    header, *lines = (tmp_path / "log.csv").read_text().splitlines()
-    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
+    rows[:, 3:5] += 0.01 * rng.standard_normal((len(time), 2))
 
-    def runs(units, header=header, lines=lines):
+    def runs(units, rows=rows, unit="A"):
+        write(tmp_path, rows)
+        header, *lines = (tmp_path / "log.csv").read_text().splitlines()
+        header = header.replace("elbow.motor_current_A", f"elbow.motor_current_{unit}")
         (tmp_path / "log.csv").write_text("\n".join([header, units, *lines]))
-        return loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)["elbow"]
+        return runs_of(tmp_path)
 
     table = runs("s,V,V,A,A,deg,deg")
     assert any("contains units" in note for note in table.notes)
     assert_allclose(np.median(table["motor_current_sd_A"]), 0.01, rtol=0.1)
-    milli = [
-        ",".join(x if k != 4 else f"{1e3 * float(x):.9g}" for k, x in enumerate(line.split(","))) for line in lines
-    ]
-    other = runs("s,V,V,A,mA,deg,deg", header.replace("elbow.motor_current_A", "elbow.motor_current_mA"), milli)
+    milli = rows * np.where(np.arange(7) == 4, 1e3, 1.0)
+    other = runs("s,V,V,A,mA,deg,deg", milli, "mA")
     assert_allclose(other["motor_current_sd_A"], table["motor_current_sd_A"], rtol=1e-6)
-    for wrong, name in (
-        ("s,V,V,A,mA,deg,deg", "motor_current_A states mA"),
-        ("s,V,V,A,A,rad,deg", "output_angle_deg states rad"),
-    ):
+    for wrong, name in (("A,mA,deg", "motor_current_A states mA"), ("A,A,rad", "output_angle_deg states rad")):
         with pytest.raises(BadData, match=f"{name} in the row of units"):
-            runs(wrong)
+            runs(f"s,V,V,{wrong},deg")
 
 
 def test_current_is_left_out_where_the_direction_of_the_smoothed_speed_is_uncertain(tmp_path):
     """A reading of friction with the wrong sign looks like a missing effect."""
     rows = arm(2.0)
     write(tmp_path, rows, 3e-4)
-    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
-    log = read_csv_columns(tmp_path / "log.csv", "log.csv")
-    table = loop_joints.runs_of_joints(log, chain, robots)["elbow"]
-    true_speed = np.interp(table["time_s"], rows[:, 0], rows[:, 8])
-    wrong = np.sign(table["motor_speed_rpm"]) != np.sign(true_speed)
+    table = runs_of(tmp_path)
+    wrong = np.sign(table["motor_speed_rpm"]) != np.sign(np.interp(table["time_s"], rows[:, 0], rows[:, 8]))
     kept = np.isfinite(table["motor_current_A"])
     assert np.sum(wrong) > 5 and np.sum(wrong & kept) <= 0.2 * np.sum(wrong) and np.mean(kept) > 0.5
     assert any("direction of the speed is uncertain" in note for note in table.notes)
@@ -168,12 +166,11 @@ def test_currents_of_a_joint_are_not_late(tmp_path, joint):
     late by 4 ms. Inertias that move half a row early made that 10 ms."""
     rows, k = arm(2.0, seed=12), JOINTS.index(joint)
     write(tmp_path, rows, 3e-4)
-    robots, chain = {joint: read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
-    table = loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)[joint]
+    table = runs_of(tmp_path, joint)
     time, speed = table.whole["time_s"], table.whole["motor_speed_rpm"] * np.pi / 30 / 50
-    gradient = np.gradient(speed, time)[np.searchsorted(time, table["time_s"])]
-    speed = speed[np.searchsorted(time, table["time_s"])]
-    friction = np.where(speed > 0, *DRY[k]) * np.sign(speed) + VISCOUS * speed
+    at = np.searchsorted(time, table["time_s"])
+    speed, gradient = speed[at], np.gradient(speed, time)[at]
+    friction = friction_of(speed[:, None], np.sign(speed[:, None]))[:, k]
     needed = table["load_torque_Nm"] + (0.05 + 2e-6 * 50**2) * gradient + friction
     slope = np.interp(table["time_s"], rows[:, 0], np.gradient(rows[:, 3 + k], rows[:, 0]))
     error, slope = (x / table["motor_current_sd_A"] for x in (table["motor_current_A"] - needed / (50 * 0.02), slope))
@@ -183,7 +180,7 @@ def test_currents_of_a_joint_are_not_late(tmp_path, joint):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "joints", "message"),
+    "old, new, joints, message",
     [
         ("", "", "wrist", r"--joints: got wrist; arm.xml has no such driven joint"),
         ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow is no named hinge"),
@@ -199,24 +196,20 @@ def test_models_that_are_no_chain_of_driven_hinges_are_refused(old, new, joints,
     ends(mmrjax("loop", tmp_path / "log.csv", "--model", tmp_path / "arm.xml", "--joints", joints), message)
 
 
-def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
+@pytest.mark.parametrize("old, new, options, says, code", [
+    ("", "", [], "--model and --joints must be given together", 2),
+    ("elbow.output", "wrist.output", ["--joints", "shoulder"], "has no column elbow.output_angle_deg or elbow.output_angle_rad", 4),
+    ("time_s", "moment", ["--joints", "elbow"], "has no column time_s", 4),
+    ("0.05,", "#", ["--joints", "elbow"], "shoulder.output_angle_deg: has 5 readings in run 1", 4),
+    ("", "", ["--joints", "elbow", "--robot", "sm1"], "expected the rig of one joint", 2),
+])  # fmt: skip
+def test_what_a_joint_lacks_is_named(old, new, options, says, code, mmrjax, tmp_path):
     rows = np.zeros((20, 7))
     rows[:, 0] = np.arange(20) * 0.01
     write(tmp_path, rows)
-    arguments = COMMAND.format(tmp_path).split()
-    ends(mmrjax(*arguments), "--model and --joints must be given together")
     log = (tmp_path / "log.csv").read_text()
-    (tmp_path / "log.csv").write_text(log.replace("elbow.output_angle_deg", "wrist.output_angle_deg"))
-    ends(
-        mmrjax(*arguments, "--joints", "shoulder"),
-        "has no column elbow.output_angle_deg or elbow.output_angle_rad",
-        code=4,
-    )
-    (tmp_path / "log.csv").write_text(log.replace("time_s", "moment"))
-    ends(mmrjax(*arguments, "--joints", "elbow"), "has no column time_s", code=4)
-    (tmp_path / "log.csv").write_text("\n".join(log.splitlines()[:6]))
-    ends(mmrjax(*arguments, "--joints", "elbow"), "shoulder.output_angle_deg: has 5 readings in run 1", code=4)
-    ends(mmrjax(*arguments[:-2], "--joints", "elbow", "--robot", "sm1"), "expected the rig of one joint")
+    (tmp_path / "log.csv").write_text(log.partition("0.05,")[0] if new == "#" else log.replace(old, new))
+    ends(mmrjax(COMMAND.format(tmp_path), *options), says, code=code)
 
 
 @pytest.mark.slow
@@ -238,18 +231,16 @@ def test_finished_joints_are_kept_and_all_are_on_one_page(mmrjax, tmp_path, monk
 
     def loop(one, beside, robot, runs):
         ran.append(one.joints)
-        with store.open_folder("loop", one, robot, beside, runs) as folder:
+        with open_folder("loop", one, robot, beside, runs) as folder:
             errors = {
                 which: {"held_out": {"motor_current": {"rms_percent": x}}}
                 for which, x in (("before", 4.0), ("after", 2.0))
             }
             folder.write_json("result.json", {"statement": f"Friction of {runs.source}.", "errors": errors})
-            return store.finish_run_folder(folder, one, {}, robot=robot, runs=runs)
+            return finish_run_folder(folder, one, {}, robot=robot, runs=runs)
 
     monkeypatch.setattr("sweeps.commands.loop._run_with_time_limit", loop)
-    write(
-        tmp_path, np.column_stack([np.arange(40) * 0.01, np.zeros((40, 4)), np.random.default_rng(0).random((40, 2))])
-    )
+    write(tmp_path, np.column_stack([np.arange(40) * 0.01, np.zeros((40, 4)), default_rng(0).random((40, 2))]))
     arguments = [*COMMAND.format(tmp_path).split(), "--joints", "all", "--out", tmp_path / "found"]
     ends(mmrjax(*arguments), "4 → 2", code=0)
     ends(mmrjax(*arguments), "joint shoulder: finished in", code=0)

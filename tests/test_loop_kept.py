@@ -9,19 +9,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from worlds import rigs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import OutOfTime
-from calibration.discovery import discover as room
+from calibration.discovery.discover import discover
 from calibration.discovery.verdict import LoopStages
-from calibration.inference import population
 from mmrjax.compile import programs
-from sweeps import config
-from sweeps import stage_files as kept_stages
 from sweeps.commands import loop as command
+from sweeps.config import FolderPart, LoopBeside
+from sweeps.stage_files import read_stage, write_stage
 from sweeps.store import RunFolder, open_folder
 from tests.commands import ends
 
@@ -44,7 +44,7 @@ def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
 
 def test_a_stage_of_another_version_is_made_again(tmp_path, monkeypatch, robot):
     """What is named by a hash of the source: the release's number does not change with a mended line."""
-    told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), config.FolderPart(out=tmp_path / "x")
+    told, beside = SimpleNamespace(model_dump=lambda **_: {}, effects=()), FolderPart(out=tmp_path / "x")
 
     def stage(make, force=False):
         with (
@@ -70,20 +70,20 @@ def test_nothing_kept_leaves_nothing_behind(tmp_path):
     assert not folder.partial.exists()
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("90s", 90.0), ("5min", 300.0), ("1.5h", 5400.0), ("40", 40.0)])
+@pytest.mark.parametrize("text, seconds", [("90s", 90.0), ("5min", 300.0), ("1.5h", 5400.0), ("40", 40.0)])
 def test_a_budget_has_a_unit(text, seconds):
-    assert config.LoopBeside(within=text).seconds == seconds
+    assert LoopBeside(within=text).seconds == seconds
 
 
 @pytest.fixture
 def rig(tmp_path):
     """A folder with a bench's file and its table."""
-    world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    world = rigs.world(default_rng(3), "bench", "voltage", rows=(16, 20))
     rigs.case(world).write(tmp_path)
     return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
 
 
-@pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt, 130), (OutOfTime, 3)])
+@pytest.mark.parametrize("end, code", [(KeyboardInterrupt, 130), (OutOfTime, 3)])
 def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end, code):
     def first(*_, keep, **__):
         keep("verdict", lambda: LoopStages("class"))
@@ -144,7 +144,7 @@ def test_time_that_is_out_before_the_verdict_ends_it_there_and_says_so(rig, mmrj
     monkeypatch.setattr(command, "discover", late)
     code, _, err = mmrjax(*rig, "--within", within)
     assert code == 3 and "went on" not in err and "interrupted" not in err
-    said = f"no verdict within {within.removesuffix('s')} s, and no fit of the base model; allow more time, such as --within 5min"
+    said = f"no verdict within {within.removesuffix('s')} s, and no fit of the base model; allow more, such as --within 5min"
     assert said in err
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and not (tmp_path / "found.partial").exists()
 
@@ -155,7 +155,7 @@ def test_a_budget_that_was_too_small_is_answered_by_a_larger_one(rig, mmrjax, mo
 
     monkeypatch.setattr(command, "discover", late)
     assert (
-        "no verdict within 540 s, and no fit of the base model; allow more time, such as --within 18min"
+        "no verdict within 540 s, and no fit of the base model; allow more, such as --within 18min"
         in (mmrjax(*rig, "--within", "9min")[2])
     )
 
@@ -169,42 +169,30 @@ def test_a_budget_ends_a_step_that_says_nothing():
 
 @pytest.mark.nightly
 def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
-    world = rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
-    rigs.case(world, "iron_loss", 12.0).write(tmp_path)
-    text = (tmp_path / "table.csv").read_text().splitlines()
-    header = text[0].split(",")
-    shown = [
-        k for k, name in enumerate(header) if "_sd_" not in name
-    ]  # so that the noise is assumed, and others tried
-    rows = [",".join(line.split(",")[k] for k in shown) for line in text]
-    (tmp_path / "table.csv").write_text("\n".join(rows) + "\n")
+    rigs.case(rigs.world(default_rng(3), "bench", "voltage", rows=(16, 20)), "iron_loss", 12.0).write(tmp_path)
     robot = robot_file.read_robot(tmp_path / "rig.toml")
     runs = records.read_runs(tmp_path / "table.csv", robot=robot)
+    for name in [n for n in runs.columns if "_sd_" in n]:  # so that the noise is assumed, and others tried
+        del runs.columns[name]
     written = {}
 
     def keep(name, make):
         made = make()
-        kept_stages.write_stage(tmp_path / name, made)
-        written[name] = kept_stages.read_stage(tmp_path / name)
+        write_stage(tmp_path / name, made)
+        written[name] = read_stage(tmp_path / name)
         return made
-
-    found = room.discover(runs, robot, replicates=250, keep=keep)
-    factors = tuple(float(name.split()[1]) for name in written if name.startswith("noise"))
-    assert {"base", "bootstrap 0", "verdict", "result"} <= set(written) and len(factors) == 2
-    again = room.discover(runs, robot, replicates=250, keep=lambda name, make: written[name])
-    assert again.verdict == found.verdict and again.chi2 == found.chi2
-    assert [e.name for e in again.effects] == [e.name for e in found.effects]
-    assert again.sensitivity == found.sensitivity
 
     def slow(name, make):  # other noises take longer than there is time
         if name.startswith("noise"):
             raise concurrent.futures.TimeoutError
         return written[name]
 
-    ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
-    assert ended.verdict == found.verdict and not ended.sensitivity
-    assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [tuple(sorted(factors))]
-
-
-def test_nothing_is_kept_where_nobody_asks():
-    assert population.compute_without_storing("base", lambda: 3) == 3
+    found = discover(runs, robot, replicates=250, keep=keep)
+    factors = tuple(sorted(float(name.split()[1]) for name in written if name.startswith("noise")))
+    assert {"base", "bootstrap 0", "verdict", "result"} <= set(written) and len(factors) == 2
+    again = discover(runs, robot, replicates=250, keep=lambda name, make: written[name])
+    ended = discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
+    assert again.verdict == ended.verdict == found.verdict and again.chi2 == found.chi2
+    assert [e.name for e in again.effects] == [e.name for e in found.effects]
+    assert again.sensitivity == found.sensitivity and not ended.sensitivity
+    assert [n.factors for n in ended.remarks if n.code == "outstanding"] == [factors]

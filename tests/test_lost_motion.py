@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.data import robot_file
-from calibration.data import runs as records
 from calibration.described import describe
-from calibration.discovery import discover, log_stages, loop_input, stages, verdict
+from calibration.discovery import discover, log_stages, verdict
+from calibration.discovery.loop_input import LoopInput, prepare_loop
+from calibration.discovery.stages import findings, search_until_clean
 from calibration.inference.lost_motion import lost_motion_notes
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import loop as command
 from sweeps.commands.rig_check import check_rig_file
+from tests.commands import csv_text, read_rig, read_table
 
 RIG = """base = "none"
 channels = [{channels}]
@@ -64,21 +65,17 @@ def servo(play=0.0, friction=0.17, delay=0, seconds=16.0):
 
 
 def read(tmp_path, log, channels='"output_angle"', backlash=""):
-    time, duty, speed, angle = log
-    (tmp_path / "rig.toml").write_text(RIG.format(channels=channels, backlash=backlash))
-    motor = "motor_speed" in channels
-    lines = [f"time_s,supply_voltage_V,duty,output_angle_deg{',motor_speed_rpm' * motor}"]
-    lines += [
-        f"{t:.3f},12,{d},{a:.3f}" + f",{w / RPM:.1f}" * motor
-        for t, d, w, a in zip(time, duty, speed, angle, strict=True)
-    ]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
-    return records.read_runs(tmp_path / "log.csv", robot=robot), robot
+    columns = dict(zip(("time_s", "duty", "motor_speed_rpm", "output_angle_deg"), log, strict=True))
+    columns = {name: np.round(x, 3) for name, x in columns.items()} | {"supply_voltage_V": np.full(len(log[0]), 12)}
+    columns["motor_speed_rpm"] = np.round(log[2] / RPM, 1)
+    if "motor_speed" not in channels:
+        del columns["motor_speed_rpm"]
+    robot = read_rig(tmp_path, RIG.format(channels=channels, backlash=backlash))
+    return read_table(tmp_path, csv_text(columns), robot), robot
 
 
 @pytest.mark.parametrize(
-    ("channels", "off"), [('"output_angle"', 0.3), ('"output_angle", "motor_speed"', 0.05)], ids=["output", "both"]
+    "channels, off", [('"output_angle"', 0.3), ('"output_angle", "motor_speed"', 0.05)], ids=["output", "both"]
 )
 def test_play_is_found_and_measured(tmp_path, channels, off):
     runs, robot = read(tmp_path, servo(play=1.0), channels)
@@ -137,16 +134,13 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
         return (base, rejected) if name == "bootstrap 0" else (base, rejected, SimpleNamespace(diagnosis=None))
 
     task = SimpleNamespace(
-        settings=SimpleNamespace(replicates=1),
-        keep=keep,
-        ranked=[],
-        progress=lambda step: None,
+        settings=SimpleNamespace(replicates=1), keep=keep, ranked=[], progress=lambda step: None,
         shows_unmodelled_backlash=lost,
-    )
-    monkeypatch.setattr(stages.findings, "rank_library", lambda *_: None)
-    searched = stages.search_until_clean(task, base, None)[2]
+    )  # fmt: skip
+    monkeypatch.setattr(findings, "rank_library", lambda *_: None)
+    searched = search_until_clean(task, base, None)[2]
     assert (searched is None) == lost
-    assert steps == (["bootstrap 0"] if lost else ["bootstrap 0", "ranking", "search 0"])
+    assert steps == ["bootstrap 0"] + ["ranking", "search 0"] * (not lost)
 
 
 @pytest.mark.parametrize("rejected", [True, False])
@@ -166,7 +160,7 @@ def test_a_rigid_base_that_leaves_only_noise_refutes_the_lost_motion(rejected, m
         discover, "STAGES", [steps[name] for name in ("base", "settled", "readings", "search", "no search")]
     )
     notes = tuple(lost_motion_notes(runs, robot))
-    given = loop_input.LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
+    given = LoopInput(runs, None, robot, *[None] * 4, at_first=notes, keep=lambda name, make: (
         SimpleNamespace(base=base), SimpleNamespace(noise=None)))  # fmt: skip
     assert discover.trace_verdict(given).verdict == ("undescribed" if rejected else "none")
 
@@ -187,7 +181,7 @@ def test_a_loop_that_runs_out_of_time_answers_with_the_lost_motion(tmp_path, mmr
 def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
     for play in (1.0, 0.0):
         runs, robot = read(tmp_path, servo(play=play))
-        given = loop_input.prepare_loop(runs, robot, noise="output_angle=0.1deg")
+        given = prepare_loop(runs, robot, noise="output_angle=0.1deg")
         assert given.shows_unmodelled_backlash == (play > 0)
 
 
@@ -209,6 +203,6 @@ def test_stages_of_windows_are_stored_apart_and_their_fit_begins_the_simulation(
     monkeypatch.setattr(log_stages, "delayed_by_rows", lambda given, fit: fit)
     monkeypatch.setattr(discover, "trace_verdict", Windows.trace)
     robot = SimpleNamespace(has_ground=False)
-    given = loop_input.LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
+    given = LoopInput(None, None, robot, *[None] * 4, keep=lambda name, make: name)
     given.__dict__["space"] = SimpleNamespace(with_room=lambda names: None)
     assert discover.trace_windows(given) == "fit" and confirmed == ["ranking", "windows base", "windows search 0"]

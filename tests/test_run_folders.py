@@ -77,7 +77,7 @@ def test_a_foreign_partial_folder_is_left_alone(tmp_path, name, text, force):
     file.write_text(text)
     (tmp_path / "x.partial/thesis.txt").write_text("years of work")
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match=r"x\.partial already exists and was not created by mmrjax"):
+    with pytest.raises(BadConfiguration, match=r"x\.partial was not created by mmrjax"):
         RunFolder(tmp_path / "x", LOOP, force=force)
     assert names(tmp_path) == before
 
@@ -93,7 +93,7 @@ def test_a_partial_folder_that_is_a_link_is_left_alone(tmp_path):
 def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     partial = interrupted(tmp_path / "x")
     with pytest.raises(
-        BadConfiguration, match=r"x\.partial contains an interrupted loop, which the same command resumes"
+        BadConfiguration, match=r"x\.partial contains an interrupted loop; choose another path or --force"
     ):
         RunFolder(tmp_path / "x", SWEEP)
     other = LOOP | {"seed": 2}
@@ -104,7 +104,7 @@ def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     assert (partial / "chunks/base.stage").is_file()
     RunFolder(tmp_path / "x", other, force=True).close()
     assert not (partial / "chunks/base.stage").exists()
-    assert "x.partial: was made with another configuration, so it is started again" in capsys.readouterr().err
+    assert "x.partial: was made with another configuration and is started again" in capsys.readouterr().err
     RunFolder(tmp_path / "x", SWEEP).close()  # nothing of the loop's is left
     interrupted(tmp_path / "x", SWEEP)
     with RunFolder(tmp_path / "x", LOOP, force=True) as folder:
@@ -130,7 +130,7 @@ def test_a_forged_mark_costs_no_file(tmp_path):
     with pytest.raises(BadConfiguration, match=r"thesis\.txt, which its command did not write"):
         finished(tmp_path / "x")
     (partial / "lock").write_text(json.dumps(json.loads(lock_text("loop")) | {"foreign": []}))
-    with pytest.raises(BadConfiguration, match="or use --force to start again"):
+    with pytest.raises(BadConfiguration, match="or --force to start again"):
         finished(tmp_path / "x")
     assert (partial / "thesis.txt").is_file()
 

@@ -16,7 +16,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
 from calibration.discovery.result import EffectRanking, RankedEffect
 from calibration.discovery.settings import settings_for
-from calibration.inference.held_out import predict_unseen
+from calibration.inference.blocks import predict_unseen
 from calibration.inference.observers import Histories
 from calibration.inference.observers.linear_rows import problem_of_readings
 from calibration.inference.optimizers import Optimum

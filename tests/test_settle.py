@@ -320,7 +320,7 @@ def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, mon
     bench(tmp_path, columns)
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: NOTHING_FORESEEN)
     said = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
-    assert any("in the motor leads measures motor_current" in s for s in said) == duty
+    assert any("Motor leads carry motor_current" in s for s in said) == duty
 
 
 @pytest.mark.quick(1)

@@ -57,7 +57,7 @@ def asked(text):
 
 @pytest.fixture(scope="module")
 def found(robot, asked):
-    return design_search.size_robot(robot, asked, ("mass",), starts=256)
+    return design_search.size_robot(robot, asked, ("mass",))
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +218,7 @@ def test_what_no_parts_meet_is_left_out_and_said(robot):
     asked = requirements_file.parse_requirements(
         "speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml"
     )
-    found = design_search.size_robot(robot, asked, ("mass",), starts=32, motors=(MOTOR,))
+    found = design_search.size_robot(robot, asked, ("mass",), motors=(MOTOR,))
     assert found.unmeetable == ("steepest slope held",) and found.best is not None
     assert [design_verdict(f, found.unmeetable) for f in (found.best, *found.motors.values())] == [
         "meets the others"
@@ -232,7 +232,7 @@ def test_step_that_is_asked_for_decides_the_design(robot):
     """Smaller pulleys stand on higher steps: 290 mm without payload takes 3/4 of the robot's, with which it does 270."""
     text = "speed_m_s = 0.5\nstep_mm = { least = 290, payload_kg = 0 }\n[envelope]\nstate_of_charge = [0.1, 1]"
     asked = requirements_file.parse_requirements(text, "r.toml")
-    best = design_search.size_robot(robot, asked, ("mass",), starts=32, motors=(MOTOR,)).best
+    best = design_search.size_robot(robot, asked, ("mass",), motors=(MOTOR,)).best
     meets(best, asked)
     assert 0.6 <= best.radius / float(robot.radius_pulley) < 0.75
 

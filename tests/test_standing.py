@@ -184,7 +184,7 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
     angle = np.concatenate([(0.6 + 0.4 * k) * np.sin(np.pi * t) ** 2 for k in range(3)])
     speed = np.concatenate([(0.6 + 0.4 * k) * np.pi * np.sin(2 * np.pi * t) for k in range(3)])
     rows, n = np.arange(3 * samples).reshape(3, samples), 3 * samples
-    waves = bases.wave_families(np.zeros(n, bool), angle, rows, rows)
+    waves = bases.wave_families(np.zeros(n, bool), angle, rows, rows, bases.BALANCES)
     only = np.array([1.0, 0.0, 0.0])
     defects = np.zeros((len(PROBED), n, 3))
     defects[PROBED.index("track")] = only

@@ -270,7 +270,7 @@ def stopping(monkeypatch, at, error):
 @pytest.mark.parametrize("at", [2, 6, 20, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 7, 33, 40))])
 def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, tmp_path, at):
     heal = stopping(monkeypatch, at, KeyboardInterrupt())
-    ends(sweep("s"), "resumes the sweep after its last complete chunk", code=130)
+    ends(sweep("s"), "resume after the last complete chunk", code=130)
     assert not (tmp_path / "s").exists()
     heal()
     computed, honest = [], scale.Compiled.__call__
@@ -615,7 +615,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
     HARMS[harm](victim(store.partial, name))
     if name == "identity.json" and harm != "remove":  # without one the store had not begun
         with pytest.raises(
-            BadData, match=r"identity\.json is damaged; choose another path, or use --force to start again"
+            BadData, match=r"identity\.json is damaged; choose another path, or --force to start again"
         ):
             opened()
         again = opened(force=True)
@@ -761,7 +761,7 @@ def test_size_of_a_store_is_what_it_takes(whole):
 def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
     (tmp_path / "s.partial").mkdir()
     (tmp_path / "s.partial/thesis.txt").write_text("years of work")
-    ends(sweep("s"), "already exists and was not created by mmrjax")
+    ends(sweep("s"), "was not created by mmrjax")
     (tmp_path / "t").mkdir()
     (tmp_path / "t/thesis.txt").write_text("years of work")
     for force in ([], ["--force"]):

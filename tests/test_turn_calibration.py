@@ -91,7 +91,7 @@ def test_a_step_of_a_fit_whose_roots_are_known_searches_for_none(robot, of_world
     roots = jax.ShapeDtypeStruct((rows, 9), float), jax.ShapeDtypeStruct((rows,), bool)
 
     def step(z, roots):
-        return dataclasses.replace(posed, roots=roots).linearised(posed.robot, z, posed.data)[1]
+        return dataclasses.replace(posed, roots=roots).linearised(posed.robot, z)[1]
 
     known = str(jax.make_jaxpr(step)(jnp.zeros(3), roots))
     assert posed.observe.apart and "custom_jvp_call" in known
@@ -103,11 +103,11 @@ def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world
     posed = posed_turns(robot, of_world)
 
     def through(z):
-        return (posed.signed(posed.observation(z), posed.data),) * 2
+        return (posed.signed(posed.observation(z)),) * 2
 
     z = jnp.asarray([0.3, -0.4, 0.2])
     apart = fit.with_solved_rows(posed, z)
-    r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
+    r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z)[:2])(z)
     wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
     assert_allclose(r, value, rtol=1e-6, atol=1e-6)
     assert_allclose(jacobian, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())

@@ -195,8 +195,7 @@ class CandidateSpace:
         def with_data(problem: Problem) -> Problem:
             known = np.asarray(problem.data.sd)
             new = known if sd is None else np.where(np.isfinite(sd) & (sd > 0), sd, known)
-            data = dataclasses.replace(problem.data, sd=jnp.asarray(new), weight=jnp.asarray(weight))
-            return dataclasses.replace(problem, data=data)
+            return problem.with_data(sd=jnp.asarray(new), weight=jnp.asarray(weight))
 
         return dataclasses.replace(self, bare=with_data(self.bare), equipped=with_data(self.equipped))
 

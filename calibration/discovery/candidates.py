@@ -18,7 +18,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import scans
-from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization, amplitude_of
 from calibration.inference.observers import Observer

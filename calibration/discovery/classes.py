@@ -17,7 +17,7 @@ from calibration.discovery.projection import explained_function, projection_fact
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
-from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from mmrjax.model import channels
 
@@ -100,8 +100,7 @@ def _fit_without_prior(
         centre = np.zeros(len(start))
         centre[k] = mean
         start[k] = mean
-        data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
-        problem = dataclasses.replace(equipped, data=data)
+        problem = equipped.with_data(centre=jnp.asarray(centre))
         optima, _ = fit_from_each_start(problem, [start], [space.weight], [indices])
         best = jax.tree.map(lambda x: x[0], optima)
         z = np.asarray(best.z)

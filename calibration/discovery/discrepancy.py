@@ -28,7 +28,7 @@ from calibration.discovery.score_tests import diagnose_fit, family_columns
 from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem

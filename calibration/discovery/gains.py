@@ -20,7 +20,7 @@ from calibration.discovery.standing import kept_readings
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import place_signature
-from calibration.inference.held_out import predict_unseen
+from calibration.inference.blocks import predict_unseen
 
 #: A reading counts if the mechanism changes it by at least this share of the largest rms change of a channel [-].
 CHANGED = 0.5

@@ -101,7 +101,7 @@ def _add_experiment(
     if not np.isfinite(joint.cost):
         return what
     problem = space.problem(active)
-    _, jacobian, _ = linearise(problem, jnp.asarray(joint.z), problem.data)
+    _, jacobian, _ = linearise(problem, jnp.asarray(joint.z))
     informed = np.asarray(jacobian)[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
     k = space.free + slot

@@ -30,7 +30,7 @@ from calibration.discovery.score_tests import (
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.blocks import fit_from_each_start
 from mmrjax.compile.compiling import Threads
 
 # --- clusters of outliers in time, angle, order or condition --------------------------------------

@@ -17,7 +17,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.inference import blocks as blocks_room
-from calibration.inference.held_out import predict_unseen
+from calibration.inference.blocks import predict_unseen
 from calibration.inference.problem import Observation, Problem
 
 #: Degrees of freedom of Student's t for the score of a reading, so that a single outlier does not decide.

@@ -201,7 +201,7 @@ def diagnose_fit(
         residual, jacobian, _ = problem.observe.at(problem, z)
         linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
     elif problem.observe.over_time:  # by separate programs
-        linear = problem.observe.linearise(problem, z, problem.data, effects)
+        linear = problem.observe.linearise(problem, z, effects)
     else:
         linear = _linearised(with_solved_rows(problem, z), z, effects)
     return linear, *_padded_scores(linear, bases)
@@ -209,7 +209,7 @@ def diagnose_fit(
 
 @functools.partial(compiled, options=SELDOM)
 def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
-    return problem.observe.linearise(problem, z, problem.data, effects)
+    return problem.observe.linearise(problem, z, effects)
 
 
 def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, StrongestStatistics]:
@@ -354,7 +354,7 @@ def _replicate_batch(
     """Statistics of one batch of bootstrap replicates."""
 
     def statistics_of_replicate(drawn: Any) -> StrongestStatistics:
-        replicate = problem.observe.fit_replicate(problem, problem.data, effects, linear, drawn)
+        replicate = problem.observe.fit_replicate(problem, effects, linear, drawn)
         return strongest_statistics(score_tests(replicate, bases), replicate)
 
     return jax.vmap(statistics_of_replicate)(drawn)

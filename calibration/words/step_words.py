@@ -27,10 +27,9 @@ STEPS = {
     # requirements and sizing
     "requirement": "requirement {} of {}: {}",
     "changes": "changes that would meet missed requirement {} of {}: {}",
-    "designs": "1 of 4, random designs of every combination",
-    "descents": "2 of 4, {} searches by gradients",
-    "whole": "3 of 4, makers' ratios and whole cells",
-    "refined": "4 of 4, the best {} designs, with ratio and number of cells continuous",
+    "designs": "1 of 3, random designs of every combination",
+    "whole": "2 of 3, makers' ratios and whole cells",
+    "refined": "3 of 3, the best {} designs, with ratio and number of cells continuous",
     # a calibration
     "optimum": "optimum found, now {}",
     "steady": "fitting the steady model, to start from its optimum",

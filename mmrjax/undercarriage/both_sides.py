@@ -76,7 +76,7 @@ class _ContactsOfSides(eqx.Module):
 
 def _places_of_sides(run: HalfRobotSystem) -> Pair:
     """Distances of the sides to the left of the middle of the robot [m]."""
-    return SIDES * run.chassis.turning.width
+    return jnp.asarray(SIDES * run.chassis.turning.width)
 
 
 def _heading(motion: HalfRobotState) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ class RunScene(NamedTuple):
     wheel: float
     path: BeltPath
     levers: list[tuple[float, float]]
-    run: TrackTrajectory
+    run: Any  # TrackTrajectory, of one run
     weight: float
 
     def sheet(self, k: int) -> Any:

@@ -116,7 +116,7 @@ VERDICT, LARGEST = "verdict", "largest_mm"
 OUTPUTS: dict[str, tuple[str, str]] = {
     VERDICT: (
         "",
-        "result of the climb. For a search, that of the smallest obstacle not climbed",
+        "result. For a search, of the smallest obstacle not climbed",
     ),
     LARGEST: ("mm", "largest got over"),
     "time_s": ("s", "time to the verdict"),

@@ -225,13 +225,13 @@ class SizeResult:
     def to_json(self) -> Json:
         """`result.json`."""
         return {
-            "schema": "mmrjax.size/1",
+            "schema": "mmrjax.size/2",
             "statement": self.statement(),
             **writing.entries_of(self, "source=asked.source", "objectives"),
             **writing.entries_of(self.sizing, "unmeetable", "best", "ideal", "alternatives"),
             "motors": list(self.sizing.motors.values()),
             **writing.entries_of(self, "pareto=sizing.front", "requirements=outcomes"),
-            **writing.entries_of(self.sizing, "starts", "evaluated"),
+            "evaluated": self.sizing.evaluated,
         }
 
 
@@ -282,7 +282,7 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
     s, objective_words = found.sizing, ", ".join(OBJECTIVES[name][1] for name in found.objectives)
     lead = (
         f"Requirements: **{found.asked.source}**. Starting from: **{robot_name}**. Minimised: **{objective_words}**. "
-        f"{s.starts} searches evaluated {s.evaluated:,} designs."
+        f"{s.evaluated:,} designs were evaluated."
     )
     best = () if s.best is None else (s.best, *s.alternatives)
     about = _DESIGNS if best else "No design with these parts meets the requirements."
