@@ -594,7 +594,7 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 
 
 @pytest.mark.parametrize("amplitudes, configuration, message", [
-    ({"side_friction": 1e-3}, None, r"side_friction makes the sides differ, but an export is one drive"),
+    ({"side_friction": 1e-3}, None, r"side_friction makes the sides differ; export a file for each side"),
     ({}, "4W2", r"--configuration: got 4W2; .* did you mean 4W2T\?"),
 ])  # fmt: skip
 def test_drives_that_are_no_joint_are_refused_in_a_sentence(amplitudes, configuration, message):
@@ -773,7 +773,7 @@ def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     (how,) = (f.how for f in mujoco.fates_in_mujoco(drive_of(rig), 0.0) if f.name == mujoco.CONTROLLER)
     assert "acts at each step, not at 50 Hz" in how
     rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
-    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; the exported controller"):
+    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; add it"):
         drive_of(rig)
 
 

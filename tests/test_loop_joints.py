@@ -130,18 +130,20 @@ def test_units_of_a_log_reach_each_joint(tmp_path):
         [time, np.full((len(time), 2), 5.0), np.tile([np.sin(2 * time), np.cos(3 * time)], (2, 1)).T]
     )
     rows[:, 3:5] += 0.01 * rng.standard_normal((len(time), 2))
-    write(tmp_path, rows)
-    header, *lines = (tmp_path / "log.csv").read_text().splitlines()
 
-    def runs(units, header=header):
+    def runs(units, rows=rows, unit="A"):
+        write(tmp_path, rows)
+        header, *lines = (tmp_path / "log.csv").read_text().splitlines()
+        header = header.replace("elbow.motor_current_A", f"elbow.motor_current_{unit}")
         (tmp_path / "log.csv").write_text("\n".join([header, units, *lines]))
         return runs_of(tmp_path)
 
     table = runs("s,V,V,A,A,deg,deg")
     assert any("contains units" in note for note in table.notes)
     assert_allclose(np.median(table["motor_current_sd_A"]), 0.01, rtol=0.1)
-    other = runs("s,V,V,A,mA,deg,deg", header.replace("elbow.motor_current_A", "elbow.motor_current_mA"))
-    assert_allclose(other["motor_current_sd_A"], 1e-3 * table["motor_current_sd_A"], rtol=1e-6)
+    milli = rows * np.where(np.arange(7) == 4, 1e3, 1.0)
+    other = runs("s,V,V,A,mA,deg,deg", milli, "mA")
+    assert_allclose(other["motor_current_sd_A"], table["motor_current_sd_A"], rtol=1e-6)
     for wrong, name in (("A,mA,deg", "motor_current_A states mA"), ("A,A,rad", "output_angle_deg states rad")):
         with pytest.raises(BadData, match=f"{name} in the row of units"):
             runs(f"s,V,V,{wrong},deg")

@@ -136,7 +136,11 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     """Every message of a configuration's own rules has its fields between backticks, and those that differ from their
     option are called by it. From a file by their key."""
     source = Path(config.__file__).read_text(encoding="utf-8")
-    rules = [m for m in re.findall(r'"idle",\s*(f?"(?:[^"]|"\s*f?")*")', source)]
+    rules = re.findall(r'\bidle\(\s*(f?"(?:[^"]|"\s*f?")*")', source)
+    tables = [
+        part.exclusive + part.needed for kinds in KINDS.values() for kind in kinds for part in kind.__mro__[:-2]
+    ]
+    rules += [text for table in tables for _, _, *texts in table for text in texts]
     fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}
     assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
     given = {"left_V": 5.0, "battery": True}

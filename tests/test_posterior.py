@@ -84,9 +84,9 @@ def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
     wide = posterior_of_coordinates(coordinates, np.zeros(1), np.eye(1))
     runs = read_runs("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
     found = run.simulate_draws(robot, wide, runs, config.Compare(), 300)
-    share = found.columns[run.SHARE]
+    share = found[run.SHARE]
     assert share[0] == 1 and 0.7 < share[1] < 0.95
-    assert np.isfinite(found.sd("speed_mm_s")).all()
+    assert np.isfinite(found["speed_mm_s_sd"]).all()
 
 
 def test_a_coordinate_that_does_not_vary_is_drawn_at_its_mean(posterior):

@@ -8,7 +8,7 @@ from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
 from calibration.discovery import result_remarks
-from calibration.inference import noise, repeats
+from calibration.inference import noise
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers import SettledRuns
 from calibration.inference.preparation import prepare_input
@@ -32,7 +32,7 @@ def table(sd, times=4, seed=0):
 
 def enlarged(runs, stated):
     known = noise.noise_from_table(runs, SettledRuns.sizes(runs), stated)
-    return known, *repeats.enlarge_noise(known, runs)
+    return known, *noise.enlarge_noise(known, runs)
 
 
 def test_noise_that_repeats_contradict_is_enlarged():
@@ -62,7 +62,7 @@ def test_the_probability_of_a_median_is_right(count):
     magnitudes = np.abs(np.random.default_rng(0).standard_normal((40_000, count)))
     # Of an even number the larger of the two in the middle is below half of them.
     share = np.mean(np.sort(magnitudes, 1)[:, count // 2] > 1.2)
-    least = repeats._median_tail(1.2, count)
+    least = noise._median_tail(1.2, count)
     assert least >= share - 0.01 and (count % 2 == 0 or least == pytest.approx(share, abs=0.01))
 
 

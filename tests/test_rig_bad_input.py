@@ -109,7 +109,7 @@ def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
         rig_check.check_rig_file(text_file(tmp_path / "rig.toml", "[motor]\nresistance = 0.6\n"), None, (), False)
         == 0
     )
-    assert "come from its base, a packaged robot. base = " in " ".join(capsys.readouterr().out.split())
+    assert "come from the base, a packaged robot. base = " in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

@@ -79,14 +79,14 @@ def test_a_foreign_partial_folder_is_left_alone(tmp_path, name, text, force):
         (partial / name).write_text(text)
         (partial / "thesis.txt").write_text("years of work")
     before = names(tmp_path)
-    with refused(r"x\.partial already exists and was not created by mmrjax", BadConfiguration):
+    with refused(r"x\.partial was not created by mmrjax", BadConfiguration):
         RunFolder(tmp_path / "x", LOOP, force=force)
     assert names(tmp_path) == before
 
 
 def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     partial = interrupted(tmp_path / "x")
-    with refused(r"x\.partial contains an interrupted loop, which the same command resumes", BadConfiguration):
+    with refused(r"x\.partial contains an interrupted loop; choose another path or --force", BadConfiguration):
         RunFolder(tmp_path / "x", SWEEP)
     other = LOOP | {"seed": 2}
     with refused(r"x\.partial contains interrupted work of another configuration.*--force", BadConfiguration):
@@ -94,7 +94,7 @@ def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     assert (partial / "chunks/base.stage").is_file()
     RunFolder(tmp_path / "x", other, force=True).close()
     assert not (partial / "chunks/base.stage").exists()
-    assert "x.partial: was made with another configuration, so it is started again" in capsys.readouterr().err
+    assert "x.partial: was made with another configuration and is started again" in capsys.readouterr().err
     RunFolder(tmp_path / "x", SWEEP).close()  # nothing of the loop's is left
     interrupted(tmp_path / "x", SWEEP)
     with RunFolder(tmp_path / "x", LOOP, force=True) as folder:
@@ -120,7 +120,7 @@ def test_a_forged_mark_costs_no_file(tmp_path):
     with refused(r"thesis\.txt, which its command did not write", BadConfiguration):
         finished(tmp_path / "x")
     (partial / "lock").write_text(json.dumps(json.loads(lock_text("loop")) | {"foreign": []}))
-    with refused("or use --force to start again", BadConfiguration):
+    with refused("or --force to start again", BadConfiguration):
         finished(tmp_path / "x")
     assert (partial / "thesis.txt").is_file()
 

@@ -47,7 +47,7 @@ def is_global(adhesion, creep, seed=3):
     runs, p = on_ground(adhesion, creep, seed)
     space = ANALYST.space(runs)
     z = jnp.asarray(at_truth(space, p))
-    truth = 0.5 * float(jnp.sum(space.bare.misfit(z, space.bare.data) ** 2) + jnp.sum(z**2))
+    truth = 0.5 * float(jnp.sum(space.bare.misfit(z) ** 2) + jnp.sum(z**2))
     fitted = fit_base(space, ANALYST.settings, "starts")
     assert fitted.unusable == () and fitted.candidate.cost < truth, (adhesion, creep)
     readings = 3 * len(runs)

@@ -113,7 +113,8 @@ def call(name, *arguments):
 
 FORGED = {
     "a pickle": pickle.dumps(Harm()),
-    "an array of objects": None,
+    "an array of objects": pickle.dumps(np.array([Harm()], object)),
+    "an array of JAX around a function": call("jax._src.array._reconstruct_array", "os", "2", "3", "4"),
     "a function of the system": call("os.system", "touch harmed"),
     "a function of ours that is no setup": call("calibration.data.writing.write_text", "harmed", "x"),
     "a class of another package": call("subprocess.Popen", "touch harmed"),
@@ -126,7 +127,7 @@ FORGED = {
     "a field that there is not": call(
         "calibration.inference.noise.Noise", "1", "2", "3", "4", "5", "6", "7", "8", "9"
     ),
-    "an array that there is not": b"P7\n.",
+    "an object that there is not": b"P7\n.",
     "no kind": b"nonsense",
 }
 
@@ -137,12 +138,7 @@ def test_a_forged_stage_runs_nothing_and_is_made_again(tmp_path, monkeypatch, ca
     with RunFolder(tmp_path / "x", {"command": "loop"}) as folder:
         folder.stage("base", lambda: 1)
         file = folder.partial / "chunks/base.stage"
-        if what == "a pickle":
-            file.write_bytes(FORGED[what])
-        else:
-            forged = np.array([Harm()], object) if FORGED[what] is None else np.frombuffer(FORGED[what], np.uint8)
-            np.savez(file.with_suffix(".npz"), pickle=forged)
-            file.with_suffix(".npz").replace(file)
+        file.write_bytes(stage_files.sealed(FORGED[what]))
         assert folder.stage("base", lambda: "anew") == "anew"
         assert folder.stage("base", lambda: "no more") == "anew"
     assert not (tmp_path / "harmed").exists() and "this" not in sys.modules

@@ -88,7 +88,7 @@ def test_a_step_of_a_fit_whose_roots_are_known_searches_for_none(robot, of_world
     roots = jax.ShapeDtypeStruct((rows, 9), float), jax.ShapeDtypeStruct((rows,), bool)
 
     def step(z, roots):
-        return dataclasses.replace(posed, roots=roots).linearised(posed.robot, z, posed.data)[1]
+        return dataclasses.replace(posed, roots=roots).linearised(posed.robot, z)[1]
 
     known = str(jax.make_jaxpr(step)(jnp.zeros(3), roots))
     assert posed.observe.apart and "custom_jvp_call" in known
@@ -100,11 +100,11 @@ def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world
     posed = posed_turns(robot, of_world)
 
     def through(z):
-        return (posed.signed(posed.observation(z), posed.data),) * 2
+        return (posed.signed(posed.observation(z)),) * 2
 
     z = jnp.asarray([0.3, -0.4, 0.2])
     apart = fit.with_solved_rows(posed, z)
-    r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
+    r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z)[:2])(z)
     wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
     assert_allclose(r, value, rtol=1e-6, atol=1e-6)
     assert_allclose(jacobian, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
@@ -160,7 +160,7 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     few = runs.where(np.repeat([1, 1, 1, 0, 0, 0, 0, 0, 0], turns.HOLD) > 0)
     again = {name: np.tile(x, 4) for name, x in few.columns.items()}
     again["time_s"] = np.arange(len(again["time_s"])) * turns.EVERY
-    with refused(r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 6 or"):
+    with refused(r"settled runs \(12, .* s in all\) have only 3 operating points. Hold 6 or"):
         rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
     short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
     with refused(r"the longest level has .*; give one command for straight travel, or hold each"):
@@ -168,7 +168,7 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
     for command in ("loop", "calibrate"):
         run = mmrjax(command, str(table), "--robot", str(file), "--out", str(tmp_path / "out"))
-        ends(run, "too few operating points (3). Hold 6 or more different levels until all readings", code=4)
+        ends(run, "have only 3 operating points. Hold 6 or more levels until all readings", code=4)
         assert not [*tmp_path.glob("out*")]
 
 

@@ -45,7 +45,7 @@ def posed(tmp_path_factory):
 def linear(posed):
     problem, space = posed
     z = jnp.zeros(space.free)
-    found = jax.jit(lambda z: problem.observe.linearise(problem, z, problem.data, space.library.scored))(z)
+    found = jax.jit(lambda z: problem.observe.linearise(problem, z, space.library.scored))(z)
     return jax.device_get(found)
 
 
@@ -64,7 +64,7 @@ def shown(posed):
     @jax.jit
     def of(present):
         there = dataclasses.replace(robot, effects=present)
-        return problem.whitened(problem.observe(there), problem.data)[: problem.data.measured.size]
+        return problem.whitened(problem.observe(there))[: problem.data.measured.size]
 
     def at(effect, amplitude):
         own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)

@@ -1,6 +1,5 @@
 """Regression of a log's equations in weak form, on logs from plain NumPy laws. No window holds a jump."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -249,4 +248,4 @@ def without(problem, channel):
     """The problem without the readings of a channel."""
     weight = np.array(problem.data.weight)
     weight[:, [c.name for c in problem.channels].index(channel)] = 0.0
-    return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=weight))
+    return problem.with_data(weight=weight)

@@ -12,7 +12,7 @@ from worlds.settled import remainder
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, noise, observers, ranges
-from calibration.inference.observers.time_histories import _common_length
+from calibration.inference.observers.run_grids import _common_length
 from calibration.inference.ranges import check_ranges
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
@@ -108,7 +108,8 @@ def test_logs_of_about_one_length_share_what_is_compiled():
     assert len({long for long in lengths if 2048 <= long < 4096}) == 8
     rows = np.arange(200)[None]
     slow, fast = (
-        bases.wave_families(np.zeros(200, bool), np.linspace(0, 2 * np.pi * n, 200), rows, rows) for n in (30.0, 60.0)
+        bases.wave_families(np.zeros(200, bool), np.linspace(0, 2 * np.pi * n, 200), rows, rows, bases.BALANCES)
+        for n in (30.0, 60.0)
     )
     resolved = [set(v for _, v in bases.family_names(b)) for b in (slow, fast)]
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape

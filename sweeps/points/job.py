@@ -79,12 +79,11 @@ def _profile(name: str, robot: Robot, plan: axes.SweepPlan, where: str) -> Profi
         print_message(note)
     if source.surface is not None:
         raise BadConfiguration(
-            f"{where}, profile: got {source.source}, which has a surface column; set the surface under "
-            "conditions instead"
+            f"{where}, profile: got {source.source}, which has a surface column; set it under conditions"
         )
     if source.begins:
         raise BadConfiguration(
-            f"{where}, profile: got {source.source}, which has a start column; points of a sweep start at rest"
+            f"{where}, profile: got {source.source}, which has a start column; points start at rest"
         )
     for field in source.values:
         if field in (*plan.conditions, *plan.design.names):

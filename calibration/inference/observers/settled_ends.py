@@ -136,7 +136,7 @@ def starts_from_settled_ends(
     data = problem.data
     count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
     rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
-    blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
+    blunt = problem.with_data(sd=jnp.hypot(data.sd, BLUNT * rms))
     optima = search(blunt, _recombine_points(blunt, points)[:searches], STEPS_BLUNT)
     sorted_optima = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombine_points(blunt, sorted_optima)[:1]
@@ -273,13 +273,13 @@ def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.nd
 
 @compiled
 def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
-    return jax.vmap(
-        lambda z, pinned: levenberg_marquardt(problem, z, problem.data, Pin(pinned, z), max_steps=STEPS)[0]
-    )(starts, held)
+    return jax.vmap(lambda z, pinned: levenberg_marquardt(problem, z, Pin(pinned, z), max_steps=STEPS)[0])(
+        starts, held
+    )
 
 
 @compiled
 def _reading_misfits(problem: Problem, zs: Array) -> Array:
     """Whitened residuals of the readings at each point, shape (points, rows, channels)."""
     shape = problem.data.measured.shape
-    return jax.vmap(lambda z: problem.misfit(z, problem.data)[: problem.data.measured.size].reshape(shape))(zs)
+    return jax.vmap(lambda z: problem.misfit(z)[: problem.data.measured.size].reshape(shape))(zs)
