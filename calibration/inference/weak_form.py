@@ -236,7 +236,7 @@ def equation_terms(
             first = _rolling_signals(plan, robot, row, turning, states.current)[0]
         turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
     signals, current = _rolling_signals(plan, robot, row, turning, states.current)
-    f, y = [], []
+    f, y = list[Any](), list[Any]()
     if plan.electrical:
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
         f.append(signals.voltage_left)
