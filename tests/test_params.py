@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from worlds import paper
 
 from mmrjax.model import paper_robots, params
-from mmrjax.model.paper_tables import GROUSERS_LEVER, PITCH_GROUSER, PITCH_TOOTH
+from mmrjax.model.paper_tables import GROUSERS_LEVER, PITCH_GROUSER, PITCH_TOOTH, TEETH_LEVER
 from mmrjax.model.params import parameter
 
 
@@ -115,5 +115,5 @@ def test_track_of_a_lever_closes_around_its_pulley_and_roller(robot):
     tilt = math.asin((large - small) / float(gear.lever_length))
     runs = 2 * float(gear.lever_length) * math.cos(tilt)
     loop = runs + large * (math.pi + 2 * tilt) + small * (math.pi - 2 * tilt)
-    assert loop == pytest.approx(112 * PITCH_TOOTH, abs=5e-4)
-    assert pytest.approx(GROUSERS_LEVER * PITCH_GROUSER) == 112 * PITCH_TOOTH
+    assert loop == pytest.approx(TEETH_LEVER * PITCH_TOOTH, abs=5e-4)
+    assert pytest.approx(GROUSERS_LEVER * PITCH_GROUSER) == TEETH_LEVER * PITCH_TOOTH

@@ -1,5 +1,6 @@
 """Scores of data held out: against SciPy's densities, and the set of effects that is chosen by them."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -88,11 +89,11 @@ def test_smallest_set_within_one_error_of_the_best_is_chosen(monkeypatch, runs, 
     noise -= noise.mean(1, keepdims=True)
     candidates = [SimpleNamespace(effects=tuple("abc"[:k])) for k in range(4)]
     scores = {c.effects: score(noise[k] + ([0.0, *gains])[k], np.arange(12)) for k, c in enumerate(candidates)}
-    monkeypatch.setattr(prediction, "cached_hold_out_score", lambda space, runs, c, predicted: scores[c.effects])
+    monkeypatch.setattr(prediction, "score_candidate", lambda space, runs, c: scores[c.effects])
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
     )
-    found = smallest_predictive_set(space, runs, candidates[0], candidates[1:], {})
+    found = smallest_predictive_set(space, runs, candidates[0], candidates[1:])
     assert (found is None) if chosen == 0 else (found is candidates[chosen])
 
 
@@ -101,15 +102,16 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         SimpleNamespace(effects=tuple("abc"[:k]), active=tuple("abc"[:k]), z=np.full(2, k)) for k in range(2)
     ]
     shown = {c.effects: {kind: np.full((12, 2), len(c.effects)) for kind in ("slope", "voltage")} for c in candidates}
-    bare = SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
-    space = SimpleNamespace(bare=bare, fit_of=lambda active, z: (bare, z, active))
-    predicted, times = {}, []
-    with monkeypatch.context() as patched:
-        patched.setattr(prediction, "score_predictions", lambda *_: score(np.zeros(12), np.arange(12)))
-        patched.setattr(prediction.FittedProblem, "held_out", lambda fit, kinds: times.append(1) or shown[fit.active])
-        for _ in range(2):
-            smallest_predictive_set(space, runs, candidates[0], candidates[1:], predicted)
-    assert len(times) == 2
+    monkeypatch.setattr(
+        prediction,
+        "score_candidate",
+        lambda space, runs, c: dataclasses.replace(score(np.zeros(12), np.arange(12)), reading=shown[c.effects]),
+    )
+    space = SimpleNamespace(
+        bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
+    )
+    predicted = {}
+    smallest_predictive_set(space, runs, candidates[0], candidates[1:], predicted)
     assert [predicted[prediction.candidate_key(c)] for c in candidates] == [shown[c.effects] for c in candidates]
     assert (
         prediction.candidate_key(SimpleNamespace(active=(), z=np.ones(2))) not in predicted
@@ -144,7 +146,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=()))
     )
-    assert smallest_predictive_set(space, runs, None, [None], {}) is None
+    assert smallest_predictive_set(space, runs, None, [None]) is None
     assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
         HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
     ) == Gain(0.0, np.inf)

@@ -20,7 +20,6 @@ from calibration.discovery import (
     standing,
     verdict,
 )
-from calibration.discovery.projection import Projection
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
 from calibration.inference.bases import family_names
@@ -190,9 +189,9 @@ def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_im
     space = dataclasses.replace(
         space, bare=posed, equipped=dataclasses.replace(space.equipped, observe=posed.observe)
     )
-    fit = Projection.of(linear)
-    run, changed, root = standing.changed_run(space, linear, (), fit)
-    effects = fit.roots(np.asarray(linear.signatures)).max()
+    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    run, changed, root = standing.changed_run(space, linear, (), jacobian, residual)
+    effects = standing._largest_root(jacobian, residual, np.asarray(linear.signatures))
     if "rough" in fault:
         assert (run, changed) == (3, "motor.friction_coulomb") and root > 1.2 * effects
     else:

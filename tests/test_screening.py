@@ -14,7 +14,7 @@ from calibration.discovery import candidates, log_simulation, log_stages, search
 from calibration.discovery.active_set import candidate_space
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
-from calibration.discovery.result import EffectRanking, EffectScore
+from calibration.discovery.result import EffectRanking, RankedEffect
 from calibration.discovery.settings import settings_for
 from calibration.inference.blocks import predict_unseen
 from calibration.inference.observers import Histories
@@ -45,7 +45,7 @@ def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_it
     ]  # fmt: skip
     z = np.linspace(-0.4, 0.5, len(space.coordinates))
     mine = problem.coordinates.with_effects(indices[0]).robot(problem.base, jnp.asarray(z))
-    every = space.coordinates.with_effects(space.coordinates.indices(("brush_drop", "")))
+    every = space.coordinates.with_effects(space.library.indices(("brush_drop", "")))
     whole = every.robot(space.equipped.base, jnp.asarray(z))
     (one,) = (e for e in mine.effects if e.name == "brush_drop")
     (other,) = (e for e in whole.effects if e.name == "brush_drop")
@@ -86,9 +86,9 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
 
 RANKING = EffectRanking(
     True, 0.002, 9.0,
-    (EffectScore("churning", "track", 412.0, 0.0123, 1.0, 0.0004, "loss torque that changes with speed", "N·m"),
-     EffectScore("brush_drop", "electrical", 4.0, 0.1, 1.0, 0.05, "voltage drop that changes with current", "V"),
-     EffectScore("bending_loss", "track", 430.0, -0.01, 1.0, 0.001, "loss torque that changes with speed", "N·m", True)),
+    (RankedEffect("churning", "loss torque that changes with speed", "N·m", 412.0, 0.0123, 0.0004),
+     RankedEffect("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05),
+     RankedEffect("bending_loss", "loss torque that changes with speed", "N·m", 430.0, -0.01, 0.001, True)),
 )  # fmt: skip
 
 

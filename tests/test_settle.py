@@ -393,7 +393,10 @@ def test_a_saturated_channel_leaves_its_stretch_out(tmp_path):
     columns["total_current_A"] = np.minimum(columns["total_current_A"], 1.15)  # of 1.2 A at 18 V
     found = settled(tmp_path, bench(tmp_path, columns))
     assert [s.why for s in found.stretches] == ["", "", "stuck"] and found.stretches[2].channel == "total_current"
-    assert "total_current is saturated or frozen" in words.omitted_stretches(found.stretches)[0]
+    assert (
+        "total_current shows one number for a long time: saturated or frozen"
+        in words.omitted_stretches(found.stretches)[0]
+    )
 
 
 GLITCHES = {  # share of the speed's readings, what they are multiplied by, glitches in the middle level
@@ -413,7 +416,9 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
     found = settled(tmp_path, bench(tmp_path, columns))
     assert [s.why for s in found.stretches] == ["", "" if count is not None else "glitches", ""]
     if count is None:
-        assert "motor_speed has many outliers (4" in words.omitted_stretches(found.stretches)[0][0]
+        assert (
+            "motor_speed has many readings far from the others (4" in words.omitted_stretches(found.stretches)[0][0]
+        )
         return
     middle, clean = found.kept[1], stairs()["motor_speed_rpm"][200:400]
     assert middle.glitches.get("motor_speed", 0) == np.isin(off, middle.rows).sum() >= 0.7 * count
@@ -499,8 +504,7 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
     assert speeds == pytest.approx([108.0, 216.0, 324.0], rel=0.01)
     said = words.settle_remarks(found)
     assert (
-        "output_speed_rpm is the rate of output_angle_deg. To get it, add output_speed to the rig's channels"
-        in said[0]
+        "output_speed_rpm is the rate of output_angle_deg. Add output_speed to channels in the rig's file" in said[0]
     )
     named = bench(tmp_path, columns | {"output_angle_deg": angle}, '"total_current", "output_speed", "output_angle"')
     assert words.settle_remarks(settled(tmp_path, named)) == []
@@ -552,7 +556,8 @@ def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
     said = words.sentence_on_few_settled_runs(found, 6, loop)
     assert (
-        "run it on the log: mmrjax loop log.csv." in said and words.sentence_on_few_settled_runs(found, 3, loop) == ""
+        "run it on the log as it is: mmrjax loop log.csv." in said
+        and words.sentence_on_few_settled_runs(found, 3, loop) == ""
     )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
     told = {row[0]: row[-1] for row in words.omitted_stretches(every, few=True)}

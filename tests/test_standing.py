@@ -1,7 +1,6 @@
 """Names stand where they explain better than a curve would. Evidence against marginal likelihoods written out."""
 
 import dataclasses
-import functools
 import itertools
 import math
 from types import SimpleNamespace
@@ -27,6 +26,7 @@ from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, fi
 from calibration.discovery.standing import (
     _curve_evidence,
     _deficient_equations,
+    _largest_root,
     _largest_variation,
     _most_influential_row,
     _recurrence,
@@ -83,7 +83,7 @@ def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
     # no other prior that is tried makes the readings more likely
     distance = np.subtract.outer(np.arange(6), np.arange(6))
     across = np.linspace(-1, 1, 6)
-    a, _ = Projection.of(toy.linear)(raw)
+    a, _ = Projection(toy.linear)(raw)
     for length, size in itertools.product(LENGTHS, SIZES[::4]):
         prior = np.exp(-0.5 * (distance / length) ** 2) + WIDE**2 * (1 + np.outer(across, across))
         root = np.linalg.cholesky(prior + 1e-6 * np.eye(6))
@@ -217,8 +217,8 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
 
     space = SimpleNamespace(free=p, library=Library(["e0"]), included=np.ones(n, bool))
     offered = (*waves, SimpleNamespace(names=(("track", "speed_motor"),)))
-    found = evidence_over_curves(SimpleNamespace(space=space, bases=offered), best, without, ("e0",), linear)
-    assert NameTest("e0", 9.0, 3.3, (), found).established == named
+    found = evidence_over_curves(space, best, without, ("e0",), linear, offered, SimpleNamespace(slots=4))
+    assert NameTest("e0", 9.0, 3.3, (), found).stands == named
 
 
 def test_the_curve_of_a_log_is_that_of_bayesian_least_squares_at_its_base(toy, monkeypatch):
@@ -247,7 +247,7 @@ def test_the_curve_of_a_log_is_that_of_bayesian_least_squares_at_its_base(toy, m
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
     evidence, columns = fit_smooth_surface(
-        toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection.of(toy.linear)
+        toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear)
     )
     assert evidence == pytest.approx(gained(toy, columns), rel=1e-6)
     sides = []
@@ -287,12 +287,13 @@ def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(to
         return z, 0.5 * float(np.sum((e + long @ z) ** 2))
 
     space = SimpleNamespace(free=4, library=range(12))
+    settings = SimpleNamespace(slots=4)
     base = dataclasses.replace(names_of(np.eye(0), 4), cost=fit(toy.slopes)[1])
     z, cost = fit(whole)
     best = dataclasses.replace(names_of(posterior[4:, 4:], 4), cost=cost, z=np.append(z, np.zeros(7)))
     unit = gained(toy, column) - 2 * math.log(12)
     likeliest = max(gained(toy, s * column) for s in np.geomspace(1e-3, 1.0, 60)) - 2 * math.log(12)
-    got = evidence_of_names(space, base, best)
+    got = evidence_of_names(space, base, best, settings)
     if scale == 1.0:
         assert got == pytest.approx(unit, rel=1e-6)
     else:
@@ -300,15 +301,21 @@ def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(to
 
 
 def test_cost_of_names_grows_with_the_library_and_their_number():
+    settings = SimpleNamespace(slots=4)
     known = 0.01 * np.eye(3)
     costs = [
-        [cost_of_names(SimpleNamespace(free=2, library=range(n)), names_of(known[:k, :k], 2)) for k in (1, 2, 3)]
+        [
+            cost_of_names(SimpleNamespace(free=2, library=range(n)), names_of(known[:k, :k], 2), settings)
+            for k in (1, 2, 3)
+        ]
         for n in (10, 40)
     ]
     assert np.all(np.diff(costs, axis=0) > 0) and np.all(np.diff(costs, axis=1) > 0)
     # an amplitude that the data do not tell costs nothing but its place in the library
     blind = names_of(np.eye(1), 2)
-    assert cost_of_names(SimpleNamespace(free=2, library=range(10)), blind) == pytest.approx(2 * math.log(10))
+    assert cost_of_names(SimpleNamespace(free=2, library=range(10)), blind, settings) == pytest.approx(
+        2 * math.log(10)
+    )
 
 
 def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatch):
@@ -323,13 +330,13 @@ def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatc
             return SimpleNamespace(channel="", balance=places[int(name[1:])])
 
     space = SimpleNamespace(free=2, library=Library(range(12)))
-    best = names_of(0.01 * np.eye(1), 2)
+    settings, best = SimpleNamespace(slots=4), names_of(0.01 * np.eye(1), 2)
     best.z[2] = 5.0  # fifty sds
     curves = [(4.0, PlacedCurve("track", ("speed",))), (7.0, PlacedCurve("track", ("slope",)))]
     only = lambda space, linear, bases, crowded, equation: curves if equation == "track" else []  # noqa: E731
     monkeypatch.setattr("calibration.discovery.standing._curve_evidence", only)
     without = dataclasses.replace(best, cost=best.cost + 20.0)
-    evidence = evidence_over_curves(SimpleNamespace(space=space, bases=()), best, without, ("e0",), None)
+    evidence = evidence_over_curves(space, best, without, ("e0",), None, (), settings)
     own = sum(equation_of_place(p) == equation_of_place("track") for p in places)
     of_effect = 2 * 20.0 + 2 * math.log(0.1) - 2 * math.log(own)
     assert evidence == pytest.approx(of_effect - (7.0 - 2 * math.log(2)), rel=1e-12)
@@ -350,10 +357,10 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
         each = [known[:, 0] * (residual + a @ z) for a, z in zip((jacobian, whole), left, strict=True)]
         return np.sum(each[0] ** 2) - np.sum(each[1] ** 2)
 
-    fit = Projection(jacobian, residual)
-    assert fit.roots(signature)[0] ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
+    assert _largest_root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
     space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
-    row, least = _most_influential_row(space, fit, signature)
+    space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
+    row, least = _most_influential_row(space, jacobian, residual, signature)
     falls = [fall(np.repeat(rows != k, 3)) for k in rows]
     assert row == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
 
@@ -386,10 +393,10 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
         for name, column in zip([*names, "slip"], [*parameters.T, error[:, 0]], strict=True):
             extra = np.append(column * inside, np.zeros(len(residual) - readings))[:, None]
             best = max(best, (left(jacobian) - left(np.c_[jacobian, extra]), k + 1, name))
-    run, changed, root = changed_run(space, linear, (), Projection(jacobian, residual))
+    run, changed, root = changed_run(space, linear, (), jacobian, residual)
     assert (run, changed) == best[1:] == (3, "slip") and root**2 == pytest.approx(best[0], rel=1e-6)
     runs[:] = [np.arange(toy.rows)]
-    assert changed_run(space, linear, (), Projection(jacobian, residual)) == (None, "", 0.0)
+    assert changed_run(space, linear, (), jacobian, residual) == (None, "", 0.0)
 
 
 @pytest.mark.parametrize(
@@ -404,8 +411,7 @@ def test_constant_that_differs_in_one_run_explains_as_much_as_least_squares_find
 )
 def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidence, stands, rests_on):
     test = NameTest("a", root, 3.3, (), evidence, 10, without)
-    assert (not {"chance", "curve"} & {*test.fails}) == stands
-    assert (test.rests_on, test.established) == (rests_on, stands and rests_on is None)
+    assert (test.stands, test.rests_on, test.established) == (stands, rests_on, stands and rests_on is None)
     assert not any(
         dataclasses.replace(test, **bad).established
         for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True}, {"varies": 3.4}, {"offset": 0.04})
@@ -420,7 +426,7 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     assert of_log.rests_on == (10 if root <= 6.9 else None)
     assert dataclasses.replace(of_log, root_changed=3.2).rests_on is None
     renumbered = NameSupport(True, tests=(test,)).with_row_numbers(np.arange(1, 21) * 2)
-    assert renumbered.test_of("a").rests_on == (None if rests_on is None else 20) and renumbered.test_of("b") is None
+    assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 
 
 def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is_none():
@@ -498,21 +504,16 @@ def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_
     both = np.concatenate([a, b], 1)
     few, most, others = rows < 4, rows < 11, rows >= 16
     settings, family = SETTLED.settings, (space.library["a"].family(),)
-
-    def recurs(residual, signatures, *blocks, settings=settings):
-        fit, linear = Projection(jacobian, residual), SimpleNamespace(signatures=signatures)
-        return _recurrence(space, family, fit, a, linear, blocks, settings)
-
-    again = functools.partial(recurs, residual, both)
+    again = lambda *blocks: _recurrence(space, family, (jacobian, residual, a), both, blocks, settings)  # noqa: E731
     assert again(few, others) == 1.0 and again(most) == 1.0 and again() == 1.0
     b3 = np.append(2.0 * a[:, 0] * (at < 4) + 2.5 * b[:, 0], np.zeros(2))  # only the first rows show it
-    assert recurs(b3, both, few, others) == 0.5
+    assert _recurrence(space, family, (jacobian, b3, a), both, (few, others), settings) == 0.5
     # What data cannot tell from it, of whatever family, does not take its place.
     near = a * (1 + 0.05 * random.standard_normal(a.shape))
     of_near = np.append(2.0 * near[:, 0], np.zeros(2))  # which is the stronger of the two
-    assert recurs(of_near, np.concatenate([a, near], 1), few) == 1.0
+    assert _recurrence(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
     none = dataclasses.replace(settings, same=0.0, form=0.0)
-    assert recurs(of_near, np.concatenate([a, near], 1), few, settings=none) == 0.0
+    assert _recurrence(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
 
 
 def candidate_of(*effects):
@@ -541,7 +542,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     seen = SimpleNamespace(test=SimpleNamespace(rejected_with_margin=not adequate, null=None))
     asked = []
 
-    def judged(beside, searched, proposed=None, blocks=()):
+    def judged(space, base, searched, left, bases, settings, proposed=None, blocks=(), beside=None):
         those = best if proposed is None else proposed[0]
         asked.append(those.effects)
         evidence = {"x": -20.0}
@@ -559,11 +560,13 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     )
     monkeypatch.setattr(preference.blocks_room, "predictable_blocks", lambda *a: {"slope": {"0": np.ones(3, bool)}})
     bare = SimpleNamespace(observe=SimpleNamespace(long=False, reads=True, over_time=False, blocks=("slope",)))
-    left = SimpleNamespace(test=SimpleNamespace(settings=SETTLED.settings), scores=None)
-    beside = BaseCurve(SimpleNamespace(bare=bare), candidate_of(), left, ())
+    screened = SimpleNamespace(
+        base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
+    )
+    left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
     searched = SearchResult((candidate_of("a"), candidate_of("b"), best), best, seen)
     given = SimpleNamespace(runs=None, settings=SETTLED.settings, progress=lambda note: None)
-    found, _, stood = preference.choose_effects(given, searched, beside, {})
+    found, _, stood = preference.choose_effects(given, screened, left, searched, None, None)
     assert (None if found is None else tuple(sorted(found[0].effects))) == model
     assert asked == [best.effects if adequate or few is None else few.effects]
     if found is not None:

@@ -5,12 +5,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mmrjax.fidelities.steady import steady
 from mmrjax.model.conditions import Conditions
-from mmrjax.numerics.newton import root, root_alone
+from mmrjax.numerics.newton import FewUnknowns, root, root_alone
 
 TOLERANCE = 1e-13
 
@@ -46,6 +47,15 @@ def test_root_and_derivatives_are_exact(linear):
     bend = np.array([0.0, 0.0, 2**0.5])
     for twice in (jax.jacfwd(jax.jacrev(meeting)), jax.jacrev(jax.jacfwd(meeting)), jax.jacfwd(jax.jacfwd(meeting))):
         assert_allclose(twice(radius), bend, rtol=1e-11, atol=1e-12)
+
+
+def test_root_finder_serves_optimistix():
+    radius = jnp.asarray(2.3)
+    found = optx.root_find(lambda y, of: circle(y, *of), FewUnknowns(atol=TOLERANCE), START, (None, radius))
+    assert_allclose(found.value, exact(2.3), rtol=1e-13)
+    at, solved = root(circle, START, None, radius, TOLERANCE, None)
+    assert_array_equal(found.value, at)
+    assert solved and found.state.solved
 
 
 def test_root_of_a_batch_is_that_of_its_members():

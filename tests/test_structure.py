@@ -739,7 +739,7 @@ MORE_NAMES = {
     # Observers join a kind of data with its fidelity and its solver; calibration and sizing join all steps of a fit.
     "calibration/inference/calibration.py": 48,
     "calibration/inference/observers/settled.py": 49,
-    "calibration/inference/observers/time_histories.py": 53,
+    "calibration/inference/observers/time_histories.py": 52,
     "calibration/inference/observers/turns.py": 32,
     "calibration/sizing/sheet.py": 30,
     # Models join all parts of a robot in one set of equations.

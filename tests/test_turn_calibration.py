@@ -163,7 +163,9 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     few = runs.where(np.repeat([1, 1, 1, 0, 0, 0, 0, 0, 0], turns.HOLD) > 0)
     again = {name: np.tile(x, 4) for name, x in few.columns.items()}
     again["time_s"] = np.arange(len(again["time_s"])) * turns.EVERY
-    with pytest.raises(BadData, match=r"settled runs \(12, .* s in all\) have only 3 operating points. Hold 6 or"):
+    with pytest.raises(
+        BadData, match=r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 6 or"
+    ):
         rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
     short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
     with pytest.raises(
@@ -173,7 +175,7 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
     for command in ("loop", "calibrate"):
         run = mmrjax(command, str(table), "--robot", str(file), "--out", str(tmp_path / "out"))
-        ends(run, "have only 3 operating points. Hold 6 or more levels until all readings", code=4)
+        ends(run, "too few operating points (3). Hold 6 or more different levels until all readings", code=4)
         assert not [*tmp_path.glob("out*")]
 
 

@@ -84,7 +84,7 @@ def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, ro
     (found,) = checks.copied_channels(runs, robot)
     assert (found.column, found.tied) == (column, False) and said in describe(found)
     foreseen(shown(runs))
-    with pytest.raises(BadData, match=rf"t\.csv, {column}: equals .* Measure or remove it"):
+    with pytest.raises(BadData, match=rf"t\.csv, {column}: equals .* remove it from the channels"):
         loop_input.prepare_loop(runs, robot, replicates=192)
 
 

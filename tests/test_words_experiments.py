@@ -88,7 +88,7 @@ def test_the_zero_of_every_meter_is_read_at_rest():
     shown = ("motor_speed", "motor_current", "position", "output_torque", "winding_temperature")
     said = {n: text for n, text in on(dataclasses.replace(BENCH, measured=shown)).items() if n.startswith("zero")}
     assert said == {
-        f"zero of {label}": f"With the motors off and the shaft unloaded, read the {label}"
+        f"zero of {label}": f"Switch the motors off, with the shaft at rest and unloaded, and read the {label}"
         for label in ("motor current", "output torque")
     }
 
