@@ -1,5 +1,7 @@
 """`drive` on a fixed grid: it follows `drive`, its derivatives are those of what it computes, it says when it can't."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
