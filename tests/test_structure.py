@@ -680,7 +680,7 @@ MORE_NAMES = {
     "calibration/discovery/discrepancy.py": 27,
     "calibration/discovery/mechanism.py": 32,
     # Observers join a kind of data with its fidelity and its solver; calibration and sizing join all steps of a fit.
-    "calibration/inference/calibration.py": 48,
+    "calibration/inference/calibration.py": 47,
     "calibration/inference/observers/settled.py": 49,
     "calibration/inference/observers/time_histories.py": 53,
     "calibration/inference/observers/turns.py": 32,
