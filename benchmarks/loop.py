@@ -207,14 +207,14 @@ def deviates(case: Case, found, settings) -> dict:
 def after(case: Case, runs, found) -> dict:
     """Hold-out errors by slope before and after, over the noise's sd, and the bias of the base parameters."""
     from calibration.inference import blocks
-    from calibration.inference.held_out import hold_out_blocks
+    from calibration.inference.blocks import hold_out_blocks
 
     masks, rows = list(blocks.blocks_of_kind(runs, "slope").values()), len(runs)
     space, both = found.screened.base.space, (found.screened.base.candidate, found.best)
     included, sd = space.included[:rows], np.asarray(space.bare.data.sd)[:rows]
 
     def rms(candidate) -> float:
-        indices = space.library.indices(candidate.active)
+        indices = space.coordinates.indices(candidate.active)
         seen = hold_out_blocks(space.equipped, candidate.z, masks, indices).reading
         return float(np.sqrt(np.nanmean((((seen - runs.measured()) / sd)[included]) ** 2)))
 

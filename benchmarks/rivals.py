@@ -115,7 +115,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     from calibration.data import runs as records
     from calibration.discovery.loop_input import prepare_loop
     from calibration.inference import blocks
-    from calibration.inference.held_out import fit_from_each_start
+    from calibration.inference.blocks import fit_from_each_start
 
     rig = robot_file.load_robot(robot)
     runs = records.read_runs(table, robot=rig)

@@ -111,7 +111,7 @@ def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
             jnp.asarray(problem.STIFFNESS),
         )  # fmt: skip
         posed = problem.Problem(robot, coordinates, observe, data)
-        return fit.levenberg_marquardt(posed, jnp.zeros(len(NAMES)), data)[0]
+        return fit.levenberg_marquardt(posed, jnp.zeros(len(NAMES)))[0]
 
     return eqx.filter_jit(fitted), coordinates
 

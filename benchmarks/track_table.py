@@ -45,9 +45,9 @@ from scipy.optimize import least_squares  # noqa: E402
 from calibration.data import inferred_facts  # noqa: E402
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
-from calibration.inference.held_out import fit_from_each_start  # noqa: E402
+from calibration.inference.blocks import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
-from calibration.inference.population import MemberObservations, simulate_members  # noqa: E402
+from calibration.inference.population import simulate_members  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
 from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
 from mmrjax.effects.travel_effects import VibrationSlip  # noqa: E402
@@ -216,7 +216,7 @@ class Posed:
         with np.errstate(all="ignore"):
             return 100 * (1 - speed * ratio / (motor * radius))
 
-    def cost(self, z: np.ndarray, found: MemberObservations, search: Search) -> np.ndarray:
+    def cost(self, z: np.ndarray, found: Observation, search: Search) -> np.ndarray:
         """Half the sum of squares of members, over the rows that a search sees."""
         current, motor, speed = (channels.USUAL.index(n) for n in ("total_current", "motor_speed", "speed"))
         error = self.percent(found.reading)
@@ -298,10 +298,10 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     problem = Problem(params.without_weak_types(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
     weights = [np.asarray(data.weight) * s[:, None] for s in seen]
     found, _ = fit_from_each_start(problem, [np.zeros(len(names))] * len(seen), weights)
-    slope = jax.jit(jax.jacfwd(lambda z, data: problem.misfit(z, data)))
+    slope = jax.jit(jax.jacfwd(lambda z, weight: problem.with_data(weight=weight).misfit(z)))
     spread = []
     for z, weight in zip(found.z, weights, strict=True):
-        by = np.asarray(slope(jnp.asarray(z), dataclasses.replace(data, weight=jnp.asarray(weight))))
+        by = np.asarray(slope(jnp.asarray(z), jnp.asarray(weight)))
         spread.append(np.linalg.inv(by.T @ by + np.eye(len(names))))
     return problem, np.asarray(found.z), np.array(spread)
 
@@ -372,7 +372,7 @@ def generations(posed: Posed, searches: list[Search], together: int, arguments: 
         found = simulate_members(posed.problem, np.concatenate(drawn), together=together)
         for k, (search, z) in enumerate(zip(searches, drawn, strict=True)):
             here = slice(k * arguments.population, (k + 1) * arguments.population)
-            cost = posed.cost(z, MemberObservations(*(x[here] for x in found)), search)
+            cost = posed.cost(z, jax.tree.map(lambda x: x[here], found), search)  # noqa: B023
             search.z.append(z)
             search.cost.append(cost)
             search.cma.tell([(a, float(min(c, 1e6))) for a, c in zip(z, cost, strict=True)])
@@ -389,11 +389,10 @@ def _again(problem: Problem, points: Array) -> Observation:
     return jax.vmap(problem.observation)(points)
 
 
-def finer(posed: Posed, points: np.ndarray, parts: int) -> MemberObservations:
+def finer(posed: Posed, points: np.ndarray, parts: int) -> Observation:
     """Readings of members at a fraction of the step."""
     observe = dataclasses.replace(posed.problem.observe, parts=parts)
-    seen = jax.device_get(_again(dataclasses.replace(posed.problem, observe=observe), jnp.asarray(points)))
-    return MemberObservations(*(np.asarray(getattr(seen, name)) for name in MemberObservations._fields))
+    return jax.device_get(_again(dataclasses.replace(posed.problem, observe=observe), jnp.asarray(points)))
 
 
 def lumped_slip(arguments: argparse.Namespace) -> None:
@@ -470,7 +469,7 @@ def rms(error: np.ndarray) -> list[float]:
     return np.sqrt(np.mean(error**2, 0)).round(3).tolist()
 
 
-def determined(posed: Posed, z: np.ndarray, found: list[MemberObservations], seen: np.ndarray) -> list[float]:
+def determined(posed: Posed, z: np.ndarray, found: list[Observation], seen: np.ndarray) -> list[float]:
     """Singular values of the slip of tracked rows [its sd] by the constants [prior sd], from a regression."""
     slip = np.mean([posed.mean(posed.slip(s.reading)[..., None])[..., 0] for s in found], 0)[:, seen & posed.tracked]
     usable = np.isfinite(slip).all(1)
@@ -525,7 +524,7 @@ def main() -> None:
     held: dict[str, list[np.ndarray]] = {}
     for k, search in enumerate(searches):
         here = slice(k * finalists, (k + 1) * finalists)
-        own = [MemberObservations(*(x[here] for x in s)) for s in steps]
+        own = [jax.tree.map(lambda x: x[here], s) for s in steps]  # noqa: B023
         cost = np.mean([posed.cost(points[here], s, search) for s in own], 0)
         at = int(np.argmin(cost))
         seen = search.seen > 0

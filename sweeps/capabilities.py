@@ -184,10 +184,18 @@ def imposed_default(robot: Robot, option: str) -> float:
     """
     if Layout.of(robot).complete:
         return VOLTAGE
-    limit = imposed_limit(robot)
-    if limit is None:
-        raise BadConfiguration(_missing_limit_message(robot, option, IMPOSED_WORDS[robot.rig.imposed].one))
+    limit = _stated_limit(robot, option, IMPOSED_WORDS[robot.rig.imposed].one)
     return limit if robot.rig.imposed == "voltage" else _digits(limit)
+
+
+def _stated_limit(robot: Robot, option: str, example: str) -> float:
+    """`imposed_limit` of a file that states it. The refusal has an example of the option."""
+    limit, about = imposed_limit(robot), IMPOSED_WORDS[robot.rig.imposed]
+    if limit is None:
+        # currents are not limited by files
+        missing = f", and the robot's file has no motor.{about.limit}" * (robot.rig.imposed != "motor_current")
+        raise BadConfiguration(f"{option}: not given{missing}; give it [{about.unit}], such as {option} {example}")
+    return limit
 
 
 def imposed_example(robot: Robot) -> float:
@@ -209,31 +217,13 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
     """
     if Layout.of(robot).complete:
         return VOLTAGES_V
-    limit = imposed_limit(robot)
-    if limit is None:
-        raise BadConfiguration(_missing_limit_message(robot, option, IMPOSED_WORDS[robot.rig.imposed].several))
+    about = IMPOSED_WORDS[robot.rig.imposed]
+    limit = _stated_limit(robot, option, about.several)
     levels = tuple(_digits(share * limit) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
-        notes.append(
-            f"{option}: not given. Thirds of the {_robot_phrase(robot)} in the robot's file are used: {level_text}"
-        )
+        notes.append(f"{option}: not given. Thirds of the {about.limit} in the robot's file are used: {level_text}")
     return levels
-
-
-def _robot_phrase(robot: Robot) -> str:
-    return IMPOSED_WORDS[robot.rig.imposed].limit
-
-
-def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
-    unit = IMPOSED_WORDS[robot.rig.imposed].unit
-    if robot.rig.imposed == "motor_current":  # not limited by files
-        return f"{option}: not given; give it [{unit}], such as {option} {example}"
-    return (
-        f"{option}: not given, and the robot's file has no motor.{_robot_phrase(robot)}; "
-        f"give it [{unit}], such as {option} "
-        f"{example}"
-    )
 
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
@@ -241,7 +231,7 @@ def option_refusal(robot: Robot, option: str, instead: str) -> str:
     reason = IMPOSED_WORDS[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
         return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
-    return f"{option}: the voltage is imposed on this robot, and the motor speed follows; give {instead} [V]"
+    return f"{option}: the voltage is imposed on this robot; give {instead} [V]"
 
 
 def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> None:
@@ -254,7 +244,7 @@ def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> N
         BadConfiguration: there is one.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "slope, payload, mass and surface do not act on a shaft; remove it"
+        why = "has no effect on a shaft; remove it"
         raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
 
 
@@ -266,9 +256,7 @@ def check_battery(robot: Robot) -> None:
     """
     if robot.rig.imposed != "voltage":
         imposed_words = IMPOSED_WORDS[robot.rig.imposed].words
-        raise BadConfiguration(
-            f"--battery: the {imposed_words} is imposed on this robot, regardless of the supply; remove --battery"
-        )
+        raise BadConfiguration(f"--battery: the {imposed_words} is imposed on this robot; remove --battery")
     if not has_battery(robot):
         raise BadConfiguration("--battery: the robot's file has no battery; add [battery], or give --voltage")
 

@@ -46,15 +46,15 @@ _Config = Annotated[
     typer.Option(
         "--config",
         hidden=True,
-        help="TOML file with the keys of a config.resolved.toml. Options on the command line override it.",
+        help="TOML file with the keys of a config.resolved.toml. Options override it.",
     ),
 ]
 _Trust = Annotated[
     bool,
-    typer.Option("--trust", hidden=True, help="Allow the file of --config to name effects, which run as code."),
+    typer.Option("--trust", hidden=True, help="Allow the file of --config to name effects, whose code is run."),
 ]
 _Effects = Annotated[
-    list[str] | None, typer.Option("--effects", help="Python file with your own effects. May be repeated.")
+    list[str] | None, typer.Option("--effects", help="Python file with your own effects. Repeatable.")
 ]
 _Columns = Annotated[
     str | None,
@@ -100,7 +100,7 @@ def _command(
             if "plan" in given:
                 given["plan"] = file
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
-            aside = config.resolve_further_options(beside, others)
+            aside = config.resolve_configuration(beside, None, others)
             if resolve is None:
                 resolved = config.resolve_configuration(kind, file, stated, trust)
             else:
@@ -429,8 +429,8 @@ def new(
         str | None,
         typer.Option(
             help=(
-                "tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  \\[default: from the "
-                "joint of --from, else bench]"
+                "tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  \\[default: from --from, "
+                "else bench]"
             )
         ),
     ] = None,
@@ -489,9 +489,7 @@ def rig_check(
     columns: _Columns = None,
     effects: _Effects = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of text.")] = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", help="Print every table and remark instead of about five lines.")
-    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print every table and remark.")] = False,
     no_cache: _NoCache = False,
 ) -> int:
     """Check a rig's file, and data for it.
@@ -527,7 +525,7 @@ def inspect_file(
 def explain(
     name: Annotated[
         list[str] | None,
-        typer.Argument(help="Effect, status, flag, output, channel, parameter or word of a report. None: list all."),
+        typer.Argument(help="Effect, status, output, parameter or other name. None: list all."),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,
@@ -670,28 +668,24 @@ def _report_failure(error: BaseException) -> int:
     if isinstance(error, typer.Abort | KeyboardInterrupt):
         advice = "no run folder was written"
         if "sweep" in sys.argv[1:2]:
-            advice = "the same command with the same --out resumes the sweep after its last complete chunk"
+            advice = "the same command and --out resume after the last complete chunk"
         if "calibrate" in sys.argv[1:2]:
-            advice = "the same command with the same --out resumes a population after its last generation"
+            advice = "the same command and --out resume a population after its last generation"
         if "loop" in sys.argv[1:2]:
-            advice = "the same command with the same --out resumes the loop after its last complete stage"
+            advice = "the same command and --out resume after the last complete stage"
         return _print_failure(f"interrupted; {advice}", INTERRUPTED)
     if _memory_exhausted(error):
-        return _print_failure("out of memory; use fewer points at a time (--chunk), fewer rows, or more memory", 2)
+        return _print_failure("out of memory; use a smaller --chunk, fewer rows, or more memory", 2)
     if isinstance(error, OSError):
         from sweeps.console import OUTPUT
 
         place = str(error.filename or OUTPUT)  # run folders and tables name theirs
-        left = (
-            ""
-            if place == OUTPUT
-            else "; no run folder was written; finished parts are in the folder that ends in .partial"
-        )
+        left = "" if place == OUTPUT else "; no run folder was written; finished parts are in the .partial folder"
         return _print_failure(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
         return 1  # whoever reads the output has had enough: head, or a pager that was left
     if isinstance(error, SystemExit):
-        return _print_failure("--effects: the code in an effects file ended the program; remove that call", 2)
+        return _print_failure("--effects: a file's code ended the program; remove that call", 2)
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
         return _print_failure(_not_a_number_message(error) or error.format_message(), error.exit_code)
     import traceback

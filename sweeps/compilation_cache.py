@@ -101,7 +101,7 @@ def _is_unsafe(folder: str) -> bool:
         from sweeps.console import print_message
 
         print_message(
-            f"compiled programs are not cached: {reason}. Set {VARIABLE} to a folder of yours, or chmod go-w it"
+            f"compiled programs are not cached: {reason}. Set {VARIABLE} to your own folder, or chmod go-w it"
         )
     return bool(reason)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
@@ -46,6 +47,7 @@ MotorSpeed = Annotated[float, number_between(*channels.find_channel("motor_speed
 PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
 SHOWN = 5.0
+PaperSurface = Literal[tuple(SURFACES)]  # type: ignore[valid-type]  # names of a table
 Seed = Annotated[int, Field(ge=0, le=SEEDS)]
 
 
@@ -63,10 +65,38 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
     return Field(default=default, description=description, json_schema_extra=extra or None)
 
 
+Rules = tuple[tuple[str, ...], ...]
+
+
 class Part(BaseModel):
     """A part of a command's configuration. Unknown keys are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+    #: Two fields that cannot be combined, and the end of the message.
+    exclusive: ClassVar[Rules] = ()
+    #: A field, another one that it needs, and what the message says of it.
+    needed: ClassVar[Rules] = ()
+
+    def states(self, name: str) -> bool:
+        """True if a field is present and has another value than its default."""
+        fields = type(self).model_fields
+        return name in fields and getattr(self, name) != fields[name].default
+
+    @model_validator(mode="after")
+    def _combined(self) -> Self:
+        parts = [vars(part) for part in type(self).__mro__]
+        for one, other, text in (rule for part in parts for rule in part.get("needed", ())):
+            if self.states(one) and not self.states(other):
+                raise idle(f"`{one}` {text}")
+        for one, other, *more in (rule for part in parts for rule in part.get("exclusive", ())):
+            if self.states(one) and self.states(other):
+                raise idle(f"`{one}` cannot be combined with `{other}`{''.join(more)}")
+        return self
+
+
+def idle(message: str) -> PydanticCustomError:
+    """Error on the combination of several fields, whose names are between backticks."""
+    return PydanticCustomError("idle", message)
 
 
 class RobotPart(Part):
@@ -74,10 +104,10 @@ class RobotPart(Part):
 
     robot: str = option_field("nominal", "nominal, sm1, sm2, or the TOML file of a robot")
     set: dict[str, bool | float] = option_field(
-        {}, "Change a parameter (SI units). May be repeated: 6T2A.ground.friction.static=0.6"
+        {}, "Change a parameter (SI units). Repeatable: 6T2A.ground.friction.static=0.6"
     )
     effects: Names = option_field(
-        (), "Python file with effects. Its code is run. May be repeated", verbatim=True, executes=True
+        (), "Python file with effects, which is run. Repeatable", verbatim=True, executes=True
     )
 
 
@@ -91,7 +121,7 @@ class FolderPart(Part):
 class VerbosePart(FolderPart):
     """Amount of text that a command prints. It changes no number."""
 
-    verbose: bool = option_field(False, "Print every table and remark instead of about five lines")
+    verbose: bool = option_field(False, "Print every table and remark")
 
 
 class Measured(FolderPart):
@@ -112,7 +142,7 @@ class SettledLog(FolderPart):
 
     data: str = option_field(
         ...,
-        "Log in any format, with time_s, the imposed quantity and channels",
+        "Log with time_s, the imposed quantity and channels",
         argument=True,
         metavar="LOG",
     )
@@ -183,17 +213,13 @@ class FidelityPart(ModelPart):
     def _acts(self) -> Self:
         for name in ("duration", "step"):
             value, having = getattr(self, f"{name}_s"), _fidelities_with_option(name)
-            usual = {option.default for option in having.values()}
-            if value is not None and self.model not in having and value not in usual:
-                raise PydanticCustomError(
-                    "idle", f"`{name}_s` has an effect only with `model` {_join_with_or(having)}"
-                )
-            if value is not None and self.model in having and value > having[self.model].most:
-                most = having[self.model]
-                raise PydanticCustomError(
-                    "idle",
-                    f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {most.most:g} {most.unit}",
-                )
+            if value is None:
+                continue
+            if self.model not in having and value not in {option.default for option in having.values()}:
+                raise idle(f"`{name}_s` has an effect only with `model` {_join_with_or(having)}")
+            if self.model in having and value > having[self.model].most:
+                most = f"{having[self.model].most:g} {having[self.model].unit}"
+                raise idle(f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {most}")
         return self
 
     @property
@@ -222,19 +248,12 @@ class SupplyPart(Part):
         0.0, "Charge taken from the battery before"
     )
 
-    @model_validator(mode="after")
-    def _feeds(self) -> Self:
-        if self.discharge_mAh and not self.battery:
-            raise PydanticCustomError("idle", "`discharge_mAh` has an effect only with `battery`")
-        if self.battery and getattr(self, "voltages_V", None) is not None:
-            raise PydanticCustomError(
-                "idle", "`voltages_V` cannot be combined with `battery`, whose charge sets the voltage"
-            )
-        return self
+    exclusive: ClassVar[Rules] = (("voltages_V", "battery", ", whose charge sets the voltage"),)
+    needed: ClassVar[Rules] = (("discharge_mAh", "battery", "has an effect only with `battery`"),)
 
 
 SURFACE = "Surface of Table 5, or one of the rig's"
-FRONT = "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)"
+FRONT = "Angle of the front levers (0: extended, positive: up, 180: folded)"
 REAR = "Angle of the rear levers, likewise"
 
 
@@ -284,10 +303,8 @@ class GivenRuns(OneRun, FolderPart):
     @model_validator(mode="after")
     def _once(self) -> Self:
         if self.runs is not None and self.stated:
-            raise PydanticCustomError(
-                "idle", f"{', '.join(f'`{name}`' for name in self.stated)}: not allowed with `runs`; give it as a "
-                    "column there, or omit `runs`",
-            )  # fmt: skip
+            names = ", ".join(f"`{name}`" for name in self.stated)
+            raise idle(f"{names}: not allowed with `runs`; give it as a column there")
         return self
 
 
@@ -340,12 +357,12 @@ class InferencePart(Part):
     """Prior knowledge and data of a fit."""
 
     prior: Names = option_field(
-        (), "A prior in SI units. May be repeated: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
+        (), "A prior in SI units. Repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
     )
     noise: str = option_field(
         "",
-        "Standard deviations in % or in A, rpm, mm/s: current=2%,motor_speed=10rpm,speed=5mm/s",
-        usual="from the columns, else estimated. Settled rows without series in the loop: 2, 0.5 and 1 %",
+        "Standard deviations: current=2%,motor_speed=10rpm,speed=5mm/s",
+        usual="from columns, else estimated. Settled rows without series in the loop: 2, 0.5, 1 %",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
         ROWS, "Most rows used. Larger data are thinned evenly"
@@ -378,23 +395,19 @@ class TurnPart(Part):
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = option_field(None, "Duty of the left motor")
     duty_right: Duty | None = option_field(None, "Duty of the right motor")
-    heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
+    heading_deg: Heading | None = option_field(None, "Heading at the start, from uphill to the left")
 
     @property
     def turns(self) -> bool:
         """True if the robot is free to turn."""
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
-    @model_validator(mode="after")
-    def _of_both_sides(self) -> Self:
-        pairs = ("left_V", "right_V"), ("duty_left", "duty_right")
-        for left, right in pairs:
-            if (getattr(self, left) is None) != (getattr(self, right) is None):
-                one, other = (left, right) if getattr(self, right) is None else (right, left)
-                raise PydanticCustomError("idle", f"`{one}` needs `{other}`; give both")
-        if self.left_V is not None and self.duty_left is not None:
-            raise PydanticCustomError("idle", "`left_V` cannot be combined with `duty_left`; give one pair")
-        return self
+    exclusive: ClassVar[Rules] = (("left_V", "duty_left", "; give one pair"),)
+    needed: ClassVar[Rules] = tuple(
+        (one, other, f"needs `{other}`; give both")
+        for pair in (("left_V", "right_V"), ("duty_left", "duty_right"))
+        for one, other in (pair, pair[::-1])
+    )
 
 
 class PosteriorPart(Part):
@@ -417,9 +430,9 @@ class ProfilePart(FidelityPart):
 
     profile: Annotated[str, Field(min_length=1)] | None = option_field(
         None,
-        "Mission: a CSV with time_s and any of speed_mm_s, motor_speed_rpm, duty, mode, supply_voltage_V, "
-        "slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left and duty_right, "
-        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed. Or one of stair, stop_and_go, "
+        "Mission: CSV with time_s and any of speed_mm_s, motor_speed_rpm, duty, mode, supply_voltage_V, "
+        "slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left, duty_right, "
+        "voltage_left_V, voltage_right_V, or yaw_rate_rad_s. Or stair, stop_and_go, "
         "shuttle, patrol (docs/reference/profiles.md)",
     )
 
@@ -430,19 +443,12 @@ class ProfilePart(FidelityPart):
             return {"model": PROFILED, **values}
         return values
 
+    exclusive: ClassVar[Rules] = (("duration_s", "profile", ", which sets the duration"),)
+
     @model_validator(mode="after")
     def _profiled(self) -> Self:
-        if self.profile is None:
-            return self
-        if self.model != PROFILED:
-            raise PydanticCustomError(
-                "idle",
-                f"`profile` has an effect only with `model` {PROFILED}; got {self.model}",
-            )
-        if self.duration_s is not None:
-            raise PydanticCustomError(
-                "idle", "`duration_s` cannot be combined with `profile`, which sets the duration"
-            )
+        if self.profile is not None and self.model != PROFILED:
+            raise idle(f"`profile` has an effect only with `model` {PROFILED}; got {self.model}")
         return self
 
     @property
@@ -454,20 +460,11 @@ class ProfilePart(FidelityPart):
 class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
     """A few given runs. Runs over time begin at standstill, or follow a profile."""
 
-    @model_validator(mode="after")
-    def _certain(self) -> Self:
-        if self.turns:
-            beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
-            if beside:
-                option = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
-                raise PydanticCustomError("idle", f"`{option}` cannot be combined with `{beside[0]}`")
-            if self.battery and self.left_V is not None:
-                raise PydanticCustomError(
-                    "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
-                )
-        if self.profile is not None and self.posterior is not None:
-            raise PydanticCustomError("idle", "`posterior` cannot be combined with `profile`")
-        return self
+    exclusive: ClassVar[Rules] = (
+        *itertools.product(TurnPart.model_fields, ("profile", "posterior")),
+        ("left_V", "battery", "; give `duty_left` and `duty_right`"),
+        ("posterior", "profile"),
+    )
 
     @property
     def options(self) -> dict[str, float]:
@@ -505,7 +502,7 @@ class Resonance(RobotPart, ConfigurationPart, FidelityPart, OutputPart):
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
-        None, "Length of a run (s). Its second half shows the ripple", usual="1.5", minimum=0.5
+        None, "Length of a run (s), whose second half is evaluated", usual="1.5", minimum=0.5
     )
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
@@ -515,9 +512,7 @@ class Resonance(RobotPart, ConfigurationPart, FidelityPart, OutputPart):
     )
     payloads_kg: Several[Payload] = option_field(PAYLOADS_KG, "Additional load masses")
     slope_deg: Slope = option_field(0.0, "Slope, positive uphill")
-    surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
-        BENCH, "Surface of Table 5"
-    )
+    surface: PaperSurface = option_field(BENCH, "Surface of Table 5")  # type: ignore[valid-type]
 
 
 Angle = Annotated[float, number_between(-360, 360)]
@@ -530,7 +525,7 @@ class ClimbPart(Part):
     nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Edge radius of steps and stairs")
     sequence: Path | None = option_field(
         None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg. "
-            "Or front_V and rear_V, voltages of the lever motors",
+            "Or front_V, rear_V of the lever motors",
         format="path",
     )  # fmt: skip
     levers_voltage_V: Annotated[float, positive_number(1e6)] | None = option_field(
@@ -553,12 +548,10 @@ class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
     levers_rear_deg: Angle | None = option_field(None, REAR, usual="the robot's")
     supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
     payload_kg: Payload = option_field(0.0, "Additional load mass")
-    surface: Literal[tuple(SURFACES)] = option_field(  # type: ignore[valid-type]  # names of a table
-        BENCH, "Surface of Table 5"
-    )
+    surface: PaperSurface = option_field(BENCH, "Surface of Table 5")  # type: ignore[valid-type]
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None,
-        "Find the largest obstacle. For stairs: largest rise at the tread of --stairs",
+        "Find the largest obstacle. For stairs: the rise at the tread of --stairs",
     )
     derivatives: Names = option_field(
         (),
@@ -566,29 +559,23 @@ class Climb(RobotPart, ConfigurationPart, ClimbPart, SupplyPart, OutputPart):
         "--battery: discharge), levers_front_deg, levers_rear_deg, obstacle_mm",
     )
 
+    exclusive: ClassVar[Rules] = (
+        *itertools.combinations(("step_mm", "stairs", "gap_mm", "terrain"), 2),
+        ("supply_voltage_V", "battery"),
+        ("derivatives", "find"),
+    )
+
     @model_validator(mode="after")
     def _one_obstacle(self) -> Self:
-        obstacle_options = [
-            name for name in ("step_mm", "stairs", "gap_mm", "terrain") if getattr(self, name) is not None
-        ]
-        if len(obstacle_options) > 1:
-            raise PydanticCustomError(
-                "idle", f"`{obstacle_options[0]}` and `{obstacle_options[1]}` are both given; keep one"
-            )
-        if not obstacle_options and self.find is None:
-            raise PydanticCustomError(
-                "idle", "no obstacle is given; give `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
-            )
-        if self.find == "stairs" and self.stairs is None:
-            raise PydanticCustomError("idle", "`find` stairs needs `stairs`, which sets tread and count")
-        if self.find is not None and obstacle_options and not obstacle_options[0].startswith(self.find):
-            raise PydanticCustomError("idle", f"`find` {self.find} cannot be combined with `{obstacle_options[0]}`")
-        if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
-            raise PydanticCustomError("idle", "`nose_mm` has an effect only with steps and stairs")
-        if self.battery and self.supply_voltage_V is not None:
-            raise PydanticCustomError("idle", "`supply_voltage_V` cannot be combined with `battery`")
-        if self.derivatives and self.find is not None:
-            raise PydanticCustomError("idle", "`derivatives` cannot be combined with `find`")
+        stated = next((name for name in ("step_mm", "stairs", "gap_mm", "terrain") if self.states(name)), None)
+        if stated is None and self.find is None:
+            raise idle("no obstacle is given; give `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`")
+        if self.find == "stairs" and stated is None:
+            raise idle("`find` stairs needs `stairs`, which sets tread and count")
+        if self.find is not None and stated is not None and not stated.startswith(self.find):
+            raise idle(f"`find` {self.find} cannot be combined with `{stated}`")
+        if self.nose_mm and (stated in ("gap_mm", "terrain") or self.find == "gap"):
+            raise idle("`nose_mm` has an effect only with steps and stairs")
         return self
 
 
@@ -681,22 +668,19 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "Order of indistinguishable effects: by misfit, or by held-out error",
+        "Order of indistinguishable effects: misfit or held-out error",
     )
-    forbid: Names = option_field(
-        (), "Experiment that you cannot do, repeatable: stall, lifted, 'one motor', a configuration"
-    )
+    forbid: Names = option_field((), "Experiment to avoid, repeatable: stall, lifted, 'one motor', a configuration")
     model: Path | None = option_field(
         None,
-        "MuJoCo model of several joints, whose torques are their loads",
+        "MuJoCo model of several joints",
     )
     joints: Names = option_field((), "Joints of --model, comma-separated, or all")
 
-    @model_validator(mode="after")
-    def _joints_of_a_model(self) -> Self:
-        if (self.model is None) == bool(self.joints):
-            raise PydanticCustomError("idle", "`model` and `joints` must be given together")
-        return self
+    needed: ClassVar[Rules] = (
+        ("model", "joints", "and `joints` must be given together"),
+        ("joints", "model", "needs `model`; give both"),
+    )
 
 
 class RequirementsPart(Part):
@@ -739,9 +723,7 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
     parameters: Names = option_field(
         (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
-    vary: Names = option_field(
-        (), "Also treat an operating condition as uncertain. May be repeated: voltage=22:26, slope_deg=0:5"
-    )
+    vary: Names = option_field((), "Also vary an operating condition. Repeatable: voltage=22:26, slope_deg=0:5")
     outputs: Names = option_field(
         (),
         "Outputs, comma-separated: of a run, steepest_slope, highest_step, best_step, or start (three outputs)",
@@ -774,21 +756,7 @@ def read_toml(file: Path) -> Json:
     return toml_content(toml_text(file, file), file)
 
 
-def resolve_further_options(kind: type[C], options: Json) -> C:
-    """Options of a command that are not part of its configuration.
-
-    Raises:
-        BadConfiguration: for the same reasons as `resolve_configuration`.
-    """
-    return _check_values(kind, None, {}, options, trust=False)
-
-
-def resolve_configuration(
-    kind: type[C],
-    file: Path | None,
-    options: Json,
-    trust: bool = False,
-) -> C:
+def resolve_configuration(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Args:
@@ -797,17 +765,14 @@ def resolve_configuration(
     Raises:
         BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.
     """
-    return _check_values(kind, file, {} if file is None else read_toml(file), options, trust)
-
-
-def _check_values(kind: type[C], file: Path | None, values: Json, options: Json, trust: bool) -> C:
+    values = {} if file is None else read_toml(file)
     option_values = {k: v for k, v in options.items() if v is not None}
     for name in (name for name, facts in schema_facts(kind).items() if facts.get("executes")):
         if file is not None and values.get(name) and name not in option_values and not trust:
             option = options_of_fields(kind)[name]
             raise BadConfiguration(
                 f"{file.name}, {name}: would run code, which a file may not request; give {option} on the command "
-                "line, or --trust if you trust the author of the file"
+                "line, or --trust"
             )
     if "set" in option_values:
         set_values = values.get("set", {})

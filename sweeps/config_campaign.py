@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration
@@ -21,6 +20,7 @@ from sweeps.config import (
     ProfilePart,
     RobotPart,
     Sweep,
+    idle,
     option_field,
     read_toml,
     resolve_configuration,
@@ -53,8 +53,8 @@ class Obstacle(ClimbPart):
     @model_validator(mode="after")
     def _of_its_kind(self) -> Self:
         for name, kinds in {"tread_mm": ("stairs",), "count": ("stairs",), "nose_mm": ("step", "stairs")}.items():
-            if getattr(self, name) != type(self).model_fields[name].default and self.kind not in kinds:
-                raise PydanticCustomError("idle", f"`{name}` has an effect only with `kind` {' or '.join(kinds)}")
+            if self.states(name) and self.kind not in kinds:
+                raise idle(f"`{name}` has an effect only with `kind` {' or '.join(kinds)}")
         return self
 
 
@@ -89,18 +89,14 @@ class StoreOptions(FolderPart):
     )
     zarr: bool = option_field(False, "Write a Zarr store for small grids too")
     outputs: Names = option_field((), "Outputs to store, comma-separated", usual="the channels of its instruments")
-    dry_run: bool = option_field(False, "Print points, chunks, size and expected time, and write nothing")
-    export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. May be repeated")
-    shard: str | None = option_field(None, "Simulate the i-th of n shares, such as 3/8, in a job array")
+    dry_run: bool = option_field(False, "Print points, chunks, size and expected time only")
+    export: tuple[Literal["csv", "parquet"], ...] = option_field((), "Also write csv or parquet. Repeatable")
+    shard: str | None = option_field(None, "Simulate the i-th of n shares, such as 3/8")
 
     @model_validator(mode="after")
     def _shared(self) -> Self:
-        if self.shard is not None and not (
-            re.fullmatch(r"\d+/\d+", self.shard) and 1 <= self.share[0] <= self.share[1]
-        ):
-            raise PydanticCustomError(
-                "idle", f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8"
-            )
+        if not 1 <= self.share[0] <= self.share[1]:
+            raise idle(f"`shard`: got {self.shard}; expected i/n with i from 1 to n, such as 3/8")
         return self
 
     @property
@@ -111,8 +107,8 @@ class StoreOptions(FolderPart):
     @property
     def share(self) -> tuple[int, int]:
         """This process's share of the chunks, k of n."""
-        k, n = (self.shard or "1/1").split("/")
-        return int(k), int(n)
+        match = re.fullmatch(r"(\d+)/(\d+)", self.shard or "1/1")
+        return (int(match[1]), int(match[2])) if match else (0, 0)
 
     @property
     def of_store(self) -> bool:
@@ -129,7 +125,6 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
         BadConfiguration: for the same reasons as `resolve`. An option of the grid with a file that has its own axes.
     """
     if file is not None and not set(KEYS).isdisjoint(read_toml(file)):
-        assert file is not None
         for name in GRID:
             if options.get(name) is not None:
                 raise BadConfiguration(

@@ -44,28 +44,22 @@ def load_robot(config: RobotPart) -> RobotFile:
         type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
     ):
         raise BadConfiguration(
-            f"--robot {file.name}: its controller follows a goal over time; use calibrate, compare, loop or rig "
-            "check with a log, export, or mmrjax.simulate in Python"
+            f"--robot {file.name}: its controller follows a goal; use calibrate, compare, loop or rig check with "
+            "a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
-        wide_words = f"± {100 * stated.EXAMPLE_SHARE:g} %"
         notes.append(
-            f"{file.name}: still example numbers of the template: {examples}. The fit widens each ± among them "
-            f"to {wide_words}"
+            f"{file.name}: still example numbers of the template: {examples}. The fit widens each ± among them to "
+            f"± {100 * stated.EXAMPLE_SHARE:g} %"
         )
     for note in (*notes, *unlike):
         print_message(note)
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
-    runs = (
-        robot.has_ground
-        and robot.rig.imposed == "voltage"
-        and all(c.inertia > 0 for _, c in robot.configurations.items())
-    )
-    if (
-        resolves and runs and not capabilities.states_running_gear(robot)
-    ):  # otherwise the model itself would be rejected
+    runs = robot.has_ground and robot.rig.imposed == "voltage"
+    runs = runs and all(c.inertia > 0 for _, c in robot.configurations.items())  # otherwise the model rejects it
+    if resolves and runs and not capabilities.states_running_gear(robot):
         print_message("the robot's file has no running_gear: its wheelbase, belt and masses are examples")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
@@ -175,29 +169,30 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
             f"--voltage: got {cells['supply_voltage_V']:g} with --battery, whose charge sets the voltage; "
             "give one of them"
         )
-    configuration = cells.get("configuration")
-    name = robot.configurations.names[0] if configuration is None else configuration
-    check_configurations(robot, (name,), "--configuration")
     cell_values = {key: value for key, value in cells.items() if value is not None}
+    name = cell_values.get("configuration", robot.configurations.names[0])
+    check_configurations(robot, (name,), "--configuration")
     layout = Layout.of(robot)
     column = layout.imposed_column
-    for other in (c for c, _ in IMPOSED.values() if c != column and c in cell_values):
-        raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
+    for other, _ in IMPOSED.values():
+        if other != column and other in cell_values:
+            raise BadConfiguration(capabilities.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
     idle = [OPTIONS[key] for key in cell_values if key in layout.idle]
     capabilities.check_acting(robot, idle, idle)
     if battery:
         capabilities.check_battery(robot)
+    elif column in elsewhere:
+        cell_values.setdefault(column, 0.0)
     elif column not in cell_values:
-        default = 0.0 if column in elsewhere else None
-        cell_values[column] = capabilities.imposed_default(robot, OPTIONS[column]) if default is None else default
+        cell_values[column] = capabilities.imposed_default(robot, OPTIONS[column])
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}
-        surface = cell_values.get("surface")
-        is_known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
-        if not is_known and table.configuration_on_surface(name, str(surface)) not in robot.configurations:
+        surface = cell_values.get("surface", BENCH)
+        is_known = surface in SURFACES or not robot.rig.scales_adhesion
+        if not is_known and table.configuration_on_surface(name, surface) not in robot.configurations:
             raise BadConfiguration(
-                f"--surface: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"
+                f"--surface: got {surface}, for which no friction is known; {allowed_words(surface, SURFACES)}"
             )
     run = records.single_run({**cell_values, "configuration": name}, layout)
     if misplaced := misplaced_levers(run, robot):

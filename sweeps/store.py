@@ -28,6 +28,7 @@ from mmrjax import __version__
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
+from sweeps import stage_files
 from sweeps.config import FolderPart, RobotPart
 from sweeps.console import print_message, print_output
 from sweeps.report import terminal_renderer
@@ -118,7 +119,7 @@ class Folder:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
         self.path, self.partial = path, path.with_name(path.name + ".partial")
         self.tables = "csv"
-        self._results_begun = False
+        self._results_begun, self._digest = False, ""
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
@@ -160,9 +161,7 @@ class Folder:
             return
         mark = interrupted_run(self.partial)
         if mark is None:
-            raise BadConfiguration(
-                f"--out: {self.partial} already exists and was not created by mmrjax; choose another path"
-            )
+            raise BadConfiguration(f"--out: {self.partial} was not created by mmrjax; choose another path")
         if foreign := sorted(self._foreign()):
             raise BadConfiguration(
                 f"--out: {self.partial} contains {foreign[0]}, which its command did not write; move that file, or "
@@ -170,8 +169,8 @@ class Folder:
             )
         if mark["command"] not in ("", command) and not force and holds_work(self.partial):
             raise BadConfiguration(
-                f"--out: {self.partial} contains an interrupted {mark['command']}, which the same command resumes; "
-                "choose another path, or use --force to start again"
+                f"--out: {self.partial} contains an interrupted {mark['command']}; choose another path "
+                "or --force to start again"
             )
 
     def refuse_appeared(self, force: bool) -> None:
@@ -197,14 +196,6 @@ class Folder:
             f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix != ENDING
         }
 
-    def _begin_results(self) -> None:
-        """Lists foreign files in the lock file before the first result is written. All other files are then ours."""
-        mark = _json(self.partial / LOCK)
-        if FOREIGN not in mark:
-            text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
-            with writing.naming_file(self.partial / LOCK), (self.partial / LOCK).open("r+b", buffering=0) as lock:
-                lock.write(text.encode())  # in one write, so that others never read a part
-
     def _clear(self) -> None:
         """Deletes all our files in the partial folder except its lock."""
         foreign = self._foreign()
@@ -222,9 +213,13 @@ class Folder:
 
     def results(self) -> Path:
         """Folder for the results, which is moved into place when all are written."""
-        if not self._results_begun:
-            self._begin_results()
-            self._results_begun = True
+        mark, lock = _json(self.partial / LOCK), self.partial / LOCK
+        if not self._results_begun and FOREIGN not in mark:
+            # Foreign files are listed before the first result is written. All other files are then ours.
+            text = json.dumps({**mark, FOREIGN: sorted(self._foreign())})
+            with writing.naming_file(lock), lock.open("r+b", buffering=0) as stream:
+                stream.write(text.encode())  # in one write, so that others never read a part
+        self._results_begun = True
         return self.partial
 
     def write_text(self, name: str, text: str) -> None:
@@ -253,28 +248,22 @@ class Folder:
         hashes = {"robot": sha256_hex((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
         if runs is not None and runs.digest:
             hashes[runs.source] = runs.digest
-        end_time = datetime.datetime.now(datetime.UTC)
-        times = {
-            "started": self.started.isoformat(timespec="seconds"),
-            "seconds": round((end_time - self.started).total_seconds(), 3),
-        }
         names = {"manifest.json", *(p.name for p in self.partial.iterdir())} - {LOCK, CHUNKS} - self._foreign()
-        # Program, versions and devices that made a result
         import jax
         import jax.numpy as jnp
 
         new_manifest = {
-            **{
-                "schema": MANIFEST,
-                "program": f"mmrjax {__version__}",
-                "arguments": sys.argv[1:],
-                "python": platform.python_version(),
-                "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
-                "devices": [str(d) for d in jax.devices()],
-                "float": jnp.result_type(float).name,
-            },
-            **times,
+            "schema": MANIFEST,
+            "program": f"mmrjax {__version__}",
+            "arguments": sys.argv[1:],
+            "python": platform.python_version(),
+            "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+            "devices": [str(d) for d in jax.devices()],
+            "float": jnp.result_type(float).name,
+            "started": self.started.isoformat(timespec="seconds"),
+            "seconds": round((datetime.datetime.now(datetime.UTC) - self.started).total_seconds(), 3),
             **manifest,
+            **({"identity": self._digest} if self._digest else {}),
             "hashes": hashes,
             "contents": sorted(names),
         }
@@ -428,9 +417,9 @@ class RunFolder(Folder):
                 if not self._force:
                     raise BadConfiguration(
                         f"--out: {self.partial} contains interrupted work of another configuration; choose "
-                        "another path, or use --force to start again"
+                        "another path, or --force to start again"
                     )
-                print_message(f"{self.partial}: was made with another configuration, so it is started again")
+                print_message(f"{self.partial}: was made with another configuration and is started again")
             self._clear()
             self._lock.truncate(0)
             self._lock.write(lock_text(self._command, self._digest))
@@ -464,8 +453,6 @@ class RunFolder(Folder):
 
     def chunk(self, name: str) -> Any:
         """Chunk from an interrupted run. None if missing or damaged, which is reported."""
-        from sweeps import stage_files
-
         file = self._chunk_file(name)
         try:
             return stage_files.read_stage(file) if file.is_file() else None
@@ -475,8 +462,6 @@ class RunFolder(Folder):
 
     def keep_chunk(self, name: str, content: Any) -> None:
         """Stores a finished chunk, for continuing an interrupted run."""
-        from sweeps import stage_files
-
         with writing.replacing(self._chunk_file(name)) as temporary:
             stage_files.write_stage(temporary, content)
 
@@ -484,8 +469,6 @@ class RunFolder(Folder):
         """Result of a stage: read if an interrupted run of the same identity stored it, otherwise computed and
         stored. A result that cannot be written is not stored.
         """
-        from sweeps import stage_files
-
         stored: tuple[T] | None = self.chunk(name)  # in a tuple, since a result may be None
         if stored is None:
             stored = (make(),)
@@ -499,10 +482,6 @@ class RunFolder(Folder):
 
     def _chunk_file(self, name: str) -> Path:
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}{ENDING}"
-
-    def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """As in `Folder`, with the identity of the run in the manifest."""
-        return super().finish({**manifest, "identity": self._digest}, runs)
 
     def move_into_place(self) -> Path:
         """Deletes the chunks and moves the folder to its final path. The lock file is removed last.

@@ -23,7 +23,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import Signals, State
-from tests.commands import read_rig, read_table, text_file
+from tests.commands import csv_text, read_rig, read_table, text_file
 
 SAMPLES = np.linspace(0, 2, 201)
 TIMES = time_grid(SAMPLES, np.arange(0, 2, 0.5), change=(1e-5, 0.04))
@@ -145,19 +145,17 @@ def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path, st
 @pytest.mark.nightly
 def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     robot = read_rig(tmp_path, FILE)
-    truth = params.replace(robot, {"bench.backlash": 0.06})
-    seen = driven(truth)
-    at = np.searchsorted(TIMES, SAMPLES)
-    random = default_rng(3)
-    lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
-    for k, t in zip(at, SAMPLES, strict=True):
-        speed = float(seen.speed_motor[k]) / quantities.RPM + 5 * random.standard_normal()
-        angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
-        lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
-    runs = read_table(tmp_path, "\n".join(lines), robot, "table.csv")
+    seen = driven(params.replace(robot, {"bench.backlash": 0.06}))
+    at, noise = np.searchsorted(TIMES, SAMPLES), default_rng(3).standard_normal((len(SAMPLES), 2)).T
+    columns = {
+        "time_s": SAMPLES, "supply_voltage_V": VOLTAGE[at],
+        "motor_speed_rpm": np.asarray(seen.speed_motor)[at] / quantities.RPM + 5 * noise[0],
+        "motor_speed_sd_rpm": np.full(len(at), 5.0), "output_angle_deg": np.degrees(seen.angle)[at] + 0.2 * noise[1],
+        "output_angle_sd_deg": np.full(len(at), 0.2),
+    }  # fmt: skip
     found = calibrate(
-        runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
-        profiles=False,
+        read_table(tmp_path, csv_text(columns), robot, "table.csv"), robot, model="drive", starts=2, blocks=False,
+        free=["bench.backlash", "bench.loss_coulomb"], profiles=False,
     )  # fmt: skip
     backlash = found.parameters["bench.backlash"]
     # Flanks that meet and part make kinks in the misfit: its curvature says less than what it finds is off by.

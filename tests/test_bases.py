@@ -1,11 +1,14 @@
 """Bases of curves: over what they go, windows in which something happens, and when row order says nothing new."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
+from calibration.inference import bases
 from calibration.inference.bases import (
     BALANCES,
     COLLINEAR,
@@ -16,18 +19,31 @@ from calibration.inference.bases import (
     VARIABLES,
     CurveScope,
     Window,
-    curve_families,
     family_names,
-    order_collinearity,
     wave_families,
-    window_families,
     window_from_name,
 )
 from mmrjax.compile.compiling import for_equations
-from mmrjax.model import channels
+from mmrjax.effects.curve import WAYS
+from mmrjax.model import channels, paper_robots
 
 RNG = default_rng(0)
 ROWS = 60
+SCOPE = CurveScope.of(paper_robots.nominal(), {})
+
+
+def curve_families(columns, weight, scope=SCOPE):
+    """Of runs that always travel forward."""
+    return bases.curve_families(columns, weight, dict.fromkeys(WAYS, np.ones(len(weight))), scope)
+
+
+def window_families(columns, weight, scope=SCOPE):
+    """Of runs that always travel forward."""
+    return bases.window_families(columns, weight, dict.fromkeys(WAYS, np.ones(len(weight))), scope)
+
+
+def order_collinearity(columns, weight, axes=SCOPE.axes):
+    return bases.order_collinearity(columns, weight, axes, "order")
 
 
 def table(rows=ROWS, **more):
@@ -86,7 +102,7 @@ def test_order_of_a_sorted_table_is_no_driver(driven):
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
         "total_current_A": RNG.uniform(1, 5, 30), driven: level / level[-1],
     }  # fmt: skip
-    scope = CurveScope(("electrical", "track"), ("supply_voltage_V",))
+    scope = replace(SCOPE, balances=("electrical", "track"), axes=("supply_voltage_V",))
     assert "order" not in variables(curve_families(columns, np.ones(30), scope=scope))
     assert not [v for v in variables(window_families(columns, np.ones(30), scope=scope)) if v.startswith("order")]
     for seed in range(5):
@@ -103,7 +119,7 @@ TIME = np.arange(40.0)
 def test_time_of_a_single_ramp_is_no_driver(voltage, expected):
     columns = {"configuration": np.full(40, "bench"), "time_s": TIME, "total_current_A": RNG.uniform(1, 5, 40)}
     logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
-    scope = CurveScope(("electrical",), ("supply_voltage_V",))
+    scope = replace(SCOPE, balances=("electrical",), axes=("supply_voltage_V",))
     assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
     assert any(v.startswith("time") for v in variables(window_families(*logged, scope=scope))) == expected
 
@@ -220,7 +236,7 @@ def test_a_table_without_order_or_levels_has_no_windows():
 def test_an_order_that_the_only_condition_tells_has_no_curves():
     order = np.arange(1.0, ROWS + 1)
     columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
-    alone = CurveScope(("electrical", "track"), ("motor_current_A",))
+    alone = replace(SCOPE, balances=("electrical", "track"), axes=("motor_current_A",))
     assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {CONDITIONS}
 
 
@@ -271,7 +287,7 @@ def back_and_forth(turn, runs=3, samples=100):
 def waves_of(turn):
     """Order of the shaft → columns of its wave in one balance, of runs that turn so far [rad] and come back."""
     angle, rows = back_and_forth(turn)
-    (basis,) = wave_families(np.zeros(angle.size, bool), angle, rows, rows)
+    (basis,) = wave_families(np.zeros(angle.size, bool), angle, rows, rows, BALANCES)
     every = {n: np.asarray(c) for n, c in zip(basis.names, basis.columns, strict=True)}
     return angle, rows, {v: c for (place, v), c in every.items() if place == "track"}
 
@@ -297,4 +313,4 @@ def test_pieces_of_a_wave_have_one_phase_in_all_runs():
 
 def test_a_shaft_that_stands_has_no_waves():
     angle, rows = back_and_forth(0.0)
-    assert wave_families(np.zeros(angle.size, bool), angle, rows, rows) == ()
+    assert wave_families(np.zeros(angle.size, bool), angle, rows, rows, BALANCES) == ()

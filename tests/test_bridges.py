@@ -160,9 +160,11 @@ def test_requirements_behind_a_limit_or_a_diode_are_those_of_steady_travel(one_w
     current, speed, outcome = values(*map(jnp.asarray, (limits, which, volts, slope, payload)))
     runs = mm.Conditions(which, voltage=volts, slope_deg=slope, payload=payload).resolved(robot)
     exact = solved(robot, runs, jnp.asarray(limits))
-    assert_allclose(current, exact["motor_current"], rtol=1e-9, atol=1e-9)
-    assert_allclose(speed, np.abs(exact["motor_speed"]), rtol=1e-9, atol=1e-9)
     assert_array_equal(outcome, exact["status"])
+    travels = np.isfinite(exact["motor_speed"])  # or slides
+    assert travels.mean() > 0.9
+    for got, right in ((current, exact["motor_current"]), (speed, np.abs(exact["motor_speed"]))):
+        assert_allclose(got[travels], right[travels], rtol=1e-9, atol=1e-9)
     assert (np.abs(current) > limits).sum() > 10
 
 

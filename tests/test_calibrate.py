@@ -301,7 +301,7 @@ def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(ga
     lost = jnp.isnan(gaps.measured())
     assert lost.sum() == 22
     one, other = (
-        fit.search_starts(posed, starts, replace(posed.data, measured=posed.data.measured + number * lost))[0]
+        fit.search_starts(posed.with_data(measured=posed.data.measured + number * lost), starts)[0]
         for number in (0.0, 1e6)
     )
     for name in ("z", "sd", "cost"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
+from scipy.optimize import brentq
 from worlds import paper
 
 from mmrjax.model import params
@@ -33,24 +34,21 @@ def test_normal_load_matches_reference():
 def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     """(1) with (2), (4): where wheel and robot accelerate alike, m δ a = M_d i η / r - M_t / r - F_f - G."""
     run = Conditions(voltage=24.0, slope_deg=np.degrees(0.05), configuration=wheeled)
-    body = robot.chassis(wheeled)
-    # find by bisection the sliding speed at which V' = r ω_k', at 300 rad/s and 1.5 A
-    low, high = 0.0, float(body.ground.friction.speed_static)
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        state = State(1.5, 300.0, 300.0 / robot.gearbox.ratio * body.radius - middle, 0.0)
-        s = moving_signals(robot, run, state)
-        if float(s.acceleration) < float(body.radius * s.acceleration_wheel):
-            low = middle
-        else:
-            high = middle
-    m, eta = s.mass / 2, robot.gearbox.efficiency_load
-    drive = (s.torque_motor - s.torque_idle) * robot.gearbox.ratio * eta / body.radius
-    free = drive - s.torque_track_loss / body.radius - s.demand
-    turned = paper.equivalent_inertia(m, body.radius, robot.motor.inertia, robot.gearbox.ratio, eta, body.inertia)
-    delta = paper.mass_factor(m, body.radius, turned)
+    body, ratio, eta = robot.chassis(wheeled), robot.gearbox.ratio, robot.gearbox.efficiency_load
+
+    def signals(sliding):
+        return moving_signals(robot, run, State(1.5, 300.0, 300.0 / ratio * body.radius - sliding, 0.0))
+
+    def lag(sliding):
+        s = signals(sliding)
+        return float(s.acceleration - body.radius * s.acceleration_wheel)
+
+    s = signals(brentq(lag, 0.0, float(body.ground.friction.speed_static), xtol=1e-16))
+    free = (s.torque_motor - s.torque_idle) * ratio * eta / body.radius - s.torque_track_loss / body.radius - s.demand
+    turned = paper.equivalent_inertia(s.mass / 2, body.radius, robot.motor.inertia, ratio, eta, body.inertia)
+    delta = paper.mass_factor(s.mass / 2, body.radius, turned)
     assert float(delta) > 1.3  # 48 : 1 makes the rotor count
-    assert_allclose(s.acceleration, free / (m * delta), rtol=1e-9)
+    assert_allclose(s.acceleration, free / (s.mass / 2 * delta), rtol=1e-9)
 
 
 def test_total_mass_stated_overrides_robot_and_payload(robot):

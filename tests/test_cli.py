@@ -125,7 +125,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
         return honest(compiled, values, *told)
 
     monkeypatch.setattr(Compiled, "__call__", interrupted)
-    ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resumes the sweep after its last complete chunk", code=130)
+    ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resume after the last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
     kept = len(list((tmp_path / "s.partial/chunks").glob("*.stage")))
     assert 0 < kept <= 3
@@ -307,9 +307,7 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
 
     monkeypatch.setattr(Compiled, "__call__", short)
     code, _, err = mmrjax(command, "--no-report", "--out", "x")
-    assert code == 2 and err.endswith(
-        "mmrjax: out of memory; use fewer points at a time (--chunk), fewer rows, or more memory\n"
-    )
+    assert code == 2 and err.endswith("mmrjax: out of memory; use a smaller --chunk, fewer rows, or more memory\n")
     assert "Traceback" not in err and not any(tmp_path.iterdir())
 
 
@@ -342,7 +340,7 @@ def test_an_effects_file_cannot_end_the_command_as_if_it_were_done(mmrjax, tmp_p
         raise SystemExit(0)
 
     monkeypatch.setattr(Compiled, "__call__", later)
-    ends(mmrjax("simulate --no-report --out x"), "the code in an effects file ended the program")
+    ends(mmrjax("simulate --no-report --out x"), "a file's code ended the program")
     assert [p.name for p in tmp_path.iterdir()] == ["own.py"]
 
 

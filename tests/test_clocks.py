@@ -143,8 +143,9 @@ def test_each_reading_of_a_slow_sensor_is_used_once():
 
 
 def test_repeats_are_reported_and_weigh_nothing(robot):
-    found = read_runs(frame(time_s=TABLE["t"], motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot)
+    slow = held(TABLE["rpm"][::10], 10)
+    found = read_runs(frame(time_s=TABLE["t"], motor_speed_rpm=slow), robot)
     assert any("motor_speed_rpm repeats each reading in 10 rows" in note for note in found.notes)
     assert np.isfinite(found["motor_speed_rpm"]).sum() == 20 and np.isfinite(found["total_current_A"]).all()
-    settled = read_runs(frame(motor_speed_rpm=held(TABLE["rpm"][::10], 10)), robot)  # without time they are runs
+    settled = read_runs(frame(motor_speed_rpm=slow), robot)  # without time they are runs
     assert np.isfinite(settled["motor_speed_rpm"]).all()

@@ -1,4 +1,4 @@
-"""Derivatives of a step of the track model, written by hand, against those of what is computed."""
+"""Derivatives of a step of the track model through linearised sums, against those of what is computed."""
 
 from dataclasses import replace
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import read_robot, write_robot
-from calibration.inference.bases import BALANCES, OF_TURNS, VARIABLES, curve_families, window_families
+from calibration.inference.bases import BALANCES, OF_TURNS, VARIABLES, CurveScope, curve_families, window_families
 from mmrjax import effects
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive
@@ -149,7 +149,8 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     columns |= {"configuration": np.repeat("6T2A", 18), "slope_deg": np.zeros(18), "payload_kg": np.zeros(18)}
     ways = dict.fromkeys(curve.WAYS, np.repeat([1.0, -1.0], 9))
     for looked in (curve_families, window_families):
-        (basis,) = (b for b in looked(columns, np.ones(18), robot, None, ways) if b.places[0] in curve.READINGS)
+        scope = CurveScope.of(robot, columns)
+        (basis,) = (b for b in looked(columns, np.ones(18), ways, scope) if b.places[0] in curve.READINGS)
         for (place, _), shapes in zip(basis.names, np.asarray(basis.columns), strict=True):
             assert_allclose(shapes[:9], (1 if place == "motor_current" else -1) * shapes[9:])
 
@@ -178,7 +179,8 @@ def test_curves_are_those_that_the_trace_looks_for():
     )
     columns = {name: np.arange(9.0) for name in ("order", "total_current_A", "motor_speed_rpm")}
     columns |= {"configuration": np.repeat("bench", 9), "supply_voltage_V": np.tile([6.0, 12.0, 24.0], 3)}
-    (basis,) = (b for b in curve_families(columns, np.ones(9), robot) if b.places[0] in curve.READINGS)
+    ways, scope = dict.fromkeys(curve.WAYS, np.ones(9)), CurveScope.of(robot, columns)
+    (basis,) = (b for b in curve_families(columns, np.ones(9), ways, scope) if b.places[0] in curve.READINGS)
     assert set(basis.names) == {("output_torque", "order"), ("output_torque", "current"), ("position", "order")}
     assert all(f"curve_{place}_{over}" in UNNAMED for place, over in basis.names)
 

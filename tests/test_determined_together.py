@@ -22,29 +22,24 @@ def posterior(correlation, kinds, spread=(1.0, 1.0), value=(3.0, 5.0)):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "correlation, kinds, spread, form, weight",
-    [
-        (0.99, (LOG, LOG), (0.1, 0.1), "ratio", -3 / 5),
-        (-0.99, (LOG, LOG), (0.1, 0.11), "product", 3 / 5 / 1.1),
-        (0.99, (LOG, LOG), (0.2, 0.1), "linear", -2 * 3 / 5),
-        (-0.999, (NORMAL, NORMAL), (0.1, 0.4), "linear", 0.25),
-    ],
-)
+@pytest.mark.parametrize("correlation, kinds, spread, form, weight", [
+    (0.99, (LOG, LOG), (0.1, 0.1), "ratio", -3 / 5),
+    (-0.99, (LOG, LOG), (0.1, 0.11), "product", 3 / 5 / 1.1),
+    (0.99, (LOG, LOG), (0.2, 0.1), "linear", -2 * 3 / 5),
+    (-0.999, (NORMAL, NORMAL), (0.1, 0.4), "linear", 0.25),
+])  # fmt: skip
 def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread, form, weight):
     found = posterior(correlation, kinds, spread)
     (pair,) = determined_together(found)
     assert (pair.one, pair.other, pair.form) == ("a", "b", form) and pair.weight == pytest.approx(weight)
-    z = default_rng(1).standard_normal((4000, 3)) @ found.root.T * 0.1
-    a, b, _ = found.at(z).T
-    combined = {"ratio": np.log(a / b), "product": np.log(a * b), "linear": a + pair.weight * b}[form]
-    alone = a if form == "linear" else np.log(a)
+    a, b, _ = found.at(default_rng(1).standard_normal((4000, 3)) @ found.root.T * 0.1).T
+    combined, alone = a + pair.weight * b, a
+    if form != "linear":
+        alone = np.log(a)
+        combined = alone + np.log(b) * {"ratio": -1, "product": 1}[form]
     assert np.std(combined) < 0.2 * np.std(alone)
-    assert [describe(Determination.from_pairs(n, False, (pair,))) for n in "abc"] == [
-        "only with b",
-        "only with a",
-        "yes",
-    ]
+    determined = [describe(Determination.from_pairs(n, False, (pair,))) for n in "abc"]
+    assert determined == ["only with b", "only with a", "yes"]
 
 
 def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():

@@ -31,23 +31,30 @@ def names(answer):
 
 def test_rates_match_reference_at_random_states(robot, grid):
     """Backwards, braking, spinning, at rest, on battery: the ODE itself to 1e-9 of its largest terms."""
-    rng, n = default_rng(2), 400
-    wheeled, slope, payload, volts = grid[rng.integers(0, len(grid), n)].T
+    rng = default_rng(2)
+    n = 400
+    rows = grid[rng.integers(0, len(grid), n)]
     states = rng.uniform((-8, -1300, -1.3, 0), (50, 1300, 1.3, 7000), (n, 4)) * rng.choice([0, 1e-3, 1], (n, 1))
     on_battery = rng.integers(0, 2, n)
-    slope = np.radians(slope) * rng.choice([-1, 1], n)
-    runs = Conditions(wheeled, volts, np.degrees(slope), payload, battery=on_battery)
+    slopes = np.radians(rows[:, 1]) * rng.choice([-1, 1], n)
+    runs = Conditions(
+        voltage=rows[:, 3],
+        slope_deg=np.degrees(slopes),
+        payload=rows[:, 2],
+        configuration=rows[:, 0],
+        battery=on_battery,
+    )
     moving = jax.jit(jax.vmap(moving_signals, in_axes=(None, 0, 0)))
     s = moving(robot, runs, State(*jnp.asarray(states.T), distance=jnp.zeros(n)))
-    rates = np.stack([s.voltage_left / 0.000119, s.acceleration_wheel * 48.0, s.acceleration], -1)
-    expected = np.array([
-        paper.Side(u, a, p, bool(k), bool(b)).rates(0.0, [current, w, speed, 0.0, charge])[:3]
-        for u, a, p, k, b, (current, w, speed, charge) in zip(volts, slope, payload, wheeled, on_battery, states, strict=True)
-    ])  # fmt: skip
-    largest = (np.abs(s.voltage) + np.abs(0.611 * states[:, 0]) + np.abs(0.0259 * states[:, 1])) / 0.000119
-    assert (np.abs(rates[:, 0] - expected[:, 0]) < 1e-9 * largest + 1e-7 * np.abs(expected[:, 0])).all()
-    assert_allclose(rates[:, 1], expected[:, 1], rtol=1e-9, atol=1e-7)
-    assert_allclose(rates[:, 2], expected[:, 2], rtol=1e-9, atol=1e-9)
+    inductance, ratio = 0.000119, 48.0
+    for k in range(n):
+        side = paper.Side(rows[k, 3], slopes[k], rows[k, 2], bool(rows[k, 0]), bool(on_battery[k]))
+        current, w, speed, charge = states[k]
+        expected = side.rates(0.0, [current, w, speed, 0.0, charge])
+        volts = abs(float(s.voltage[k])) + abs(0.611 * current) + abs(0.0259 * w)
+        assert_allclose(s.voltage_left[k] / inductance, expected[0], atol=1e-9 * volts / inductance)
+        assert_allclose(s.acceleration_wheel[k] * ratio, expected[1], rtol=1e-9, atol=1e-7)
+        assert_allclose(s.acceleration[k], expected[2], rtol=1e-9, atol=1e-9)
     assert_allclose(s.total_current, 2 * states[:, 0], rtol=1e-15)
 
 

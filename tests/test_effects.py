@@ -137,22 +137,15 @@ def random_states(n=400):
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
     moving = jax.jit(jax.vmap(moving_signals, in_axes=(None, 0, 0)))
-    straight = moving(
-        NOMINAL,
-        run,
-        State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n)),
-    )
+    state = State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n))
     turn = rng.uniform(-4, 4, n)
-    lateral = -np.sign(turn) * rng.uniform(0, 5, n)  # against the turn
+    way = np.sign(turn)
+    lateral = -way * rng.uniform(0, 5, n)  # against the turn
+    pause, side, command = rng.uniform(0, 1, n), rng.choice((-1.0, 1.0), n), default_rng(13).uniform(-1, 1, n)
     return dataclasses.replace(
-        straight,
-        pause=rng.uniform(0, 1, n),
-        command=default_rng(13).uniform(-1, 1, n),
-        side=rng.choice((-1.0, 1.0), n),
-        yaw_rate=turn,
-        direction_turn=np.sign(turn),
+        moving(NOMINAL, run, state), pause=pause, command=command, side=side, yaw_rate=turn, direction_turn=way,
         moment_lateral=lateral,
-    )
+    )  # fmt: skip
 
 
 STATES = random_states()

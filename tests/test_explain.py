@@ -56,7 +56,7 @@ def test_a_typical_size_is_simulated():
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._change_sentences(BY_NAME["series_resistance"]()))
     assert len(changes) == 2 and changes[0].startswith(
-        "change of the readings at its typical size (6T2A, 24 V, 5°, 3 kg): total current -"
+        "change at its typical size (6T2A, 24 V, 5°, 3 kg): total current -"
     )
     assert "motor speed -3.3 %" in changes[0]
     assert list(explain._change_sentences(BY_NAME["armature_inductance"]())) == []

@@ -28,9 +28,9 @@ from sweeps.report.terminal_renderer import print_document
 def linear(jacobian):
     """The linear analysis of readings with this whitened Jacobian, priors of sd 1."""
     readings, parameters = jacobian.shape
-    posed = SimpleNamespace(coordinates=SimpleNamespace(names=tuple(f"p{k}" for k in range(parameters))))
     data = SimpleNamespace(measured=np.zeros((readings, 1)))
-    return identifiability.analyse_identifiability(posed, np.zeros(parameters), data, slope=jacobian)
+    posed = SimpleNamespace(coordinates=SimpleNamespace(names=tuple(f"p{k}" for k in range(parameters))), data=data)
+    return identifiability.analyse_identifiability(posed, np.zeros(parameters), slope=jacobian)
 
 
 def posterior_sd(jacobian):

@@ -14,6 +14,7 @@ from calibration.discovery.loop_input import remove_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun
+from mmrjax.model.channels import channels_named
 from sweeps.pages import comparison_figures
 from tests.commands import read_rig, read_table
 
@@ -159,19 +160,19 @@ def test_counts_of_numpy_are_counts(count):
     assert count_noun(count, "row") == f"{int(count)} row" + ("" if int(count) == 1 else "s")
 
 
-@pytest.mark.parametrize("column", ["motor_current_A", "motor_speed_rpm", None])
-def test_errors_are_drawn_over_what_is_imposed_or_the_rows(tmp_path, column):
-    robot = bench(tmp_path)
-    shown = robot.channels
+@pytest.mark.parametrize("column, label, shown", [
+    ("motor_current_A", "motor current [A]", ["output_speed"]),
+    ("motor_speed_rpm", "motor speed [rpm]", ["motor_current", "output_speed"]),
+    (None, "row", ["motor_current", "output_speed"]),
+])  # fmt: skip
+def test_errors_are_drawn_over_what_is_imposed_or_the_rows(column, label, shown):
     rows = {"configuration": np.repeat("shaft", 3)} | ({} if column is None else {column: np.arange(3.0)})
+    shown = channels_named(shown)
     for channel in shown:
         rows |= {channel.column: np.ones(3), f"simulated_{channel.column}": np.full(3, 1.1)}
         rows[f"error_{channel.name}_percent"] = np.full(3, 10.0)
-    rows.pop("simulated_motor_current_A" if column == "motor_current_A" else "", None)
-    shown = tuple(c for c in shown if f"simulated_{c.column}" in rows)
     fig = comparison_figures.draw_errors_over_conditions(rows, shown)
-    words = {"motor_current_A": "motor current [A]", "motor_speed_rpm": "motor speed [rpm]", None: "row"}
-    assert fig.axes[-1].get_xlabel() == words[column]
+    assert fig.axes[-1].get_xlabel() == label
 
 
 def test_echoes_of_input_are_short():

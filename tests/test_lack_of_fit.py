@@ -101,7 +101,7 @@ def test_noise_that_is_larger_than_stated_is_not_adequate():
 
 def test_replicates_tell_what_the_noise_is():
     made = toy(default_rng(4), missing=1.5, repeats=2)
-    found = _replicate_test(made)
+    (found,) = _replicate_test(made)
     assert found[0] < 0.01 and found[1] == AdequacyFinding(what="repeats")
     clean = toy(default_rng(5), repeats=2)
     assert judged(clean, estimated=True).adequate

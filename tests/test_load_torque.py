@@ -19,6 +19,7 @@ from calibration.data.rig_facts import doubtful_torque, log_doubts
 from calibration.inference import bases
 from calibration.inference.blocks import distinct_held_out_blocks, kind_in_words
 from calibration.inference.observers import Histories, SettledRuns
+from mmrjax.effects.curve import WAYS
 from mmrjax.errors import UsageError
 from mmrjax.fidelities import rest
 from mmrjax.fidelities.drive import drive_batch
@@ -243,7 +244,8 @@ def test_a_drift_that_goes_with_the_torque_is_none(torque):
         "configuration": np.full(18, "brake"), "order": np.arange(18.0), "supply_voltage_V": np.full(18, 24.0),
         "total_current_A": np.linspace(0, 9, 18), **torque,
     }  # fmt: skip
-    over = {variable for _, variable in bases.family_names(bases.curve_families(columns, np.ones(18), bench()))}
+    ways, scope = dict.fromkeys(WAYS, np.ones(18)), bases.CurveScope.of(bench(), columns)
+    over = {variable for _, variable in bases.family_names(bases.curve_families(columns, np.ones(18), ways, scope))}
     assert ("order" in over) != bool(torque)
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,11 +16,11 @@ from calibration.inference import identifiability, noise, observers, population,
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import ReachedBound, Remark
 from calibration.inference.observers.settled import SettledRuns
-from calibration.inference.population import MemberObservations
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
 from sweeps.store import RunFolder
+from tests.commands import refused
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -57,16 +58,14 @@ def posed(runs, truth, known):
     robot = paper_robots.nominal()
     problem = observers.pose_problem(runs, robot, priors.parameter_coordinates(robot, NAMES), known.sd)
     reading = problem.observation(jnp.asarray(truth)).reading
-    return dataclasses.replace(
-        problem, data=dataclasses.replace(problem.data, measured=reading, centre=jnp.asarray(truth))
-    )
+    return problem.with_data(measured=reading, centre=jnp.asarray(truth))
 
 
 def evolve(posed, known, generations=30, seed=3, keep=lambda name, make: make()):
     size = len(NAMES)
     return population.run_evolution(
         posed, population.member_objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
-        generations=generations, keep=keep,
+        generations=generations, beside=np.empty((0, size)), tell=lambda step: None, keep=keep,
     )  # fmt: skip
 
 
@@ -94,9 +93,9 @@ def test_same_seed_same_members_and_another_seed_others(posed, known, found):
 
 @pytest.mark.slow
 def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
-    rows = MemberObservations(found.reading[:3], found.adhesion_used[:3], found.status[:3], found.flags[:3])
+    rows = jax.tree.map(lambda x: x[:3], found.seen)
     for z, cost in zip(found.z[:3], population.member_objective(posed, known)(found.z[:3], rows), strict=True):
-        readings = np.asarray(posed.misfit(jnp.asarray(z), posed.data))[: posed.data.measured.size]
+        readings = np.asarray(posed.misfit(jnp.asarray(z)))[: posed.data.measured.size]
         lost = np.isin(np.asarray(posed.observation(jnp.asarray(z)).status), (2, 3, 4))
         if not lost.any():
             expected = 0.5 * (np.sum(readings**2) + np.sum((z - np.asarray(posed.data.centre)) ** 2))
@@ -108,21 +107,19 @@ def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, run
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
     unknown = noise.noise_from_table(runs, SettledRuns.sizes(runs))
     worst = found.order[-2:]  # far above the least share that is taken for noise
-    rows = MemberObservations(
-        found.reading[worst], found.adhesion_used[worst], found.status[worst], found.flags[worst]
-    )
+    rows = jax.tree.map(lambda x: x[worst], found.seen)
     costs = population.member_objective(posed, unknown)(found.z[worst], rows)
     size, measured = SettledRuns.sizes(runs), np.asarray(posed.data.measured)
 
     def at(k, share):
         """Of each channel, at a share for its noise."""
-        error = (found.reading[k] - measured) / size / share
+        error = (found.seen.reading[k] - measured) / size / share
         return 0.5 * np.sum(error**2, axis=0) + len(size) * np.log(share)
 
     best = [
         np.min([at(k, share) for share in GRID], axis=0).sum()
         + 0.5 * np.sum((found.z[k] - np.asarray(posed.data.centre)) ** 2)
-        + population.LOST * np.isin(found.status[k], (2, 3, 4)).sum()
+        + population.LOST * np.isin(found.seen.status[k], (2, 3, 4)).sum()
         for k in worst
     ]
     assert costs[1] - costs[0] == pytest.approx(best[1] - best[0], abs=0.1)
@@ -133,13 +130,13 @@ GRID = np.geomspace(1.2e-3, 1.0, 80)
 
 @pytest.mark.slow
 def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(posed, known, found):
-    status = found.status[:1].copy()
+    status = found.seen.status[:1].copy()
     status[0, 0] = 2
-    reached = MemberObservations(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status), found.flags[:1])
-    lost = reached._replace(status=status)
+    reached = dataclasses.replace(jax.tree.map(lambda x: x[:1], found.seen), status=np.zeros_like(status))
+    lost = dataclasses.replace(reached, status=status)
     cost = population.member_objective(posed, known)
     assert cost(found.z[:1], lost) - cost(found.z[:1], reached) == pytest.approx(population.LOST)
-    broken = reached._replace(reading=np.full_like(reached.reading, np.nan))
+    broken = dataclasses.replace(reached, reading=np.full_like(reached.reading, np.nan))
     assert np.isinf(cost(found.z[:1], broken))
 
 
@@ -214,11 +211,11 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
 @pytest.mark.slow
 def test_what_members_did_is_counted_and_said(found):
     at = int(found.order[0])
-    status, flags = np.zeros_like(found.status), np.zeros_like(found.flags)
+    status, flags = np.zeros_like(found.seen.status), np.zeros_like(found.seen.flags)
     status[:3, 0], status[3, 1], status[4:6, 0] = TIPS, FAILED, SLIDES
     flags[[at, 7], 1] = 1 << FLAGS.index("jumps")
     told = population.PopulationSearch(
-        dataclasses.replace(found, status=status, flags=flags),
+        dataclasses.replace(found, seen=dataclasses.replace(found.seen, status=status, flags=flags)),
         at,
         (),
         None,
@@ -242,13 +239,13 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, 
 
     monkeypatch.setattr(population, "_observe_points", broken)
     name = "6T2A.ground.rolling_resistance"
-    with pytest.raises(BadConfiguration, match=r"none of \d+ members runs in every row .*: \d+ tips"):
+    with refused(r"none of \d+ members runs in every row .*: \d+ tips", BadConfiguration):
         calibrate(runs, robot, model="drive", free=(name,), population=4, generations=1)
 
 
 @pytest.mark.quick(1)
 @pytest.mark.parametrize(
-    ("options", "says"),
+    "options, says",
     [
         (dict(generations=3), "--generations: has an effect only with --population"),
         (dict(population=50), "a population search needs settled rows and --model drive or track"),
@@ -257,7 +254,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, 
     ],
 )
 def test_options_of_a_population_that_cannot_be_are_refused(options, says, robot):
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         calibrate(records.read_runs("measured"), robot, **options)
 
 

@@ -1,7 +1,5 @@
 """Noise as repeats in a table show it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -10,10 +8,11 @@ from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
 from calibration.discovery import result_remarks
-from calibration.inference import noise, repeats
+from calibration.inference import noise
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers import SettledRuns
 from calibration.inference.preparation import prepare_input
+from tests.commands import with_columns
 
 
 def table(sd, times=4, seed=0):
@@ -33,7 +32,7 @@ def table(sd, times=4, seed=0):
 
 def enlarged(runs, stated):
     known = noise.noise_from_table(runs, SettledRuns.sizes(runs), stated)
-    return known, *repeats.enlarge_noise(known, runs)
+    return known, *noise.enlarge_noise(known, runs)
 
 
 def test_noise_that_repeats_contradict_is_enlarged():
@@ -53,7 +52,7 @@ def test_one_wrong_reading_does_not_enlarge_the_noise():
     runs = table(0.02)
     current = runs["total_current_A"].copy()
     current[5] += 2.0
-    wrong = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
+    wrong = with_columns(runs, total_current_A=current)
     assert enlarged(wrong, "current=0.02A,motor_speed=0.5%")[2] == []
     assert enlarged(table(0.2, times=1), "current=0.02A,motor_speed=0.5%")[2] == []
 
@@ -63,7 +62,7 @@ def test_the_probability_of_a_median_is_right(count):
     magnitudes = np.abs(np.random.default_rng(0).standard_normal((40_000, count)))
     # Of an even number the larger of the two in the middle is below half of them.
     share = np.mean(np.sort(magnitudes, 1)[:, count // 2] > 1.2)
-    least = repeats._median_tail(1.2, count)
+    least = noise._median_tail(1.2, count)
     assert least >= share - 0.01 and (count % 2 == 0 or least == pytest.approx(share, abs=0.01))
 
 
@@ -75,7 +74,7 @@ def test_every_command_takes_the_larger_noise():
 
 
 @pytest.mark.parametrize(
-    ("levels", "here", "beside"),
+    "levels, here, beside",
     [
         ([-0.40216, -0.40214, -0.2, 0.3], -0.40216, (-0.5, -0.3)),  # the same level as measured is no neighbour
         ([12.0, 18.0, 24.0], 18.0, (15.0, 21.0)),

@@ -62,10 +62,10 @@ def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
     robot, runs = coarse
     problem = posed(robot, runs)
     only = dataclasses.replace(problem, coordinates=priors.parameter_coordinates(robot, ("rig.delay",)))
-    only = dataclasses.replace(only, data=dataclasses.replace(only.data, centre=only.data.centre[:1]))
+    only = only.with_data(centre=only.data.centre[:1])
     at = np.array([-0.5, 0.3, 1.1, 1.6])
-    cost, others = only.observe.scan(only, np.zeros(1), only.data, 0, at)
-    alone = [0.5 * np.sum(np.asarray(evaluate_residuals(only, z, only.data)) ** 2) for z in at[:, None]]
+    cost, others = only.observe.scan(only, np.zeros(1), 0, at)
+    alone = [0.5 * np.sum(np.asarray(evaluate_residuals(only, z)) ** 2) for z in at[:, None]]
     assert_allclose(cost, alone, rtol=1e-9)
     assert_array_equal(np.asarray(others)[:, 0], at)
 
@@ -128,7 +128,7 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
             steps=np.full(3, 30),
         ), None
 
-    monkeypatch.setattr(time_histories, "search_rollouts", ended)
+    monkeypatch.setattr(time_histories.optimizers, "search_rollouts", ended)
     monkeypatch.setattr(time_histories, "_parallel_evaluator", lambda *_: None)
     observer = SimpleNamespace(policy=SimpleNamespace(steps=30, batch=8))
     search = functools.partial(time_histories.Histories.search, observer, SimpleNamespace(data=None))
@@ -145,11 +145,11 @@ def test_a_scan_sees_a_minimum_that_no_point_of_its_grid_is_in():
     """A stiff joint's: 0.01 prior sds wide where points are 0.27 apart, and a slope beyond it. z is the minimum."""
     at, width = -0.764, 0.01
 
-    def scan(problem, z, data, k, values):
+    def scan(problem, z, k, values):
         x = np.asarray(values)
         cost = np.minimum(0.5 * ((x - at) / width) ** 2, 800.0 + 100.0 * x)
         return cost, np.stack([x, np.zeros_like(x)], 1)
 
     problem = SimpleNamespace(observe=SimpleNamespace(number_of_scan_points=lambda problem, k: 32, scan=scan))
-    low, high = scans.scan_coordinate(problem, np.array([at, 0.0]), None, 0).interval()
+    low, high = scans.scan_coordinate(problem, np.array([at, 0.0]), 0).interval()
     assert_allclose([low, high], [at - Z95 * width, at + Z95 * width], atol=0.2 * width)

@@ -1,5 +1,6 @@
 """Stages in files: what is read is what was written, to the bit, and no file runs code or names what it may not."""
 
+import contextlib
 import dataclasses
 import os
 import pickle
@@ -112,7 +113,8 @@ def call(name, *arguments):
 
 FORGED = {
     "a pickle": pickle.dumps(Harm()),
-    "an array of objects": None,
+    "an array of objects": pickle.dumps(np.array([Harm()], object)),
+    "an array of JAX around a function": call("jax._src.array._reconstruct_array", "os", "2", "3", "4"),
     "a function of the system": call("os.system", "touch harmed"),
     "a function of ours that is no setup": call("calibration.data.writing.write_text", "harmed", "x"),
     "a class of another package": call("subprocess.Popen", "touch harmed"),
@@ -125,7 +127,7 @@ FORGED = {
     "a field that there is not": call(
         "calibration.inference.noise.Noise", "1", "2", "3", "4", "5", "6", "7", "8", "9"
     ),
-    "an array that there is not": b"P7\n.",
+    "an object that there is not": b"P7\n.",
     "no kind": b"nonsense",
 }
 
@@ -136,12 +138,7 @@ def test_a_forged_stage_runs_nothing_and_is_made_again(tmp_path, monkeypatch, ca
     with RunFolder(tmp_path / "x", {"command": "loop"}) as folder:
         folder.stage("base", lambda: 1)
         file = folder.partial / "chunks/base.stage"
-        if what == "a pickle":
-            file.write_bytes(FORGED[what])
-        else:
-            forged = np.array([Harm()], object) if FORGED[what] is None else np.frombuffer(FORGED[what], np.uint8)
-            np.savez(file.with_suffix(".npz"), pickle=forged)
-            file.with_suffix(".npz").replace(file)
+        file.write_bytes(stage_files.sealed(FORGED[what]))
         assert folder.stage("base", lambda: "anew") == "anew"
         assert folder.stage("base", lambda: "no more") == "anew"
     assert not (tmp_path / "harmed").exists() and "this" not in sys.modules
@@ -180,10 +177,6 @@ def test_effects_are_those_of_the_file_that_is_read_and_not_of_bytes_beside_it(t
     )
     assert os.path.exists(importlib.util.cache_from_source(str(file)))
     file.write_text(OWN)
-    before = os.getcwd()
-    os.chdir(tmp_path)
-    try:
+    with contextlib.chdir(tmp_path):
         (mine,) = effect_file.read_effect_file(file)
-    finally:
-        os.chdir(before)
     assert mine.name == "mine" and not (tmp_path / "harmed").exists()

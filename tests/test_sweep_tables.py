@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data.posterior_file import NORMAL, Posterior
 from calibration.data.runs import Runs
 from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
@@ -15,8 +14,8 @@ from sweeps import config
 from sweeps.points import run, scale
 from sweeps.points.sampled_design import DrawnSamples
 from sweeps.store import RunFolder
+from tests.test_sweep_posterior import NAMES, correlated_posterior
 
-NAMES = ("motor.resistance", "motor.friction_coulomb")
 DRAWS = 12
 
 
@@ -31,13 +30,8 @@ def runs(robot):
 
 
 @pytest.fixture(scope="module")
-def posterior(robot):
-    value = {p.name: float(p.value) for p in params.walk_parameters(robot)}
-    centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
-    return Posterior(
-        coordinates=NAMES, units=("ohm", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
-        spread=0.05 * centre, low=0.1 * centre, high=10 * centre, softness=none, kinds=(NORMAL,) * 2,
-    )  # fmt: skip
+def posterior():
+    return correlated_posterior()
 
 
 def chunked(chunk):
@@ -80,10 +74,10 @@ def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, po
         for theta in posterior.draw(DRAWS, run.SEED)
     ]
     speeds = np.array([table["speed_mm_s"] for table in each])
-    assert_allclose(found.sd("speed_mm_s")[:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
+    assert_allclose(found["speed_mm_s_sd"][:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
     low = np.quantile(speeds[:, :3], run.QUANTILES[0], axis=0)
-    assert_allclose(found.columns["speed_mm_s_lower"][:3], low, rtol=1e-12)
-    assert found.columns[run.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found.sd("speed_mm_s")[3])
+    assert_allclose(found["speed_mm_s_lower"][:3], low, rtol=1e-12)
+    assert found[run.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found["speed_mm_s_sd"][3])
 
 
 @pytest.mark.slow
@@ -91,7 +85,7 @@ def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
     """Of a run all draws in one chunk, some runs in each, and a run's draws in three."""
     whole = run.simulate_draws(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
     parted = run.simulate_draws(robot, posterior, runs, chunked(4), DRAWS)
-    same(whole.columns, parted.columns, rtol=1e-9)
+    same(whole, parted, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -112,11 +106,11 @@ def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkey
     assert kept <= 2
     computed.clear()
     monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
-    same(run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder).columns, whole.columns)
+    same(run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder), whole)
     assert len(computed) == 4 - kept
     again = run.simulate_draws(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
     assert len(computed) == 4 - kept  # nothing is left to do
-    same(again.columns, whole.columns)
+    same(again, whole)
     folder.close()
 
 

@@ -12,7 +12,7 @@ from worlds.settled import remainder
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import bases, noise, observers, ranges
-from calibration.inference.observers.time_histories import _common_length
+from calibration.inference.observers.run_grids import _common_length
 from calibration.inference.ranges import check_ranges
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
@@ -76,19 +76,17 @@ def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
 
 
 @pytest.mark.slow
-def test_the_current_of_an_imposed_speed_is_that_of_the_motion_at_its_row(tmp_path):
-    """The speed is smooth between its rows. With slopes of lines from row to row it was off by 2.5 times its noise."""
-    case = logs.case(logs.rig(np.random.default_rng([3, 2]), "motor_speed", 0.02), "", 0.0, 1)
+@pytest.mark.parametrize(
+    "seed, imposed, every, share",
+    [
+        ([3, 2], "motor_speed", 0.02, 2),  # smooth between its rows: slopes of lines were off by 2.5 times the noise
+        ([41, 0, 1], "motor_current", 0.005, 3),  # with reversals: steps of 2.5 ms were off by 0.49 of the noise
+    ],
+)
+def test_motion_between_the_rows_of_a_log_is_followed_within_its_noise(tmp_path, seed, imposed, every, share):
+    case = logs.case(logs.rig(np.random.default_rng(seed), imposed, every), "", 0.0, 1)
     clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p])[0])
-    assert np.sqrt(np.mean((shown(tmp_path, case)[0] - clean) ** 2)) < ERROR / 2
-
-
-@pytest.mark.slow
-def test_reversals_of_a_log_are_followed_within_its_noise(tmp_path):
-    case = logs.case(logs.rig(np.random.default_rng([41, 0, 1]), "motor_current", 0.005), "", 0.0, 1)
-    clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p])[0])
-    # Steps of 2.5 ms were off by 0.49 and made the loop find what was not there.
-    assert np.sqrt(np.mean((shown(tmp_path, case)[0] - clean) ** 2)) < ERROR / 3
+    assert np.sqrt(np.mean((shown(tmp_path, case)[0] - clean) ** 2)) < ERROR / share
 
 
 def test_a_speed_that_still_rises_is_no_matter_of_units(tmp_path, monkeypatch):
@@ -110,7 +108,8 @@ def test_logs_of_about_one_length_share_what_is_compiled():
     assert len({long for long in lengths if 2048 <= long < 4096}) == 8
     rows = np.arange(200)[None]
     slow, fast = (
-        bases.wave_families(np.zeros(200, bool), np.linspace(0, 2 * np.pi * n, 200), rows, rows) for n in (30.0, 60.0)
+        bases.wave_families(np.zeros(200, bool), np.linspace(0, 2 * np.pi * n, 200), rows, rows, bases.BALANCES)
+        for n in (30.0, 60.0)
     )
     resolved = [set(v for _, v in bases.family_names(b)) for b in (slow, fast)]
     assert resolved[1] < resolved[0] and slow[0].columns.shape == fast[0].columns.shape

@@ -16,7 +16,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit
 from calibration.discovery.settings import Settings
-from calibration.inference.held_out import fit_from_each_start
+from calibration.inference.blocks import fit_from_each_start
 from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.time_histories import HistoriesLinearization
 from mmrjax.compile.compiling import SELDOM, compiled

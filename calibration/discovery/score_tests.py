@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.discovery.projection import ABSORBED
 from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.optimizers import CORES, with_solved_rows
@@ -26,8 +27,6 @@ from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, Threads, compiled
 from mmrjax.numerics.linear_equations import solve_lower
 
-#: Share of a signature's norm below which the free parameters absorb it completely.
-ABSORBED = 1e-3
 #: Largest predicted decrease of the objective [½σ²] for a refit's statistics to count.
 UNSETTLED = 0.05
 #: Prior sd of a curve's columns in a fit with the free parameters [σ]: wide, but it keeps their rank.
@@ -201,7 +200,7 @@ def diagnose_fit(
         residual, jacobian, _ = problem.observe.at(problem, z)
         linear = dataclasses.replace(near, residual=residual, jacobian=jacobian)
     elif problem.observe.over_time:  # by separate programs
-        linear = problem.observe.linearise(problem, z, problem.data, effects)
+        linear = problem.observe.linearise(problem, z, effects)
     else:
         linear = _linearised(with_solved_rows(problem, z), z, effects)
     return linear, *_padded_scores(linear, bases)
@@ -209,7 +208,7 @@ def diagnose_fit(
 
 @functools.partial(compiled, options=SELDOM)
 def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
-    return problem.observe.linearise(problem, z, problem.data, effects)
+    return problem.observe.linearise(problem, z, effects)
 
 
 def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, StrongestStatistics]:
@@ -354,7 +353,7 @@ def _replicate_batch(
     """Statistics of one batch of bootstrap replicates."""
 
     def statistics_of_replicate(drawn: Any) -> StrongestStatistics:
-        replicate = problem.observe.fit_replicate(problem, problem.data, effects, linear, drawn)
+        replicate = problem.observe.fit_replicate(problem, effects, linear, drawn)
         return strongest_statistics(score_tests(replicate, bases), replicate)
 
     return jax.vmap(statistics_of_replicate)(drawn)

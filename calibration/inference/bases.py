@@ -18,10 +18,9 @@ from numpy.polynomial import legendre
 from calibration.data import Columns, Names
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
-from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, direction_signal, in_travel_frame, sign_factor
+from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, direction_signal, in_travel_frame, sign_factor
 from mmrjax.model import channels
 from mmrjax.model.balances import absent_balances
-from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 
 T = TypeVar("T")
@@ -158,39 +157,36 @@ def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
-def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
-    """Balances of `among` that a robot has. None: all of them."""
-    if robot is None:
-        return tuple(among)
+def balances_of(robot: Robot, among: Sequence[str] = BALANCES) -> Names:
+    """Balances of `among` that a robot has."""
     return tuple(b for b in among if b not in absent_balances(robot))
 
 
-def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot. None: those of the packaged robot."""
-    return Layout.of(robot).channels
-
-
-def axes_of(robot: Robot | None) -> Names:
-    """Columns of conditions over which a robot's curves are defined. None: those of the packaged robot."""
+def axes_of(robot: Robot) -> Names:
+    """Columns of conditions over which a robot's curves are defined."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
 
 @dataclasses.dataclass(frozen=True)
 class CurveScope:
-    """Balances and condition columns in which smooth curves are searched."""
+    """Balances, condition columns and channels in which smooth curves are searched.
+
+    Attributes:
+        unsigned: channels whose readings have no sign.
+    """
 
     balances: Names
     axes: Names
+    channels: Names
+    unsigned: frozenset[str]
 
     @classmethod
-    def of(cls, robot: Robot | None) -> CurveScope:
-        """All balances and conditions of a robot that travels straight. None: those of the packaged robot."""
-        return cls(balances_of(robot), axes_of(robot))
-
-    def over(self, columns: Columns) -> CurveScope:
-        """Scope that includes the brake torque among the conditions, if the table has that column."""
-        return dataclasses.replace(self, axes=(*self.axes, LOAD)) if LOAD in columns else self
+    def of(cls, robot: Robot, columns: Columns) -> CurveScope:
+        """Scope of a robot that travels straight. The brake torque is a condition if the table has that column."""
+        axes = (*axes_of(robot), *(c for c in (LOAD,) if c in columns))
+        names = channels.channel_names(robot.channels)
+        return cls(balances_of(robot), axes, names, robot.rig.magnitudes)
 
 
 #: Signals of `effects.curve.WAYS`, by point; and a balance of the shafts.
@@ -198,18 +194,12 @@ Ways = Columns
 SHAFTS = "electrical"
 
 
-def forward_directions(points: int) -> Ways:
-    """Directions for runs that always travel forward."""
-    return dict.fromkeys(WAYS, np.ones(points))
+def families_of_table(columns: Columns, weight: np.ndarray, ways: Ways, scope: CurveScope) -> Bases:
+    """Curves and windows. Arguments as in `curve_families`."""
+    return (*curve_families(columns, weight, ways, scope), *window_families(columns, weight, ways, scope))
 
 
-def curve_families(
-    columns: Columns,
-    weight: np.ndarray,
-    robot: Robot | None = None,
-    scope: CurveScope | None = None,
-    ways: Ways | None = None,
-) -> Bases:
+def curve_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: CurveScope) -> Bases:
     """Curves of one variable, and polynomials in all conditions, in each balance, and curves of each channel's error.
 
     Each configuration has its own polynomials. The error of a channel is a curve over its reading, and over time or
@@ -218,14 +208,9 @@ def curve_families(
     Args:
         columns: columns of the table, with fitted readings.
         weight: 0 for excluded rows or points (see `Linearization`), shape (rows,).
-        robot: robot whose channels and balances are used.
-        scope: balances and conditions. None: `CurveScope.of_robot`.
-        ways: direction of travel of each point, shape (rows,). None: all forward.
+        ways: direction of travel of each point, shape (rows,).
+        scope: balances, conditions and channels.
     """
-    scope = (CurveScope.of(robot) if scope is None else scope).over(columns)
-    balances = scope.balances
-    ways = forward_directions(len(weight)) if ways is None else ways
-    unsigned = robot.rig.magnitudes if robot else ()
     over: dict[str, str] = {}  # a variable, and the one that takes its place
     for variable, column in VARIABLES.items():
         if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
@@ -238,7 +223,7 @@ def curve_families(
 
     def curve(place: str, variable: str) -> np.ndarray:
         x, way = in_travel_frame(
-            place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, unsigned
+            place, variable, np.asarray(columns[VARIABLES[variable]]), ways.__getitem__, scope.unsigned
         )
         return (
             way[:, None]
@@ -246,10 +231,8 @@ def curve_families(
             * np.exp(-0.35 * np.arange(TERMS))
         )
 
-    names = [(balance, variable) for variable in over.values() for balance in balances]
-    channel_variables = [
-        (c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)
-    ]
+    names = [(balance, variable) for variable in over.values() for balance in scope.balances]
+    channel_variables = [(c, v) for c in scope.channels for v in over if v in AXES or v == READ_BY.get(c)]
     new = [n for n in channel_variables if over[n[1]] == n[1]]
     # As above: a skipped curve is replaced by another of its channel, or else by the first.
     read = (
@@ -258,8 +241,8 @@ def curve_families(
     groups = [
         (names, [curve(*n) for n in names]),
         (
-            [(b, CONDITIONS) for b in balances],
-            [condition_polynomials(columns, weight, scope, ways, b) for b in balances],
+            [(b, CONDITIONS) for b in scope.balances],
+            [condition_polynomials(columns, weight, scope, ways, b) for b in scope.balances],
         ),
         (read, [curve(*n) for n in read]),
     ]
@@ -314,25 +297,13 @@ def window_from_name(variable: str) -> Window | None:
     return None if match is None else Window(match[1], float(match[2]), float(match[3]))
 
 
-def window_families(
-    columns: Columns,
-    weight: np.ndarray,
-    robot: Robot | None = None,
-    scope: CurveScope | None = None,
-    ways: Ways | None = None,
-) -> Bases:
+def window_families(columns: Columns, weight: np.ndarray, ways: Ways, scope: CurveScope) -> Bases:
     """Windows of time or of the order of runs, and levels of conditions, in each balance and channel.
 
     Windows of time are at the same instants in all runs. They are omitted if the conditions determine time or order.
-
-    Args:
-        columns: columns of the table.
-        weight: 0 for excluded rows, shape (rows,).
-        robot, scope, ways: as in `curve_families`.
+    Arguments as in `curve_families`.
     """
     counts = weight > 0
-    scope = (CurveScope.of(robot) if scope is None else scope).over(columns)
-    ways = forward_directions(len(weight)) if ways is None else ways
     facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # also for starts from rest
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
@@ -365,23 +336,19 @@ def window_families(
         return ()
     # The first again for windows with too few or too many rows: tables of one size share compiled programs.
     shapes += shapes[:1] * (len(offered) - len(shapes))
-    read = [c.name for c in channels_of(robot)]
-    unsigned = robot.rig.magnitudes if robot else ()
     return tuple(
         Basis.of(
-            np.stack([s * sign_factor(place, ways.__getitem__, unsigned) for place in places for s, _ in shapes])[
-                :, :, None
-            ],
+            np.stack(
+                [s * sign_factor(place, ways.__getitem__, scope.unsigned) for place in places for s, _ in shapes]
+            )[:, :, None],
             [(place, name) for place in places for _, name in shapes],
         )
-        for places in (scope.balances, read)
+        for places in (scope.balances, scope.channels)
         if places
     )
 
 
-def order_collinearity(
-    columns: Columns, weight: np.ndarray, axes: Sequence[str] | None = None, column: str = "order"
-) -> float:
+def order_collinearity(columns: Columns, weight: np.ndarray, axes: Sequence[str], column: str) -> float:
     """Share of the variance of the order of runs, or of their time, that their conditions explain (R²).
 
     If it is 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a
@@ -391,7 +358,7 @@ def order_collinearity(
 
     Args:
         columns, weight: as in `curve_families`.
-        axes: columns of the conditions, None: of the packaged robot's.
+        axes: columns of the conditions.
         column: `order` or `time_s`.
     """
     counts = weight > 0
@@ -399,7 +366,7 @@ def order_collinearity(
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
     _, configuration = np.unique(np.asarray(columns["configuration"])[counts], return_inverse=True)
-    conditions = (*(axes_of(None) if axes is None else axes), *(["duty"] if "duty" in columns else []))
+    conditions = (*axes, *(["duty"] if "duty" in columns else []))
     other_conditions = [c for c in conditions if c != VARIABLES["slope"]]
     values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in other_conditions)], 1)
     _, group_index = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
@@ -427,7 +394,7 @@ def order_collinearity(
 
 
 def wave_families(
-    on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray, robot: Robot | None = None
+    on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray, balances: Names
 ) -> Bases:
     """Waves of the orders that the samples of histories resolve, in each balance.
 
@@ -440,7 +407,7 @@ def wave_families(
         angle: angle of the driving shaft [rad], shape (rows,).
         rows: indices of each run's rows in order of time, padded with -1, shape (runs, samples).
         knots: rows between which an error is linear, shape (runs, knots).
-        robot: robot whose balances are used.
+        balances: balances with waves.
     """
     bases, words = [], []
     for word, (order, belted) in ORDERS.items():
@@ -466,8 +433,7 @@ def wave_families(
     possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
     bases += bases[:1] * (possible - len(bases))
     words += words[:1] * (possible - len(words))
-    balance_waves = [(b, w) for b in balances_of(robot) for w in words]
-    return (Basis.of(np.stack(bases * len(balances_of(robot))), balance_waves),)
+    return (Basis.of(np.stack(bases * len(balances)), [(b, w) for b in balances for w in words]),)
 
 
 def family_names(bases: Bases) -> tuple[tuple[str, str], ...]:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
+import jax
 import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.clock import rows_of_varying_runs
 from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.runs import Runs
-from calibration.inference import held_out as refits
-from calibration.inference.problem import Problem
+from calibration.inference.optimizers import Optimum
+from calibration.inference.problem import Observation, Problem
 
 #: Kinds of blocks by name, with the columns that distinguish their blocks.
 BLOCKS: dict[str, Names] = {
@@ -126,15 +128,11 @@ def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Colu
     """Kind → blocks, for the kinds that the data have. A kind that divides the rows as an earlier one does is
     omitted.
     """
-    blocks: dict[str, Columns] = {}
-    divided = []
+    by_parts: dict[frozenset[bytes], tuple[str, Columns]] = {}
     for kind in kinds:
-        blocks_by_name = blocks_of_kind(runs, kind)
-        parts = {m.tobytes() for m in blocks_by_name.values()}
-        if parts not in divided:
-            divided.append(parts)
-            blocks[kind] = blocks_by_name
-    return {kind: blocks_by_name for kind, blocks_by_name in blocks.items() if blocks_by_name}
+        blocks = blocks_of_kind(runs, kind)
+        by_parts.setdefault(frozenset(m.tobytes() for m in blocks.values()), (kind, blocks))
+    return {kind: blocks for kind, blocks in by_parts.values() if blocks}
 
 
 def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
@@ -148,24 +146,17 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
     for follower, k, _ in coordinates.tied:
         informs[k].add(_configuration_of_parameter(follower, names))
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
-    kinds = {
-        kind: {
-            label: m for label, m in blocks_by_name.items() if not any(m[block_rows].all() for block_rows in owned)
-        }
-        for kind, blocks_by_name in distinct_held_out_blocks(runs, problem.observe.blocks).items()
-    }
-    return {kind: blocks_by_name for kind, blocks_by_name in kinds.items() if blocks_by_name}
+    kinds = {}
+    for kind, blocks in distinct_held_out_blocks(runs, problem.observe.blocks).items():
+        kinds[kind] = {label: m for label, m in blocks.items() if not any(m[rows].all() for rows in owned)}
+    return {kind: blocks for kind, blocks in kinds.items() if blocks}
 
 
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
-    all_blocks, predictable = (
-        distinct_held_out_blocks(runs, problem.observe.blocks),
-        predictable_blocks(runs, problem),
-    )
-    return tuple(
-        kind for kind, blocks_by_name in all_blocks.items() if len(predictable.get(kind, {})) < len(blocks_by_name)
-    )
+    predictable = predictable_blocks(runs, problem)
+    every = distinct_held_out_blocks(runs, problem.observe.blocks)
+    return tuple(kind for kind, blocks in every.items() if len(predictable.get(kind, {})) < len(blocks))
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
@@ -174,28 +165,120 @@ def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> s
     return first if first in configurations else ""
 
 
+# --- hold-out fits --------------------------------------------------------------------------------------
+
+
+def fit_from_each_start(
+    problem: Problem,
+    starts: Sequence[np.ndarray],
+    weights: Sequence[np.ndarray],
+    active: Sequence | None = None,
+    most: int | None = None,
+) -> tuple[Optimum, Observation]:
+    """Fits a problem from several starts, each with its own weights.
+
+    Args:
+        starts: coordinates of each start.
+        weights: weights of the readings for each start, shape (rows, channels).
+        active: set of effects of each start, None for a problem without slots.
+        most: largest number of steps, None for no limit.
+
+    Returns:
+        Optimum of each search and the model's observation there. The leading axis is the starts.
+    """
+    sets = None if active is None else np.stack(active)
+    return jax.device_get(problem.observe.search(problem, np.stack(starts), np.stack(weights), sets, most=most))
+
+
 @dataclasses.dataclass(frozen=True)
-class HeldOutReadings:
-    """Readings of each row, predicted by a fit without the row's block.
+class HeldOutFits:
+    """Fits without each block, and their predictions of the block.
 
     Attributes:
-        labels: labels of the blocks.
-        block: index of each row's block, shape (rows,).
-        reading: predicted readings [SI], shape (rows, channels). NaN if the fitted robot does not reach the row.
-        status: status of each row, shape (rows,).
-        z: coordinates of each block's fit, shape (blocks, parameters).
-        converged: True for each block whose fit converged.
+        reading: reading of each row, predicted by the fit without its block [SI], shape (rows, channels). NaN if no
+            block holds the row, or if the fitted robot does not reach it.
+        status: status of each row, -1 if no block holds it.
+        block: index of each row's block, -1 for none, shape (rows,).
+        z: coordinates of each block's fit, shape (blocks, coordinates).
+        converged: True for each block whose fit is an optimum.
+        labels: labels of the blocks, if they have any.
     """
 
-    labels: Names
-    block: np.ndarray
     reading: np.ndarray
     status: np.ndarray
+    block: np.ndarray
     z: np.ndarray
     converged: np.ndarray
+    labels: Names = ()
 
 
-def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOutReadings]:
+def hold_out_blocks(
+    problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
+) -> HeldOutFits:
+    """Refits without each block in turn, and predicts the rows that were left out.
+
+    Args:
+        problem: problem of the fit to all rows.
+        start: its optimum.
+        masks: masks of the rows of each block, shape (rows of the table,). The problem may have more, padded rows.
+        active: active effects, for a problem with slots.
+    """
+    weight = np.asarray(problem.data.weight)
+    weights = [weight * ~m[:, None] for m in _padded_masks(problem, masks)]
+    active_sets = None if active is None else [active] * len(masks)
+    optima, observations = fit_from_each_start(problem, [start] * len(masks), weights, active_sets)
+    return _predictions(problem, masks, observations.reading, observations.status, optima.z, optima.converged)
+
+
+def _padded_masks(problem: Problem, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Masks of the rows of a problem, which may have more, padded rows."""
+    return [np.pad(mask, (0, len(problem.data.weight) - len(mask))) for mask in masks]
+
+
+def _predictions(
+    problem: Problem, masks: Sequence[np.ndarray], readings: Any, statuses: Any, z: Any, converged: Any
+) -> HeldOutFits:
+    """Predictions of each block by the fit without it. First axis of the other arguments: the blocks."""
+    rows = len(masks[0])
+    reading, status, block = np.full((rows, readings[0].shape[1]), np.nan), np.full(rows, -1), np.full(rows, -1)
+    for k, mask in enumerate(masks):
+        unreachable = problem.observe.unreachable(np.asarray(statuses[k]))[:, None]
+        reading[mask] = np.where(unreachable, np.nan, readings[k])[:rows][mask]
+        status[mask], block[mask] = statuses[k][:rows][mask], k
+    return HeldOutFits(reading, status, block, np.asarray(z), np.asarray(converged))
+
+
+def predict_unseen(
+    problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
+) -> HeldOutFits:
+    """Hold-out fits as in `hold_out_blocks`. For long runs, each refit is a single Gauss-Newton step from the fit to
+    all rows.
+
+    A log has hundreds of readings per parameter, so without one block the fit stays within the linear range. The step
+    that remains with all rows is subtracted, because where a load sticks, derivatives promise a gain that does not
+    exist.
+    """
+    if not problem.observe.long:
+        return hold_out_blocks(problem, start, masks, active)
+    data, z = problem.data, np.asarray(start)
+    residual, jacobian, observation = problem.observe.at(problem, z, active)
+    residual, jacobian, reading = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
+    scale = np.asarray(data.weight / data.sd)
+    count, size = scale.shape[1], scale.size
+    slopes = jacobian[:size].reshape(*scale.shape, -1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
+    steps = []
+    promised = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+    for mask in _padded_masks(problem, masks):
+        kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
+        j = jacobian[kept]
+        steps.append(-np.linalg.solve(j.T @ j, j.T @ residual[kept]) - promised)
+    readings, statuses = [reading + per_unit @ step for step in steps], [np.asarray(observation.status)] * len(masks)
+    return _predictions(problem, masks, readings, statuses, z + np.stack(steps), np.ones(len(masks), bool))
+
+
+def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOutFits]:
     """Refits without each block of each kind in turn, with the same sds, and predicts the rows that were left out.
 
     Args:
@@ -204,19 +287,10 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
         masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are missing in the result.
     """
     answers = {}
-    fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
-    for kind, blocks_by_name in masks.items():
-        if blocks_by_name:
-            parts = tuple(m.tobytes() for m in blocks_by_name.values())
-            held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(
-                problem, start, list(blocks_by_name.values())
-            )
-            answers[kind] = HeldOutReadings(
-                tuple(blocks_by_name),
-                held_out.block,
-                held_out.reading,
-                held_out.status,
-                held_out.z,
-                held_out.converged,
-            )
+    fits: dict[tuple[bytes, ...], HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
+    for kind, blocks in masks.items():
+        if blocks:
+            parts = tuple(m.tobytes() for m in blocks.values())
+            fits[parts] = fits.get(parts) or hold_out_blocks(problem, start, list(blocks.values()))
+            answers[kind] = dataclasses.replace(fits[parts], labels=tuple(blocks))
     return answers

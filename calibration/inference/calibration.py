@@ -33,7 +33,6 @@ from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, progress_remark, remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import MultistartResult
-from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import EDGE, GENERATIONS, LEAST, StoreStage, compute_without_storing
 from calibration.inference.preparation import PreparedInput, prepare_input, rows_to_fit
@@ -107,13 +106,9 @@ def calibrate(
     """
     if not is_double():
         raise BadConfiguration(f"calibrate: {SINGLE}")
-    counts = {
-        "starts": (starts, 1),
-        "population": (population, 0),
-        "generations": (generations, 1),
-        "seed": (seed, 0),
-    }
-    for name, (value, low) in counts.items():
+    for name, value, low in (
+        ("starts", starts, 1), ("population", population, 0), ("generations", generations, 1), ("seed", seed, 0),
+    ):  # fmt: skip
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
     (runs, settled), progress = rows_to_fit(runs, robot, rows), report_in_words(tell)
@@ -131,13 +126,8 @@ def calibrate(
     base, of_product = _with_guide_priors(runs, ready, fidelity)
     coordinates = priors.parameter_coordinates(base, ready.names, {**of_product, **ready.stated})
     posed = observers.pose_problem(runs, base, coordinates, ready.noise.sd, fidelity)
-    evolved = (
-        _population_size(posed, ready.names, runs, population, generations is not None),
-        generations or GENERATIONS,
-        keep,
-    )
-    search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress)
     setting = _CalibrationInput(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
+    search, beside = _search(setting, posed, starts, population, generations, keep, seed, progress)
     if not free and priors.DELAY not in (*fix, *ready.names):
         setting, search = _free_delay_if_needed(setting, search, progress)
     return _calibration_result(setting, search, beside, seed, progress)
@@ -247,42 +237,35 @@ def _free_delay_if_needed(
     return dataclasses.replace(setting, ready=ready), found
 
 
-def _population_size(posed: Problem, names: Sequence[str], runs: Runs, population: int | None, more: bool) -> int:
-    """Number of members of each generation, 0 for no search by generations.
-
-    Args:
-        population: argument of `calibrate`.
-        more: True if its number of generations is given.
-
-    Raises:
-        BadConfiguration: a number of generations without a population, or the data do not support such a search.
-    """
-    if population is None:
-        population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
-    if more and not population:
-        raise BadConfiguration("--generations: has an effect only with --population; give it too")
-    if population and not posed.observe.starts_from_steady:
-        raise BadConfiguration(
-            f"--population: got {population}; a population search needs settled rows and --model drive or track"
-        )
-    if 0 < population < LEAST:
-        raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
-    return population
-
-
 def _search(
-    runs: Runs,
-    base: Robot,
+    setting: _CalibrationInput,
     posed: Problem,
-    known: Noise,
     starts: int,
-    size: int,
-    generations: int,
+    size: int | None,
+    generations: int | None,
     keep: StoreStage,
     seed: int,
     tell: Callable[[Remark], None],
 ) -> tuple[MultistartResult, np.ndarray | None]:
-    """Searches for the optimum. Also returns the optimum of `steady` if the searches started there."""
+    """Searches for the optimum. Also returns the optimum of `steady` if the searches started there.
+
+    Args:
+        size, generations: as `population` and `generations` of `calibrate`.
+
+    Raises:
+        BadConfiguration: a number of generations without a population, or the data do not support such a search.
+    """
+    runs, base, known = setting.runs, setting.base, setting.ready.noise
+    if size is None:
+        size = POPULATION if fidelities.unread_parameters("steady", setting.ready.names, runs.turns) else 0
+    if generations is not None and not size:
+        raise BadConfiguration("--generations: has an effect only with --population; give it too")
+    if size and not posed.observe.starts_from_steady:
+        raise BadConfiguration(
+            f"--population: got {size}; a population search needs settled rows and --model drive or track"
+        )
+    if 0 < size < LEAST:
+        raise BadConfiguration(f"--population: got {size}; expected 0 or at least {LEAST} members")
     rng, all_members = np.random.default_rng(seed), None
     if runs.log is not None:
         sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
@@ -296,9 +279,8 @@ def _search(
     tell(progress_remark("steady"))
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").starts, len(posed.coordinates)))
     draws[0] = 0.0
-    easy = multistart.search_from_starts(
-        observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws
-    )
+    steady = observers.pose_problem(runs, base, posed.coordinates, known.sd)
+    easy = multistart.search_from_starts(steady, known, draws)
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.starts_from_posterior(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
@@ -311,18 +293,18 @@ def _search(
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
     everyone = population.run_evolution(
-        posed, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
-        seed=seed, beside=points, tell=tell, keep=keep,
+        posed, population.member_objective(posed, known), beside, covariance, size=size,
+        generations=generations or GENERATIONS, seed=seed, beside=points, tell=tell, keep=keep,
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
-        search_result = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
-        endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in search_result.items())
+        endings = ", ".join(f"{n} {word.replace('_', ' ')}" for word, n in everyone.outcomes().items())
         raise BadConfiguration(
             f"--population: none of {len(everyone.z)} members runs in every row (ended in: {endings or 'none'}); "
             "begin from another robot, or free fewer parameters"
         )
-    posed, shares = multistart.reestimate_noise_at(posed, known, everyone, best_member)
+    shares = population.most_probable_noise(posed, known, np.asarray(everyone.seen.reading[best_member]))
+    posed = multistart.with_noise_shares(posed, known, shares)
     tell(progress_remark("derivatives"))
     identifiability_there = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
     unreliable = population.unreliable_derivatives(
@@ -368,7 +350,7 @@ def _calibration_result(
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = {k: scans.scan_coordinate(posed, z, posed.data, k) for k in scans.scanned_coordinates(posed)}
+    scanned = {k: scans.scan_coordinate(posed, z, k) for k in scans.scanned_coordinates(posed)}
     about = scans.with_scanned_sds(about, scanned)
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [
@@ -386,7 +368,7 @@ def _calibration_result(
         notes.append(Remark("elsewhere", searches=elsewhere, total=len(found.starts.cost), names=scanned_names))
     if not np.isfinite(about.covariance).all():
         notes.append(Remark("no_covariance"))
-    if jumps := row_numbers(np.asarray(after.flags) >> FLAGS.index("jumps") & 1):
+    if jumps := estimates.row_numbers(np.asarray(after.flags) >> FLAGS.index("jumps") & 1):
         notes.append(Remark("of_rows", rows=jumps, what="jumps"))
     profile = None
     if setting.profiles:
@@ -456,11 +438,11 @@ def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
     yield from (Remark("residual_cluster", cluster=c) for c in found.residual_clusters)
     for k, word in enumerate(STATUSES):
         if k not in DONE and np.any(found.status == word):
-            yield Remark("of_rows", rows=row_numbers(found.status == word), what=word)
+            yield Remark("of_rows", rows=estimates.row_numbers(found.status == word), what=word)
     yield from _parameter_remarks(found)
     limited = found.adhesion_used > 1 - MARGIN
     if limited.any():
-        yield Remark("of_rows", rows=row_numbers(limited), what="limited", share=MARGIN)
+        yield Remark("of_rows", rows=estimates.row_numbers(limited), what="limited", share=MARGIN)
     for configuration in found.robot.configurations:
         friction = f"{configuration}.{priors.GUIDE_FRICTION}"
         share = f"{configuration}.{priors.GUIDE_SHARE}"
@@ -475,9 +457,7 @@ def calibration_remarks(found: CalibrationResult) -> Iterator[Remark]:
 
 
 def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    far_names = {
-        name for name, p in found.parameters.items() if abs(p.shift) > FAR
-    }  # these get a remark of their own
+    far_names = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # with a remark of their own
     if near_prior := tuple(name for name in found.undetermined if name not in far_names):
         yield Remark("held_by_prior", names=near_prior)
     if pairs := found.together:
@@ -491,8 +471,3 @@ def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for name, p in found.parameters.items() if found.searched is not None else ():
         if EDGE < abs(p.shift) <= FAR and not p.at_bound:
             yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="edge")
-
-
-def row_numbers(which: np.ndarray) -> tuple[int, ...]:
-    """Row numbers of a mask, counted from 1."""
-    return tuple(int(k) + 1 for k in np.flatnonzero(which))

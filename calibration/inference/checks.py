@@ -47,17 +47,14 @@ def unused_notes(runs: Runs) -> tuple[Remark, ...]:
 
 
 def unused_columns(runs: Runs) -> Names:
-    """Names of numeric columns that vary and have no role."""
-    return tuple(name for name, cells in runs.extras.items() if _is_varying(name, cells))
-
-
-def _is_varying(name: str, cells: np.ndarray) -> bool:
-    """True for a numeric column that varies and is neither a row number nor a time."""
-    if cells.dtype.kind != "f" or TIMES.search(name):
-        return False
-    levels = np.unique(cells[np.isfinite(cells)])
-    counts = len(levels) == len(cells) and bool((np.diff(levels) == 1).all())
-    return len(levels) > 1 and not counts
+    """Names of numeric columns that vary and have no role. Row numbers and times are left out."""
+    unused = []
+    for name, cells in runs.extras.items():
+        if cells.dtype.kind == "f" and not TIMES.search(name):
+            levels = np.unique(cells[np.isfinite(cells)])
+            counts = len(levels) == len(cells) and bool((np.diff(levels) == 1).all())
+            unused += [name] if len(levels) > 1 and not counts else []
+    return tuple(unused)
 
 
 def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:

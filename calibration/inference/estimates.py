@@ -9,8 +9,8 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
-from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, result, simulation_errors
+from calibration.inference.blocks import HeldOutFits
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
@@ -55,14 +55,17 @@ def parameter_estimates(
     stated = coordinates.stated
     linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
     wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
-    other = None if beside is None else coordinates.value(np.asarray(beside))
+    steady: list[result.SteadyEstimate | None] = [None] * len(point)
+    if beside is not None:
+        with_steady = zip(coordinates.value(beside).tolist(), ((z - beside) / about.sd).tolist(), strict=True)
+        steady = [result.SteadyEstimate(x, apart) for x, apart in with_steady]
     bound, fields = coordinates.beyond(z), params.parameters_by_name(base)
     estimates = {}
     for k, name in enumerate(coordinates.names):
         interval, is_open = linear[k], (False, False)
         if profile is not None:
             interval = np.array([profile.low[k], profile.high[k]])
-            is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
+            is_open = bool(profile.open[k, 0]), bool(profile.open[k, 1])
         if k in scans:
             is_open = scans[k].open()
             ends = [np.where(np.arange(len(z)) == k, x, point) for x in scans[k].interval()]
@@ -87,9 +90,7 @@ def parameter_estimates(
             at_bound=SIDE_OF_BOUND[int(bound[k])],
             measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
             profiled=profile is not None,
-            with_steady=None
-            if beside is None or other is None
-            else result.SteadyEstimate(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+            with_steady=steady[k],
         )
     return estimates
 
@@ -122,41 +123,31 @@ def _channel_errors(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
 ) -> Errors:
     errors = simulation_errors.channel_errors(shown, simulated, measured, sd, percent)
-    return {
-        name: result.ChannelErrors(
-            int(e["rows"]), *(float(e[x]) for x in ("rms_percent", "max_percent", "rms_sigma", "rms"))
-        )
-        for name, e in errors.items()
-    }
+    return {name: result.ChannelErrors(**e) for name, e in errors.items()}
 
 
-def hold_out_errors(
-    posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
-) -> HeldOutErrors:
+def hold_out_errors(posed: Problem, held: HeldOutFits, measured: np.ndarray, sd: np.ndarray) -> HeldOutErrors:
     """Hold-out errors of all rows together and of each block."""
-    percent, unreachable = (
-        sized_error(held.reading, measured),
-        posed.observe.unreachable(held.status),
-    )
+    percent, unreachable = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
         is_in_block = held.block == k
-        values_of_block = [np.where(is_in_block[:, None], x, np.nan) for x in (held.reading, percent)]
+        of_block, percent_of_block = (np.where(is_in_block[:, None], x, np.nan) for x in (held.reading, percent))
         blocks[label] = result.BlockErrors(
-            _channel_errors(posed.channels, values_of_block[0], measured, sd, values_of_block[1]),
-            _row_numbers(is_in_block & unreachable),
+            _channel_errors(posed.channels, of_block, measured, sd, percent_of_block),
+            row_numbers(is_in_block & unreachable),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
     return HeldOutErrors(
         _channel_errors(posed.channels, held.reading, measured, sd, percent),
-        _row_numbers(unreachable),
+        row_numbers(unreachable),
         blocks,
         reading,
     )
 
 
-def _row_numbers(rows: np.ndarray) -> tuple[int, ...]:
+def row_numbers(rows: np.ndarray) -> tuple[int, ...]:
     """Row numbers of a mask, counted from 1."""
     return tuple((np.flatnonzero(rows) + 1).tolist())
 

@@ -355,21 +355,15 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
         lagged_product = (scored[lag:] * near[:, None]).T @ scored[:-lag]
         middle += (1 - lag / (w["count"][0] + 1)) * (lagged_product + lagged_product.T)
     spread = inverse @ middle @ inverse
-    b, kA = solved[0], 1 / solved[0]
-    names = [solved[1] / b, solved[2] / b, kA]
-    size = np.eye(len(solved)) / b
-    jacobian = [size[1], size[2], np.zeros(len(solved))]
-    jacobian[2][0] = -(kA**2)
-    jacobian[0][0], jacobian[1][0] = -names[0] / b, -names[1] / b
-    if mechanism == "elevator":
-        names, jacobian = [*names, solved[3] / b], [*jacobian, size[3] - np.eye(len(solved))[0] * solved[3] / b**2]
-    elif mechanism == "arm":
-        c, s = solved[3] / b, solved[4] / b
-        kG = np.hypot(c, s)
-        names = [*names, kG]
-        jacobian = [*jacobian, (c * size[3] + s * size[4]) / kG - np.eye(len(solved))[0] * kG / b]
-    derivatives = np.array(jacobian)
-    return np.array(names), derivatives @ spread @ derivatives.T, float(acceleration_error @ acceleration_error)
+
+    def constants(x: np.ndarray) -> np.ndarray:
+        gravity = x[3:] if mechanism != "arm" else [np.sqrt(x[3] ** 2 + x[4] ** 2)]
+        return np.array([x[1], x[2], 1.0, *gravity]) / x[0]
+
+    step = 1e-30  # in the imaginary direction, which gives exact derivatives (Squire and Trapp, SIAM Rev. 40 (1998))
+    derivatives = np.stack([constants(solved + 1j * step * unit).imag / step for unit in np.eye(len(solved))], 1)
+    covariance = derivatives @ spread @ derivatives.T
+    return constants(solved), covariance, float(acceleration_error @ acceleration_error)
 
 
 def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:

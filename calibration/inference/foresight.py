@@ -105,8 +105,8 @@ def predict_identifiability(runs: Runs, robot: Robot) -> InformationForecast:
     is_reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
         np.asarray(observation.status)
     )
-    data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(is_reached, float)[:, None])
-    about = identifiability.analyse_identifiability(posed, z, data)
+    weight = posed.data.weight * jnp.asarray(is_reached, float)[:, None]
+    about = identifiability.analyse_identifiability(posed.with_data(weight=weight), z)
     is_prior_bound = identifiability.held_by_prior(about.sd)
     fields = params.parameters_by_name(robot)
     width = coordinates.prior_sd
@@ -153,7 +153,7 @@ def _separating_columns(
     table = dataclasses.replace(runs, columns=columns, layout=layout)
     sd = np.ones((len(runs), len(robot_with_all_channels.channels)))
     problem = observers.pose_problem(table, robot_with_all_channels, posed.coordinates, sd)
-    linearised = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
+    linearised = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)))[:2]
     readings, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in linearised)
     covariances = {}
     for k, channel in enumerate(robot_with_all_channels.channels):

@@ -16,7 +16,7 @@ from calibration.inference import optimizers
 from calibration.inference.fit_notes import DependentPair
 from calibration.inference.optimizers import Pin
 from calibration.inference.priors import SOFTNESS, Coordinates
-from calibration.inference.problem import Data, Problem
+from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import compiled
 
 #: Two-sided 95 % of the standard normal distribution.
@@ -115,27 +115,25 @@ def separate_directions(directions: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
-    readings = problem.linearised(problem.robot, z, data)[1][: data.measured.size]
+def _jacobians(problem: Problem, z: Array) -> tuple[Array, Array]:
+    readings = problem.linearised(problem.robot, z)[1][: problem.data.measured.size]
     return jnp.concatenate([readings, jnp.eye(z.size)]), readings
 
 
-def analyse_identifiability(
-    problem: Problem, z: Array, data: Data | None = None, slope: np.ndarray | None = None
-) -> Identifiability:
+def analyse_identifiability(problem: Problem, z: Array, slope: np.ndarray | None = None) -> Identifiability:
     """Linear analysis of `problem` at coordinates z, from readings and priors only.
 
     `slope`, if given, replaces the Jacobian of the whitened readings, (rows · channels, parameters). The limit of
     adhesion is excluded: it is one-sided, so a profile shows it and a standard error cannot.
     """
-    data = problem.data if data is None else data
+    data = problem.data
     if slope is not None:
         all_slopes, readings = np.concatenate([slope, np.eye(len(z))]), slope
     elif problem.observe.long:
-        jacobian = np.asarray(optimizers.linearise(problem, z, data)[1])
+        jacobian = np.asarray(optimizers.linearise(problem, z)[1])
         all_slopes, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_solved_rows(problem, z), z, data))
+        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_solved_rows(problem, z), z))
     _, s, v = np.linalg.svd(all_slopes, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
@@ -179,8 +177,8 @@ class ProfileLikelihoods:
 
 
 @compiled
-def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> optimizers.Optimum:
-    return jax.vmap(lambda z, pin: optimizers.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
+def _profiles(problem: Problem, starts: Array, pins: Pin) -> optimizers.Optimum:
+    return jax.vmap(lambda z, pin: optimizers.levenberg_marquardt(problem, z, pin)[0])(starts, pins)
 
 
 def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifiability) -> ProfileLikelihoods:
@@ -196,7 +194,7 @@ def profile_likelihoods(problem: Problem, z: Array, cost: float, about: Identifi
     starts = centre + direction_of[:, None, :] * (pinned - centre[:, None])[..., None]
     pinned_names = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     pins = Pin(jnp.asarray(pinned_names.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
-    profiles = _profiles(problem, problem.data, pins.at, pins)
+    profiles = _profiles(problem, pins.at, pins)
     rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)

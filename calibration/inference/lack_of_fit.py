@@ -193,11 +193,15 @@ def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
     tests = structure_tests(fit, known=known)
     if known and freedom > 0:
         tests.append((float(chdtrc(freedom, chi2)), AdequacyFinding(what="stated")))
-    if not tests:
+    if not (strongest := _strongest_test(tests)):
         return Adequacy(None, chi2, freedom, None, AdequacyFinding(), known)
-    p, finding = min(tests)
-    p = min(1.0, p * len(tests))
+    (p, finding) = strongest[0]
     return Adequacy(p > LEVEL, chi2, freedom, p, finding, known)
+
+
+def _strongest_test(tests: list[tuple[float, AdequacyFinding]]) -> list[tuple[float, AdequacyFinding]]:
+    """Test with the smallest p-value, multiplied by their number (Bonferroni). Empty without tests."""
+    return [(min(1.0, p * len(tests)), finding) for p, finding in sorted(tests)[:1]]
 
 
 def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, AdequacyFinding]]:
@@ -205,12 +209,8 @@ def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Adequac
     and a finding.
     """
     families = {finding: _p_value_of_columns(fit, columns, known) for finding, columns in _curve_columns(fit).items()}
-    tested = [(p, finding) for finding, p in families.items() if p is not None]
-    tests = []
-    if tested:
-        p, finding = min(tested)
-        tests.append((min(1.0, p * len(tested)), finding))
-    return [*tests, *(test for test in (_autocorrelation_test(fit), _replicate_test(fit)) if test is not None)]
+    curves = [(p, finding) for finding, p in families.items() if p is not None]
+    return [*_strongest_test(curves), *_strongest_test(_autocorrelation_tests(fit)), *_replicate_test(fit)]
 
 
 def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
@@ -265,11 +265,11 @@ def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:
     return families
 
 
-def _autocorrelation_test(fit: Residuals) -> tuple[float, AdequacyFinding] | None:
-    """Tests for autocorrelation at lag 1 within runs. None if the rows of a run have no order."""
+def _autocorrelation_tests(fit: Residuals) -> list[tuple[float, AdequacyFinding]]:
+    """Tests for autocorrelation at lag 1 within runs. Empty if the rows of a run have no order."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
-        return None
+        return []
     run = runs.run_names
     order = np.lexsort((runs[observe.axis], run))
     is_same_run = run[order][1:] == run[order][:-1]
@@ -281,14 +281,11 @@ def _autocorrelation_test(fit: Residuals) -> tuple[float, AdequacyFinding] | Non
         if is_consecutive.sum() >= 20 and power > 0:
             r = float(np.sum(e[1:][is_consecutive] * e[:-1][is_consecutive])) / power
             tests.append((float(ndtr(-r * np.sqrt(is_consecutive.sum()))), AdequacyFinding(channel.name, "remember")))
-    if not tests:
-        return None
-    p, finding = min(tests)
-    return min(1.0, p * len(tests)), finding
+    return tests
 
 
-def _replicate_test(fit: Residuals) -> tuple[float, AdequacyFinding] | None:
-    """Tests the residuals against the scatter of rows under the same conditions. None if there are too few
+def _replicate_test(fit: Residuals) -> list[tuple[float, AdequacyFinding]]:
+    """Tests the residuals against the scatter of rows under the same conditions. Empty if there are too few
     replicates.
     """
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
@@ -305,6 +302,6 @@ def _replicate_test(fit: Residuals) -> tuple[float, AdequacyFinding] | None:
             pure += float(np.sum((e - e.mean()) ** 2)) if len(e) > 1 else 0.0
             degrees += max(len(e) - 1, 0)
     if degrees < REPLICATES or freedom - degrees < 1 or pure <= 0:
-        return None
+        return []
     quotient = max(chi2 - pure, 0.0) / (freedom - degrees) / (pure / degrees)
-    return float(fdtrc(freedom - degrees, degrees, quotient)), AdequacyFinding(what="repeats")
+    return [(float(fdtrc(freedom - degrees, degrees, quotient)), AdequacyFinding(what="repeats"))]

@@ -50,6 +50,12 @@ def balance_probe(whose: str) -> Effect:
     return Probe()
 
 
+def with_probes(robot: Robot, probes: Sequence[Effect], amplitudes: Sequence[Array] | Array) -> Robot:
+    """Robot with further effects, such as probes, at these amplitudes."""
+    put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitudes, strict=True))
+    return dataclasses.replace(robot, effects=(*robot.effects, *put))
+
+
 # --- effects as they are scored -------------------------------------------------------------------------
 
 
@@ -153,6 +159,25 @@ def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Ar
     return jax.vmap(of_shape)(scored.values, given)
 
 
+def _with_memory(signals: Signals, effect: Effect, memory: Array) -> Signals:
+    return dataclasses.replace(signals, memory={**signals.memory, effect.name: memory})
+
+
+def initial_memory(robot: Robot, scored: ScoredEffect, angle: Array) -> Array:
+    """Memory of an effect at the start of a run, at each point of its grid, shape (grid,)."""
+    initial = lambda effect, _: jnp.asarray(effect.initial(robot, angle), float)  # noqa: E731
+    return map_over_shapes(scored, initial, jnp.zeros(len(scored.at)))
+
+
+def memory_rates(robot: Robot, scored: ScoredEffect, signals: Signals, memory: Array) -> Array:
+    """Rate of change of an effect's memory at each point of its grid, shape (grid,)."""
+
+    def rate(effect: Effect, memory: Array) -> Array:
+        return jnp.asarray(effect.rate(robot, _with_memory(signals, effect, memory)), float)
+
+    return map_over_shapes(scored, rate, memory)
+
+
 def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
     """Terms of effects in their balances at one instant, shape (instances,).
 
@@ -162,11 +187,11 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
 
     def term(effect: Effect, remembered: Array) -> Array:
         alone = dataclasses.replace(robot, effects=(effect,))
-        with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
-        return jnp.asarray(balances.effects_sum(alone, with_memory, effect.balance, effect.channel), float)
+        there = _with_memory(signals, effect, remembered)
+        return jnp.asarray(balances.effects_sum(alone, there, effect.balance, effect.channel), float)
 
     terms = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
-    return jnp.concatenate(terms) if terms else jnp.zeros(0)
+    return jnp.concatenate([jnp.zeros(0), *terms])
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -217,10 +242,6 @@ class Linearization(eqx.Module):
     def by_row(self) -> Float[Array, "rows channels"]:
         """Whitened residuals of the readings."""
         return self.residual[: self.readings].reshape(self.rows, -1)
-
-    def with_residual(self, residual: Array) -> Linearization:
-        """Copy with these residuals."""
-        return dataclasses.replace(self, residual=residual)
 
     def rescaled(self, factor: Array) -> Self:
         """Copy with the scale of the readings times a factor, shape (rows, channels)."""

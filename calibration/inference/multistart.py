@@ -16,8 +16,8 @@ from calibration.inference import identifiability, optimizers, scans, series_noi
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.noise import Noise
-from calibration.inference.population import Population, PopulationSearch, most_probable_noise
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.population import PopulationSearch
+from calibration.inference.problem import Observation, Problem
 from mmrjax.model.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
@@ -117,7 +117,7 @@ def search_from_starts(posed: Problem, noise: Noise, points: np.ndarray) -> Mult
         if new is None:
             break
         shares = new
-        posed = _with_noise_shares(posed, noise, shares)
+        posed = with_noise_shares(posed, noise, shares)
     return MultistartResult(
         posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
     )
@@ -145,17 +145,16 @@ def search_one_by_one(
     def elapsed_minutes() -> float:
         return (time.perf_counter() - start_time) / 60
 
-    def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
+    def step(posed: Problem, points: np.ndarray) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
             return optimizers.search_rollout(
                 posed,
                 jnp.asarray(z),
-                data,
                 tell=lambda *done: tell(progress_remark("search", *done, elapsed_minutes())),
             )
 
         optima, start, end = one(points[0])
-        optima, end = scans.search_lower_minima(posed, (optima, end), data, lambda z: one(z)[::2], tell)
+        optima, end = scans.search_lower_minima(posed, (optima, end), lambda z: one(z)[::2], tell)
         optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
         return optima, start.status, end.status
 
@@ -170,10 +169,10 @@ def search_one_by_one(
             if new is None:
                 break
             shares = new
-            posed = _with_noise_shares(posed, noise, shares)
+            posed = with_noise_shares(posed, noise, shares)
         ends, feasibles = [optima], [feasible]
         for k, point in enumerate(points[1:], 2):
-            end, status, _ = step(posed, point[None], posed.data)
+            end, status, _ = step(posed, point[None])
             ends.append(end)
             feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
             tell(progress_remark("start", k, len(points), end.cost[0], end.steps[0], elapsed_minutes()))
@@ -224,24 +223,18 @@ def optimum_of_population(
     if searched.slope is None:
         optima = search_one_by_one(posed, noise, z[None], shares, tell)
         return dataclasses.replace(optima, searched=searched)
-    observation = Observation(*(jnp.asarray(x[searched.at]) for x in (
-        searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,
-    )))  # fmt: skip
-    error = np.concatenate([np.asarray(posed.whitened(observation, posed.data)), z - np.asarray(posed.data.centre)])
+    observation = jax.tree.map(lambda x: jnp.asarray(x[searched.at]), searched.found.seen)
+    error = np.concatenate([np.asarray(posed.whitened(observation)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
-    best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
+    jacobian = jnp.asarray(np.concatenate([searched.slope, rows, np.eye(len(z))]))
+    pin, point, count = optimizers.no_pin(len(z)), jnp.asarray(z), jnp.asarray(0)
+    best = optimizers.optimum_at(jacobian, jnp.asarray(error), point, posed.data, pin, count, jacobian)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
     start_outcomes = StartOutcomes(
         np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations)
     )
     return MultistartResult(posed, best, start_outcomes, shares, searched)
-
-
-def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
-    """Problem with the most probable noise at a member of the population, and that noise relative to the readings."""
-    shares = most_probable_noise(posed, noise, searched.reading[at])
-    return _with_noise_shares(posed, noise, shares), shares
 
 
 def initial_noise_shares(noise: Noise) -> np.ndarray:
@@ -279,9 +272,10 @@ def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.n
     return None if np.nanmax(np.abs(new / shares - 1)) < SETTLED_SHARE else new
 
 
-def _with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+def with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+    """Problem with estimated noise, relative to the readings, shape (channels,)."""
     sd = np.where(noise.estimated, noise.sd / noise_room.START * shares, noise.sd)
-    return dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=jnp.asarray(sd)))
+    return posed.with_data(sd=jnp.asarray(sd))
 
 
 def _search_until_feasible(
@@ -293,10 +287,9 @@ def _search_until_feasible(
         The problem, the searches, and True for each feasible start.
     """
     for _ in range(TIGHTENINGS + 1):
-        optima, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
+        optima, status_start, status_end = search(posed, jnp.asarray(points))
         k = int(np.nanargmin(optima.cost))
         if not unreachable_rows(posed, status_end)[k].any():
             break
-        data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
-        posed = dataclasses.replace(posed, data=data)
+        posed = posed.with_data(stiffness=posed.data.stiffness / 10)
     return posed, optima, ~np.any(unreachable_rows(posed, status_start), axis=1)

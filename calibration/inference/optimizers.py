@@ -1,6 +1,6 @@
 """Maximum a posteriori estimation: least squares with exact Jacobians, from many starts at once.
 
-Every search uses the solver of optimistix in `levenberg_marquardt`.
+Every search uses the solver in `levenberg_marquardt`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.levenberg_marquardt import (
     NEAR,
-    Function,
     OneSidedLevenbergMarquardt,
     SearchState,
     half_squares,
-    linear_residual_function,
     one_sided_step,
-    with_derivative,
     zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
@@ -112,39 +108,26 @@ def informative_residuals(data: Data) -> np.ndarray:
 Progress = tuple[Z, SearchState]
 
 
-def _evaluate_residuals(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
+def _evaluate_residuals(problem: Problem, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
     """Residuals (readings, penalties with their signs, priors) at z, their Jacobian, and the observation.
 
     All three come from one evaluation of the model.
     """
-    r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
-    prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+    r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z)
+    prior = jnp.where(pin.held, z - pin.at, z - problem.data.centre)
     return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
-
-
-def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
-    """Residual function for optimistix, from `_evaluate_residuals`. Its auxiliary output is the observation."""
-
-    def function(z: Z, args: Any) -> tuple[Array, Observation]:
-        r, jacobian, observation = _evaluate_residuals(problem, data, pin, jax.lax.stop_gradient(z))
-        return with_derivative(z, r, jacobian), observation
-
-    return function
 
 
 def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver for fits to such data. `long`: True for rollouts."""
     penalties, tolerance = adhesion_penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(
-        tolerance, tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
+        tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
     )
 
 
-def _optimum_at(
-    jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array | None = None
-) -> Optimum:
-    """Optimum record of a point. `slope` is the Jacobian that predicts its decrement, None for `jacobian`."""
-    slope = jacobian if slope is None else slope
+def optimum_at(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array) -> Optimum:
+    """Optimum record of a point. `slope` is the Jacobian that predicts its decrement."""
     held_rows = adhesion_penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
@@ -164,84 +147,44 @@ def _optimum_at(
     )
 
 
-def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
-    """Optimum record of a point, from its residuals (misfit, then priors) and their Jacobian."""
-    j, r, point = (jnp.asarray(x, float) for x in (jacobian, residual, z))
-    return _optimum_at(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
-
-
-def _initial_progress(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
-    """State of a search before its first evaluation.
-
-    Args:
-        size: number of residuals.
-        aux: shapes and dtypes of the auxiliary output of an evaluation.
-    """
-    struct = jax.ShapeDtypeStruct((size,), start.dtype)
-    return start, solver.init(_unevaluated, start, None, {}, struct, aux, frozenset())
-
-
-def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
-    """A residual function that is never called."""
-    raise NotImplementedError
-
-
-def _solver_step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
-    """One step of a search by the solver."""
-    y, state, _ = solver.step(function, at[0], None, {}, at[1], frozenset())
-    return y, state
-
-
-def _begin_search(problem: Problem, start: Z, data: Data) -> Progress:
+def _begin_search(problem: Problem, start: Z) -> Progress:
     """State of a problem's search before its first evaluation."""
-    size = adhesion_penalty_slice(data).stop + start.shape[0]
-    codes = jnp.zeros(data.measured.shape[0], int)
-    return _initial_progress(
-        _least_squares_solver(data, problem.observe.long),
-        start,
-        size,
-        jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes)),
-    )
+    data = problem.data
+    size, codes = adhesion_penalty_slice(data).stop + start.shape[0], jnp.zeros(data.measured.shape[0], int)
+    aux = jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes))
+    return start, _least_squares_solver(data, problem.observe.long).begin(start, size, aux)
 
 
-def _advance_search(problem: Problem, at: Progress, max_steps: int | Numbers) -> Progress:
+def _advance_search(problem: Problem, pin: Pin, at: Progress, max_steps: int | Numbers) -> Progress:
     """One step of a problem's search.
 
     The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
     the result of the search, with its residuals, Jacobian and observation.
     """
-    solver, function = (
-        _least_squares_solver(problem.data, problem.observe.long),
-        residual_function(problem, problem.data, no_pin(at[0].shape[0])),
-    )
-    y, state = _solver_step(solver, function, at)
-    done, _ = solver.terminate(function, y, None, {}, state, frozenset())
-    is_over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
+    solver = _least_squares_solver(problem.data, problem.observe.long)
+    r, jacobian, observation = _evaluate_residuals(problem, pin, at[1].ahead)
+    y, state = solver.step(*at, r, jacobian, observation)
+    is_over = state.over | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
     return y, dataclasses.replace(state, over=is_over)
 
 
 def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
     y, state = at
-    # optimistix takes no step from a start that is not finite.
     r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
-    return _optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
+    return optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
 
 
 def levenberg_marquardt(
-    problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
+    problem: Problem, start: Z, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """Optimum of one search, and the observation there. It can be vmapped over starts, data and pins."""
-    pin = no_pin(start.shape[0]) if pin is None else pin
-    function: Any = residual_function(problem, data, pin)
-    solution: optx.Solution = optx.least_squares(
-        function,
-        _least_squares_solver(data, problem.observe.long),
-        pin.apply(start),
-        has_aux=True,
-        max_steps=max_steps,
-        throw=False,
-    )
-    return _optimum_of_progress((solution.value, solution.state), data, pin), solution.aux
+    """Optimum of one search, and the observation there. It can be vmapped over problems, starts and pins."""
+    held = no_pin(start.shape[0]) if pin is None else pin
+
+    def advance(at: Progress) -> Progress:
+        return _advance_search(problem, held, at, max_steps)
+
+    at = jax.lax.while_loop(lambda at: ~at[1].over, advance, _begin_search(problem, held.apply(start)))
+    return _optimum_of_progress(at, problem.data, held), at[1].aux
 
 
 class SearchMember(eqx.Module):
@@ -261,11 +204,9 @@ class SearchMember(eqx.Module):
 
     def problem(self, problem: Problem) -> Problem:
         """Problem of this search."""
-        data = dataclasses.replace(problem.data, weight=self.weight, measured=self.measured, centre=self.centre)
-        coordinates = problem.coordinates
         if self.active is not None:
-            coordinates = coordinates.with_effects(self.active)
-        return dataclasses.replace(problem, data=data, coordinates=coordinates)
+            problem = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(self.active))
+        return problem.with_data(weight=self.weight, measured=self.measured, centre=self.centre)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -273,7 +214,7 @@ def _placeholder_searches(problem: Problem, members: SearchMember) -> Progress:
     """States of searches that have already ended, as placeholders."""
 
     def placeholder(member: SearchMember) -> Progress:
-        y, state = _begin_search(problem, member.start, member.problem(problem).data)
+        y, state = _begin_search(member.problem(problem), member.start)
         return y, dataclasses.replace(state, over=jnp.asarray(True))
 
     return jax.vmap(placeholder)(members)
@@ -283,7 +224,7 @@ def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Number
     """States of parallel searches after the `fresh` ones were reset to their starts."""
 
     def begin(member: SearchMember, fresh: Array, at: Progress) -> Progress:
-        search_begin = _begin_search(problem, member.start, member.problem(problem).data)
+        search_begin = _begin_search(member.problem(problem), member.start)
         return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), search_begin, at)
 
     return jax.vmap(begin)(members, fresh, at)
@@ -300,7 +241,7 @@ def _continue_searches(
 
     def advance(member: SearchMember, at: Progress) -> Progress:
         member_problem = member.problem(problem)
-        new = _advance_search(member_problem, at, max_steps)
+        new = _advance_search(member_problem, pin, at, max_steps)
         return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
     at = _start_fresh_searches(problem, members, fresh, at)
@@ -330,7 +271,7 @@ def _step_unfinished(
 
     def advance(member: SearchMember, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
         member_problem = dataclasses.replace(member.problem(problem), roots=roots)
-        new = _advance_search(member_problem, at, max_steps)
+        new = _advance_search(member_problem, pin, at, max_steps)
         new = jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
         return new, _optimum_of_progress(new, member_problem.data, pin)
 
@@ -472,25 +413,18 @@ def _search_with_states(
     return jax.tree.map(lambda *x: np.stack(x), *(results_by_member[k] for k in range(count)))
 
 
-def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def linearise(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Residuals (misfit, then priors) at z, their Jacobian, and the observation."""
-    r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
-        problem, z, data
-    )
-    return *clip_penalties(r, jacobian, data), observation
+    evaluate = linearise_rollout if problem.observe.long else _linearise_by_search_program
+    r, jacobian, observation = evaluate(problem, z)
+    return *clip_penalties(r, jacobian, problem.data), observation
 
 
-def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def _linearise_by_search_program(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Result of `linearise`, with the signs of the penalties, by the compiled program of the searches."""
-    active = getattr(problem.coordinates, "active", None)
-    one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
-    members = SearchMember(
-        one_member[0],
-        one_member[1],
-        one_member[2],
-        one_member[3],
-        None if active is None else np.asarray(active)[None],
-    )
+    data, active = problem.data, getattr(problem.coordinates, "active", None)
+    member = SearchMember(z, data.weight, data.measured, data.centre, active)
+    members = jax.tree.map(lambda x: np.asarray(x)[None], member)
     _, final_states = _search_with_states(problem, members, 1, problem.observe.searches_per_core(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
     return state.found.residual, state.found.jacobian, state.aux
@@ -513,34 +447,27 @@ def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def linearise_rollout(problem: Problem, z: Z) -> tuple[Array, Array, Observation]:
     """Result of `linearise` for a rollout, with negative penalties and their derivatives.
 
     If a step of the rollout is too long for its friction law (V_s small compared with μ_s), the run oscillates and
     its derivative grows without limit. Such a reading counts as not computed, if it has a weight.
     """
+    r, jacobian, observation = _evaluate_residuals(problem, no_pin(z.size), z)
+    return *mask_uncomputed(r, jacobian, problem.data), observation
 
-    r, jacobian, observation = _evaluate_residuals(problem, data, no_pin(z.size), z)
-    return *mask_uncomputed(r, jacobian, data), observation
 
-
-def evaluate_residuals(problem: Problem, z: Z, data: Data) -> Array:
+def evaluate_residuals(problem: Problem, z: Z) -> Array:
     """Residuals of `linearise` without the Jacobian. It uses the program of `observe_robot`, which saves a
     compilation.
     """
     observation = observe_robot(problem, problem.robot(z))
-    return jnp.concatenate([problem.whitened(observation, data), z - data.centre])
-
-
-@eqx.filter_jit
-def _linearised_step(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
-    return _solver_step(solver, linear_residual_function(r, jacobian), at)
+    return jnp.concatenate([problem.whitened(observation), z - problem.data.centre])
 
 
 def search_rollout(
     problem: Problem,
     start: Z,
-    data: Data,
     max_steps: int = 100,
     tell: Callable[[int, float], None] = lambda steps, cost: None,
 ) -> tuple[Optimum, Observation, Observation]:
@@ -551,28 +478,25 @@ def search_rollout(
     Returns:
         The optimum, and the observations at the start and at the end.
     """
-    pin, solver = no_pin(start.shape[0]), _least_squares_solver(data, long=True)
-    size = adhesion_penalty_slice(data).stop + start.shape[0]
-    progress, first_result, last_result = _initial_progress(solver, start, size, None), None, None
+    progress, first = _begin_search(problem, start), None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
-        ahead = progress[1].ahead
+        state = progress[1]
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
-        r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
+        r = evaluate_residuals(problem, state.ahead) if state.rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, observation = linearise_rollout(problem, ahead, data)
-        first_result = observation if first_result is None else first_result
-        progress = _linearised_step(solver, progress, r, jacobian)
+            r, jacobian, observation = linearise_rollout(problem, state.ahead)
+        first = observation if first is None else first
+        progress, end = _step_search(progress, (r, jacobian, observation), problem.data)
         done = bool(progress[1].over)
-        if progress[1].rejected == 0:
-            best, last_result = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
-            done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
-        assert best is not None  # the first step only evaluates the start, and accepts it
+        if best is None or progress[1].rejected == 0:  # the first step only evaluates the start
+            best = end
+            done |= bool(end.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * end.cost))
         tell(steps, float(best.cost))
         if done:
             break
-    assert best is not None and first_result is not None and last_result is not None
-    return best, first_result, last_result
+    assert best is not None and first is not None
+    return best, first, progress[1].aux
 
 
 #: Function of members' coordinates and indices: residuals, penalties with their signs, their Jacobian and the
@@ -583,7 +507,7 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 @functools.partial(compiled, options=SELDOM)
 def _step_search(at: Progress, found: tuple[Array, Array, Any], data: Data) -> tuple[Progress, Optimum]:
     """Next step of a search, and its best point."""
-    new = _solver_step(_least_squares_solver(data, long=True), linear_residual_function(*found), at)
+    new = _least_squares_solver(data, long=True).step(*at, *found)
     return new, _optimum_of_progress(new, data, no_pin(at[0].shape[-1]))
 
 
@@ -629,7 +553,8 @@ def search_rollouts(
         for j, k in enumerate(going):  # one at a time, so that one program serves any number of searches
             found = jax.tree.map(lambda x: x[j], evaluated)  # noqa: B023
             if k in fresh:
-                searches[k] = jax.device_get(_initial_progress(solver, ahead[k], found[0].size, found[2])), None
+                begun = ahead[k], solver.begin(ahead[k], found[0].size, found[2])
+                searches[k] = jax.device_get(begun), None
             searches[k] = jax.device_get(_step_search(searches[k][0], found, data))
         results = [(s.over, s.steps, s.ahead, s.aux, end) for (_, s), end in searches]
         over, steps, ahead, observation, ends = jax.tree.map(lambda *x: np.stack(x), *results)
@@ -652,7 +577,7 @@ def search_rollouts(
 
 
 def search_starts(
-    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
+    problem: Problem, starts: Float[Array, "starts parameters"]
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
     """Searches from each start, in batches.
 
@@ -661,14 +586,14 @@ def search_starts(
     Returns:
         The end of each search, and the status of each row at its start and at its end.
     """
+    data = problem.data
     if not problem.observe.apart:
         size = min(len(starts), max(1, AT_ONCE // len(data.measured)))
         filled = np.resize(starts, (-(-len(starts) // size) * size, starts.shape[1]))  # one program for all batches
-        parts = [jax.device_get(_search_starts(problem, z, data)) for z in filled.reshape(-1, size, starts.shape[1])]
+        parts = [jax.device_get(_search_starts(problem, z)) for z in filled.reshape(-1, size, starts.shape[1])]
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(starts)], *parts)
     tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
     members = SearchMember(np.asarray(starts), *tables)
-    problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
     first_results, final_results = (
         search_refilling(problem, members, steps, problem.observe.searches_per_core(problem)) for steps in (1, 100)
@@ -677,9 +602,9 @@ def search_starts(
 
 
 @compiled
-def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> tuple[Optimum, Array, Array]:
+def _search_starts(problem: Problem, starts: Array | np.ndarray) -> tuple[Optimum, Array, Array]:
     def search(z: Any) -> tuple[Optimum, Array, Array]:
-        optimum, observation = levenberg_marquardt(problem, z, data)
+        optimum, observation = levenberg_marquardt(problem, z)
         return optimum, problem.observation(z).status, observation.status
 
     return jax.vmap(search)(starts)
@@ -697,6 +622,4 @@ def _simulated_readings(problem: Problem, robot: Robot) -> Observation:
 
 def observe_at(problem: Problem, z: Z) -> Observation:
     """Observation at z. For rollouts, by a program that the search has already compiled."""
-    return (
-        linearise(problem, z, problem.data)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))
-    )
+    return linearise(problem, z)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))

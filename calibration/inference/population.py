@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,17 +72,13 @@ class Population:
 
     Attributes:
         z: coordinates, shape (members, parameters).
-        reading: reading of each row [SI], shape (members, rows, channels).
-        adhesion_used, status, flags: values of each row, shape (members, rows).
+        seen: observation of each member, first axis the members.
         cost: objective with the final noise of the search [½σ²], inf if a member has none.
         generations: summary of each generation.
     """
 
     z: Float[np.ndarray, "members parameters"]
-    reading: Float[np.ndarray, "members rows channels"]
-    adhesion_used: Float[np.ndarray, "members rows"]
-    status: Int[np.ndarray, "members rows"]
-    flags: Int[np.ndarray, "members rows"]
+    seen: Observation
     cost: Float[np.ndarray, " members"]
     generations: tuple[Generation, ...]
 
@@ -97,17 +93,15 @@ class Population:
         lowest = [g.lowest for g in self.generations]
         return len(lowest) > PATIENCE and lowest[-PATIENCE - 1] - lowest[-1] < GAIN
 
-
-class MemberObservations(NamedTuple):
-    """Observation of each row for several members, see `Population`."""
-
-    reading: Float[np.ndarray, "members rows channels"]
-    adhesion_used: Float[np.ndarray, "members rows"]
-    status: Int[np.ndarray, "members rows"]
-    flags: Int[np.ndarray, "members rows"]
+    def outcomes(self) -> dict[str, int]:
+        """Number of members with at least one row of each status or flag. Zeros are omitted."""
+        counts = {word: int((self.seen.status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
+        counts["jumps"] = int((self.seen.flags >> FLAGS.index("jumps") & 1).any(1).sum())
+        return {word: count for word, count in counts.items() if count}
 
 
-Objective = Callable[[np.ndarray, MemberObservations], Float[np.ndarray, " members"]]
+#: Function of members' coordinates and observations.
+Objective = Callable[[np.ndarray, Observation], Float[np.ndarray, " members"]]
 #: Function that returns the stored result of a stage by its name, or else computes and stores it.
 StoreStage = Callable[[str, Callable[[], Any]], Any]
 
@@ -122,7 +116,7 @@ def simulate_members(
     points: np.ndarray,
     advance: Callable[[int], None] = lambda _: None,
     together: int | None = None,
-) -> MemberObservations:
+) -> Observation:
     """Simulates the rows for each point.
 
     Args:
@@ -135,14 +129,18 @@ def simulate_members(
         part = points[first : first + together]
         filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
         observed = jax.device_get(_observe_points(posed, jnp.asarray(filled)))
-        batches.append([getattr(observed, name)[: len(part)] for name in MemberObservations._fields])
+        batches.append(jax.tree.map(lambda x: x[: len(part)], observed))  # noqa: B023
         advance(first + len(part))
-    return MemberObservations(*map(np.concatenate, zip(*batches, strict=True)))
+    return _join_observations(batches)
 
 
-def lost_rows(posed: Problem, seen: MemberObservations) -> Bool[np.ndarray, "members rows"]:
+def _join_observations(parts: list[Observation]) -> Observation:
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def lost_rows(posed: Problem, seen: Observation) -> Bool[np.ndarray, "members rows"]:
     """True for measured rows that the model does not reach."""
-    return posed.observe.unreachable(seen.status) & (np.asarray(posed.data.weight).max(1) > 0)
+    return posed.observe.unreachable(np.asarray(seen.status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
 @compiled
@@ -172,10 +170,10 @@ def member_objective(posed: Problem, noise: Noise) -> Objective:
     data = posed.data
     weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
 
-    def of(z: np.ndarray, seen: MemberObservations) -> Float[np.ndarray, " members"]:
+    def of(z: np.ndarray, seen: Observation) -> Float[np.ndarray, " members"]:
         error = np.where(weight > 0, seen.reading - measured, 0.0)
         squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
-        shares = most_probable_noise(posed, noise, seen.reading)
+        shares = most_probable_noise(posed, noise, np.asarray(seen.reading))
         for k, estimated in enumerate(noise.estimated):
             count = weight[:, k].sum()
             if estimated and count:
@@ -197,9 +195,9 @@ def run_evolution(
     size: int,
     seed: int,
     generations: int,
-    beside: np.ndarray | None = None,
-    tell: Callable[[Remark], None] = lambda step: None,
-    keep: StoreStage = compute_without_storing,
+    beside: np.ndarray,
+    tell: Callable[[Remark], None],
+    keep: StoreStage,
 ) -> Population:
     """Searches by generations: each is drawn around the best members of the generations before.
 
@@ -218,36 +216,27 @@ def run_evolution(
 
     start_time = time.perf_counter()
     search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
-    z = np.empty((0, len(centre))) if beside is None else np.asarray(beside, float)
-    rows, cost, progress = None, np.empty(0), list[Generation]()
+    z, cost, seen, progress = np.empty((0, len(centre))), np.empty(0), list[Observation](), list[Generation]()
     for number in range(1, generations + 1):
         sample = np.array([search.ask() for _ in range(size)])
-        points = sample if number > 1 or not len(z) else np.concatenate([z, sample])
+        points = sample if number > 1 else np.concatenate([beside, sample])
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - start_time) / 60
             tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
         simulate = functools.partial(simulate_members, posed, points, advance)
-        generation: MemberObservations = keep(f"generation {number}", simulate)
-        z = points if rows is None else np.concatenate([z, points])
-        rows = (
-            generation
-            if rows is None
-            else MemberObservations(*map(np.concatenate, zip(rows, generation, strict=True)))
-        )
+        generation: Observation = keep(f"generation {number}", simulate)
+        z = np.concatenate([z, points])
+        seen.append(generation)
         cost = np.concatenate([cost, objective(points, generation)])
         own_cost = cost[-size:]
-        search.tell(
-            [
-                (d, float(c))
-                for d, c in zip(sample, np.where(np.isfinite(own_cost), own_cost, MISSING**2), strict=True)
-            ]
-        )
+        finite_cost = np.where(np.isfinite(own_cost), own_cost, MISSING**2)
+        search.tell(list(zip(sample, finite_cost.tolist(), strict=True)))
         failed = int(np.sum(lost_rows(posed, generation).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
         tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
-        population = Population(z, *rows, cost, tuple(progress))
+        population = Population(z, _join_observations(seen), cost, tuple(progress))
         if population.settled:
             break
     return population
@@ -265,13 +254,13 @@ def local_regression(
         The derivative, shape (rows · channels, parameters), and the rms of the residuals [σ].
     """
     finite = np.isfinite(found.cost)
-    z, reading = found.z[finite], found.reading[finite]
+    z, reading = found.z[finite], found.seen.reading[finite]
     number = min(len(z), MEMBERS_EACH * (z.shape[1] + 1))
     spread = np.linalg.pinv(np.cov(z.T).reshape(z.shape[1], -1))
     offsets = z - found.z[at]
     near = np.argsort(np.einsum("ij,jk,ik->i", offsets, spread, offsets), kind="stable")[:number]
     scale = np.asarray(posed.data.weight / posed.data.sd)
-    reading_changes = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
+    reading_changes = np.where(scale > 0, (reading[near] - found.seen.reading[at]) * scale, 0.0).reshape(number, -1)
     design = np.column_stack([np.ones(number), offsets[near]])
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
     ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(offsets[near]) + 1e-12)])
@@ -332,31 +321,17 @@ class PopulationSearch:
     left: float
     edge: dict[str, ReachedBound] = dataclasses.field(default_factory=dict)
 
-    def outcomes(self) -> dict[str, int]:
-        """Number of members with at least one row of each status or flag. Zeros are omitted."""
-        status, flags = self.found.status, self.found.flags
-        status_counts = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
-        status_counts["jumps"] = int((flags >> FLAGS.index("jumps") & 1).any(1).sum())
-        return {word: count for word, count in status_counts.items() if count}
-
     def to_json(self) -> Json:
         """Entries of result.json."""
         return {
             "members": len(self.found.z),
-            **entries_of(self, "settled=found.settled", "generations=found.generations", "outcomes"),
+            **entries_of(self, "settled=found.settled", "generations=found.generations", "outcomes=found.outcomes"),
             "at_edge": {name: describe(at) for name, at in self.edge.items()},
             **entries_of(self, "derivatives_apart=apart", "regression_rms_sd=left"),
         }
 
     def remarks(self) -> list[Remark]:
         """Remarks on the search."""
-        notes: list[Remark] = [
-            Remark(
-                "generations",
-                members=len(self.found.z),
-                generations=len(self.found.generations),
-                settled=self.found.settled,
-            )
-        ]
-        notes += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
-        return notes
+        members, generations = len(self.found.z), len(self.found.generations)
+        summary = Remark("generations", members=members, generations=generations, settled=self.found.settled)
+        return [summary, *[Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)]

@@ -14,7 +14,7 @@ from calibration.data import Names, Priors, configuration_tables, inferred_facts
 from calibration.data.runs import Runs
 from calibration.data.unused_readings import used_rows
 from calibration.described import describe
-from calibration.inference import checks, observers, repeats
+from calibration.inference import checks, observers
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Notes, Remark
 from calibration.inference.noise import Noise
@@ -130,7 +130,7 @@ def prepare_input(
     as_stated, weighed = robot, inferred_facts.mass_notes(robot, runs)
     robot = inferred_facts.with_table_mass(robot, runs)
     noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
-    noise_sds, larger = repeats.enlarge_noise(noise_sds, runs)
+    noise_sds, larger = noise_room.enlarge_noise(noise_sds, runs)
     robot = observe.with_initial_states(robot, runs, noise_sds)
     result = PreparedInput(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
     names = tuple(choose(result))

@@ -482,16 +482,12 @@ def parameter_coordinates(
     known_sds |= {**{n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names}, **stated}
     rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
+    pairs = [(f"{c}.{follower}", f"{c}.{leader}") for c in robot.configurations for follower, leader in TIED]
+    pairs += [(n, leader) for n in fields if (leader := _leading_parameter(robot, n)) is not None]
     tied = tuple(
         (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
-        for configuration in robot.configurations
-        for follower, leader in ((f"{configuration}.{a}", f"{configuration}.{b}") for a, b in TIED)
+        for follower, leader in pairs
         if leader in names and follower not in names
-    )
-    tied += tuple(
-        (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
-        for follower, leader in ((n, _leading_parameter(robot, n)) for n in fields)
-        if leader is not None and leader in names and follower not in names
     )
     return Coordinates(
         jnp.asarray(location),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -108,22 +109,26 @@ class Problem(eqx.Module):
         """Observation at z."""
         return self.observe(self.coordinates.robot(self.base, z))
 
-    def misfit(self, z: Float[Array, " parameters"], data: Data) -> Float[Array, " residuals"]:
+    def with_data(self, **changes: Any) -> Problem:
+        """Copy with other fields of its `Data`."""
+        return dataclasses.replace(self, data=dataclasses.replace(self.data, **changes))
+
+    def misfit(self, z: Float[Array, " parameters"]) -> Float[Array, " residuals"]:
         """Whitened residuals of the readings, then adhesion penalties, at z. Shape (rows (channels + 1),)."""
-        return self.whitened(self.observation(z), data)
+        return self.whitened(self.observation(z))
 
-    def whitened(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
+    def whitened(self, seen: Observation) -> Float[Array, " residuals"]:
         """Whitened residuals of an observation: readings, then adhesion penalties. Shape (rows (channels + 1),)."""
-        error = (seen.reading - data.measured) / data.sd
-        error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
-        return jnp.concatenate([error.ravel(), jax.nn.relu(self.adhesion_excess(seen, data))])
+        error = (seen.reading - self.data.measured) / self.data.sd
+        error = self.data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
+        return jnp.concatenate([error.ravel(), jax.nn.relu(self.adhesion_excess(seen))])
 
-    def signed(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
+    def signed(self, seen: Observation) -> Float[Array, " residuals"]:
         """Residuals as in `whitened`, but the adhesion penalty is negative for rows within their margin."""
-        return jnp.concatenate([self.whitened(seen, data)[: data.measured.size], self.adhesion_excess(seen, data)])
+        return jnp.concatenate([self.whitened(seen)[: self.data.measured.size], self.adhesion_excess(seen)])
 
     def linearised(
-        self, robot: Callable[[Array], Robot], x: Float[Array, " x"], data: Data
+        self, robot: Callable[[Array], Robot], x: Float[Array, " x"]
     ) -> tuple[Array, Array, Observation, Signals | None]:
         """Residuals of a robot that depends on x, and their derivatives, by one evaluation.
 
@@ -137,18 +142,18 @@ class Problem(eqx.Module):
 
             def explicit(x: Array) -> tuple[Array, tuple[Array, Observation]]:
                 observation = self.observe(robot(x))
-                r = self.signed(observation, data)
+                r = self.signed(observation)
                 return r, (r, observation)
 
             jacobian, (r, observed) = jax.jacfwd(explicit, has_aux=True)(x)
             return r, jacobian, observed, None
 
         unknowns, was_found = solved
-        size, (rows, count) = x.size, data.measured.shape
+        size, (rows, count) = x.size, self.data.measured.shape
 
         def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
             observation, signals, residual = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
-            r = self.signed(observation, data)
+            r = self.signed(observation)
             return (r, residual), (r, observation, signals)
 
         x_and_unknowns = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
@@ -157,9 +162,9 @@ class Problem(eqx.Module):
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
-    def adhesion_excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
+    def adhesion_excess(self, seen: Observation) -> Float[Array, " rows"]:
         """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
-        excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(self.data.weight, 1) / self.data.stiffness
         return jnp.where(jnp.isfinite(excess), excess, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:

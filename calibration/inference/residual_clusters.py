@@ -181,8 +181,13 @@ def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> l
 
 def _determines(fine: np.ndarray, coarse: np.ndarray) -> bool:
     """True if each level of `fine` determines the level of `coarse`, which has fewer levels."""
-    pairs = len(set(zip(fine.tolist(), coarse.tolist(), strict=True)))
-    return len(np.unique(coarse)) < len(np.unique(fine)) == pairs
+    pairs, fine_levels, coarse_levels = _level_counts(fine, coarse)
+    return coarse_levels < fine_levels == pairs
+
+
+def _level_counts(one: np.ndarray, other: np.ndarray) -> tuple[int, int, int]:
+    """Numbers of pairs of levels of two columns, and of levels of each."""
+    return len(set(zip(one.tolist(), other.tolist(), strict=True))), len(np.unique(one)), len(np.unique(other))
 
 
 # --- tests ----------------------------------------------------------------------------------------------
@@ -264,11 +269,10 @@ def _columns_to_test(whole: _ResidualUnits) -> Columns:
         levels = np.unique(words[words != ""])
         if len(levels) < 2 or _is_time(name, cells) or _is_id(cells, len(levels)):
             continue
-        if any(_are_equivalent(words, alias) for alias in _columns_with_role(runs)) or _are_steps_of_condition(
-            cells, words, conditions
-        ):
-            continue
-        columns[name] = cells
+        # An alias of a column has as many pairs of levels as levels.
+        is_alias = any(len({*_level_counts(words, role)}) == 1 for role in _columns_with_role(runs))
+        if not (is_alias or _are_steps_of_condition(cells, words, conditions)):
+            columns[name] = cells
     return columns
 
 
@@ -295,12 +299,6 @@ def _condition_labels(runs: Runs) -> list[str]:
         name for name, v in runs.columns.items()
         if v.dtype.kind == "U" and name not in ("run_id", "mode") and len(np.unique(v)) > 1
     ]  # fmt: skip
-
-
-def _are_equivalent(one: np.ndarray, other: np.ndarray) -> bool:
-    """True if each level of one column determines the level of the other, in both directions."""
-    pairs = len(set(zip(one.tolist(), other.tolist(), strict=True)))
-    return pairs == len(np.unique(one)) == len(np.unique(other))
 
 
 def _are_steps_of_condition(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:

@@ -324,7 +324,7 @@ class CalibrationResult:
     @property
     def counts(self) -> dict[str, int]:
         """Number of rows with each status, for the calibrated robot."""
-        return _counts(self.status)
+        return _status_counts(self.status)
 
     @property
     def held_out_alike(self) -> dict[str, Names]:
@@ -400,7 +400,7 @@ class CalibrationResult:
                     "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
                     "together": self.together,
                 },
-                "statuses_before": _counts(self.status_before),
+                "statuses_before": _status_counts(self.status_before),
                 **entries("statuses=counts", "notes"),
             }
         )
@@ -447,5 +447,5 @@ class CalibrationResult:
         posterior.write_posterior(self.posterior, folder / posterior.FILE)
 
 
-def _counts(status: np.ndarray) -> dict[str, int]:
+def _status_counts(status: np.ndarray) -> dict[str, int]:
     return {name: int(np.sum(status == name)) for name in STATUSES}

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.optimizers import Optimum, evaluate_residuals
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import Observation, Problem
 from mmrjax.model.params import parameters_by_name
 
 #: Half of the range of a scan [prior sd].
@@ -50,9 +50,14 @@ class Scan:
         lowest = np.flatnonzero((self.cost <= padded[:-2]) & (self.cost < padded[2:]))
         return lowest[np.argsort(self.cost[lowest], kind="stable")]
 
+    @property
+    def _inside(self) -> np.ndarray:
+        """True for points within 95 % (a rise of up to 3.84 σ²)."""
+        return 2 * (self.cost - self.cost.min()) <= Z95**2
+
     def interval(self) -> tuple[float, float]:
-        """Smallest interval that contains all points within 95 % (a rise of up to 3.84 σ²)."""
-        places_inside = np.flatnonzero(2 * (self.cost - self.cost.min()) <= Z95**2)
+        """Smallest interval that contains all points within 95 %."""
+        places_inside = np.flatnonzero(self._inside)
         return self._crossing(places_inside[0], -1), self._crossing(places_inside[-1], 1)
 
     def _crossing(self, k: int, side: int) -> float:
@@ -66,13 +71,11 @@ class Scan:
 
     def open(self) -> tuple[bool, bool]:
         """True for each end of the interval that may lie beyond the scanned range."""
-        is_inside = 2 * (self.cost - self.cost.min()) <= Z95**2
-        return bool(is_inside[0]), bool(is_inside[-1])
+        return bool(self._inside[0]), bool(self._inside[-1])
 
     def parts(self) -> int:
         """Number of separate parts of the 95 % region."""
-        is_inside = 2 * (self.cost - self.cost.min()) <= Z95**2
-        return int(np.sum(is_inside & ~np.concatenate([[False], is_inside[:-1]])))
+        return int(np.sum(np.diff(self._inside.astype(int), prepend=0) > 0))
 
     def sd(self) -> float:
         """Standard deviation of the coordinate, with exp(-rise / 2) as its density."""
@@ -98,26 +101,26 @@ def wide_coordinates(problem: Problem) -> tuple[int, ...]:
     return tuple(k for k, width in enumerate(widths) if width is not None and half[k] > width)
 
 
-def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
+def scan_coordinate(problem: Problem, z: np.ndarray, k: int) -> Scan:
     """Scan of coordinate k: at z, evenly over the range of the prior, and more closely near minima.
 
     Without the point at z, a narrow minimum that contains no other point could be missed.
     """
     count = problem.observe.number_of_scan_points(problem, k)
-    scan = _scan_at(problem, z, data, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
+    scan = _scan_at(problem, z, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
     around, few = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        scan = _join_scans(scan, _scan_at(problem, z, data, k, np.resize(close, count)))
+        scan = _join_scans(scan, _scan_at(problem, z, k, np.resize(close, count)))
     low, high = scan.interval()
     return _join_scans(
-        scan, _scan_at(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
+        scan, _scan_at(problem, z, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
     )
 
 
-def _scan_at(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
+def _scan_at(problem: Problem, z: np.ndarray, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
-    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
+    cost, other_coordinates = problem.observe.scan(problem, jnp.asarray(z), k, jnp.asarray(at))
     return _sorted_scan(at, np.asarray(cost), np.asarray(other_coordinates))
 
 
@@ -138,7 +141,7 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
     """
     starts = np.array(starts, float)
     for k in scanned_coordinates(problem):
-        scan = scan_coordinate(problem, starts[0], problem.data, k)
+        scan = scan_coordinate(problem, starts[0], k)
         starts[:, k] = scan.at[np.argmin(scan.cost)]
     return starts
 
@@ -147,7 +150,7 @@ Found = tuple[Optimum, Observation]
 
 
 def search_lower_minima(
-    problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
+    problem: Problem, found: Found, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
 ) -> Found:
     """Scans the optimum of a search, and repeats the search from any lower minimum.
 
@@ -163,12 +166,12 @@ def search_lower_minima(
         return found
 
     def objective(z: np.ndarray) -> float:
-        cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z), data) ** 2))
+        cost = 0.5 * float(jnp.sum(evaluate_residuals(problem, jnp.asarray(z)) ** 2))
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
         cost_here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan_coordinate(problem, z, data, k) for k in coordinates}
+        looked = {k: scan_coordinate(problem, z, k) for k in coordinates}
         lower = found
         for k, scan in looked.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
@@ -184,7 +187,7 @@ def search_lower_minima(
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
     lowest = min(float(scan.cost.min()) for scan in looked.values())
-    sd = np.asarray(found[0].sd).copy()
+    sd = np.array(found[0].sd)
     for k, scan in looked.items():
         sd[k] = scan.sd()
     settled = bool(found[0].converged) or cost_here - lowest < WORTH
@@ -201,8 +204,7 @@ def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifi
 
 
 def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
-    """Number of converged searches that ended outside the 95 % intervals of the scans at the best optimum. `z`: end
-    of each search, shape (searches, parameters), None if unknown.
+    """Number of converged searches that ended outside the 95 % intervals of the scans at the best optimum.
 
     Args:
         z: end of each search, shape (searches, parameters), None if not known.
@@ -210,6 +212,8 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
     """
     if z is None:
         return 0
-    ends = {k: scan.interval() for k, scan in scans.items()}
-    outside = [(z[:, k] < low) | (z[:, k] > high) for k, (low, high) in ends.items()]
-    return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
+    outside = np.zeros(len(converged), bool)
+    for k, scan in scans.items():
+        low, high = scan.interval()
+        outside |= (z[:, k] < low) | (z[:, k] > high)
+    return int(np.sum(outside & converged))

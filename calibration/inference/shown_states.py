@@ -245,6 +245,20 @@ class RunWindows:
         return RunWindows(self.run, *(x[which] for x in arrays))
 
 
+def join_windows(cut: list[RunWindows], more: int = 0) -> RunWindows:
+    """Windows of all runs, padded to one length, and `more` empty ones."""
+    longest = max(w.rows.shape[1] for w in cut)
+
+    def joined(name: str) -> np.ndarray:
+        parts = []
+        for x in (getattr(w, name) for w in cut):
+            missing = (0, 0), (0, longest - x.shape[1])
+            parts.append(np.pad(x, missing, "edge") if name in ("rows", "steps") else np.pad(x, missing))
+        return np.concatenate([*parts, np.full((more, longest), float(name == "steps")).astype(parts[0].dtype)])
+
+    return RunWindows(-1, *(joined(n) for n in ("rows", "weight", "slope", "bend", "steps")))
+
+
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Window w = sin⁸ π s with its derivatives w' and w'', where s is the position in the window (0 to 1). 0 outside.
 

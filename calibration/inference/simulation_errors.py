@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -55,13 +56,8 @@ def root_mean_square(errors: np.ndarray) -> float:
 def error_summary(errors: np.ndarray) -> dict[str, float | int]:
     """Root mean square and largest magnitude of the finite errors (35) [%], and their number."""
     finite = errors[np.isfinite(errors)]
-    if finite.size == 0:
-        return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
-    return {
-        "rows": int(finite.size),
-        "rms_percent": root_mean_square(finite),
-        "max_percent": float(np.abs(finite).max()),
-    }
+    largest = float(np.abs(finite).max()) if finite.size else float("nan")
+    return {"rows": int(finite.size), "rms_percent": root_mean_square(finite), "max_percent": largest}
 
 
 def r_squared(measured: np.ndarray, approximated: np.ndarray) -> float:
@@ -83,7 +79,7 @@ def channel_errors(
     measured: np.ndarray,
     sd: np.ndarray,
     percent: np.ndarray | None = None,
-) -> dict[str, dict[str, float | int]]:
+) -> dict[str, dict[str, Any]]:
     """Errors of each channel over rows with a simulated and a measured value: in percent, in sds, and as `rms` in its
     unit.
 
@@ -94,11 +90,11 @@ def channel_errors(
     """
     percent = sized_error(simulated, measured) if percent is None else percent
     errors = simulated - measured
-    answer = {}
-    for k, channel in enumerate(shown):
-        answer[channel.name] = {
+    return {
+        channel.name: {
             **error_summary(percent[:, k]),
             "rms_sigma": root_mean_square(errors[:, k] / sd[:, k]),
             "rms": root_mean_square(errors[:, k]) / channel.factor,
         }
-    return answer
+        for k, channel in enumerate(shown)
+    }

@@ -33,7 +33,6 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from calibration.data import Columns
 from calibration.inference import linearization
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
@@ -43,19 +42,20 @@ from calibration.inference.shown_states import (
     LogPoints,
     RunWindows,
     StatePlan,
+    join_windows,
     points_and_windows,
     state_plan,
     with_condition,
 )
 from mmrjax.compile import compiling
 from mmrjax.compile.programs import return_memory
-from mmrjax.effects import Effect
 from mmrjax.model import balances, channels
 from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
+from mmrjax.numerics.elementary import value_and_slope
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
 
 #: Fewest windows for each base parameter of a regression that is used.
@@ -235,7 +235,7 @@ def equation_terms(
             first = _rolling_signals(plan, robot, row, turning, states.current)[0]
         turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
     signals, current = _rolling_signals(plan, robot, row, turning, states.current)
-    f, y = [], []
+    f, y = list[Any](), list[Any]()
     if plan.electrical:
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
         f.append(signals.voltage_left)
@@ -316,9 +316,7 @@ def _terms_with_derivatives(
     def terms_of_point(row: LogPoints) -> tuple[Any, tuple[Any, Signals]]:
         def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:
             base = problem.coordinates.robot(problem.base, x[:size])
-            amplitude = x[size : size + len(probes)]
-            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
-            robot = dataclasses.replace(base, effects=(*base.effects, *put))
+            robot = linearization.with_probes(base, probes, x[size : size + len(probes)])
             f, y, signals = equation_terms(
                 plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes)
             )
@@ -336,30 +334,25 @@ def _terms_with_derivatives(
 
     def entering_terms(signals: Signals, angle: Array, memory: list[Array]) -> Array:
         read = dataclasses.replace(signals, angle=angle)
-        each = zip(effects, memory, strict=True)
         terms = [
             linearization.effect_terms(base, read if e.effect.balance == "sensor" else signals, (e,), [m])
-            for e, m in each
+            for e, m in zip(effects, memory, strict=True)
         ]
         return jnp.concatenate([jnp.zeros(0), *terms])
 
     entered = jax.vmap(entering_terms)(signals, angle, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
-    counts = np.array([len(e.at) for e in effects], int)
-    enters = [entering.index(b) if (b := e.effect.balance) in entering else -1 for e in effects]
-    parameter_index = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
-    channel_of_row = np.repeat(
-        np.array([names.index(c) if (c := e.effect.channel) in names else 0 for e in effects], int), counts
-    )
+    instances = [e.effect for e in effects for _ in e.at]
+    enters = np.array([size + entering.index(e.balance) if e.balance in entering else -1 for e in instances], int)
+    channel_of = np.array([names.index(e.channel) if e.channel in names else 0 for e in instances], int)
     first = len(values[0][0]) - len(plan.others)
 
     def of_effects(slope: Array, direct: bool) -> Array:
-        change = -slope[:, :, size + len(probes) :][:, :, channel_of_row]
+        change = -slope[:, :, size + len(probes) :][:, :, channel_of]
         for k, channel in enumerate(plan.others):
-            change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of_row == channel)) * direct)
-        by_term = jnp.where(parameter_index >= 0, slope[:, :, np.maximum(parameter_index, 0)], change)
-        return by_term * entered[:, None]
+            change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of == channel)) * direct)
+        return jnp.where(enters >= 0, slope[:, :, np.maximum(enters, 0)], change) * entered[:, None]
 
     def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
         return part(slopes[0], True), part(slopes[1], False)
@@ -383,23 +376,15 @@ def memory_by_point(
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
 
     def of_effect(scored: linearization.ScoredEffect) -> Array:
-        def rate(effect: Effect, at: Array, signals: Signals) -> Array:
-            with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: at})
-            return jnp.asarray(effect.rate(robot, with_memory), float)
-
-        def begun(angle: Array) -> Array:
-            return linearization.map_over_shapes(
-                scored, lambda e, _: jnp.asarray(e.initial(robot, angle), float), jnp.zeros(len(scored.at))
-            )
-
         def after(memory: Array, row: tuple[Array, Array, Signals]) -> tuple[Array, Array]:
             since, angle, signals = row
-            law = lambda m: linearization.map_over_shapes(scored, lambda e, x: rate(e, x, signals), m)  # noqa: E731
-            speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
-            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun(angle))
+            speed, slope = value_and_slope(lambda m: linearization.memory_rates(robot, scored, signals, m), memory)
+            begun = linearization.initial_memory(robot, scored, angle)
+            memory = jnp.where(since > 0, memory + since * speed / (1 - since * slope), begun)
             return memory, memory
 
-        return jax.lax.scan(after, begun(rows.angle[0]), (rows.since, rows.angle, signals))[1]
+        begun = linearization.initial_memory(robot, scored, rows.angle[0])
+        return jax.lax.scan(after, begun, (rows.since, rows.angle, signals))[1]
 
     return [zero if e.effect.memory_size is None else of_effect(e) for e, zero in zip(effects, nothing, strict=True)]
 
@@ -424,14 +409,6 @@ def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z:
     return jnp.moveaxis(jax.vmap(one)(rows), 1, 0)
 
 
-def _with_imposed(rows: LogPoints, given: Columns) -> LogPoints:
-    """Points with other imposed quantities, which do not depend on a delay."""
-    conditions = rows.conditions
-    for name, x in given.items():
-        conditions = with_condition(conditions, name, jnp.asarray(x))
-    return dataclasses.replace(rows, conditions=conditions, drift={})
-
-
 def fit_delay(problem: Problem, plan: StatePlan) -> float:
     """Delay of the imposed quantity after the time that its column states [s], negative if earlier.
 
@@ -445,57 +422,59 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
     if DELAY not in problem.coordinates.names:
         return file_delay
     rows, course, cut = points_and_windows(problem, plan, across=True)
-    time, since = np.asarray(rows.time), np.asarray(rows.since)
     if not (cut and rows.drift):
         return file_delay
+    time, since = np.asarray(rows.time), np.asarray(rows.since)
     step = float(np.median(since[since > 0]))
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
-    inside = np.unique(np.concatenate([w.rows.ravel() for w in cut]))
+    limit = TENTH * float(np.median([time[w.rows].max() for w in cut]))
+    grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
+    w = join_windows(cut)
+    inside, places = np.unique(w.rows, return_inverse=True)
+    w = dataclasses.replace(w, rows=places.reshape(w.rows.shape))
     rows = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[inside]), rows)
     course = dataclasses.replace(course, cell=course.cell[inside])
-    cut = [dataclasses.replace(w, rows=np.searchsorted(inside, w.rows)) for w in cut]
-    limit = TENTH * float(np.median([time[inside][w.rows].max() for w in cut]))
-    grid = np.linspace(-limit, limit, 2 * int(np.clip(limit / step, 8, DELAYS)) + 1)
     free = [k for k, name in enumerate(problem.coordinates.names) if name != DELAY]
     z, centre = np.zeros(len(problem.coordinates)), np.asarray(problem.data.centre)
+    prompt = course.at(0.0)[0]
+
+    def terms_with(imposed: dict[str, np.ndarray]) -> np.ndarray:
+        """Terms at z with other imposed quantities, which do not depend on a delay."""
+        conditions = rows.conditions
+        for name, x in imposed.items():
+            conditions = with_condition(conditions, name, jnp.asarray(x))
+        points = dataclasses.replace(rows, conditions=conditions, drift={})
+        return np.asarray(_terms_by_coordinates(problem, plan, points, jnp.asarray(z)))
 
     def profile(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
-        prompt = course.at(0.0)[0]
-        moves = [prompt, *({**prompt, n: x + np.ptp(x)} for n, x in prompt.items())]
-        fixed, *others = (
-            np.asarray(_terms_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
-        )
-        change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
+        fixed = terms_with(prompt)
+        change = {n: (terms_with({**prompt, n: x + np.ptp(x)}) - fixed) / np.ptp(x) for n, x in prompt.items()}
         # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
         first = max(change, key=lambda n: float(np.abs(change[n][0, ..., 0]).mean() * np.ptp(prompt[n])))
         factor = change[first][0].mean(0)  # (equations, 1 + z)
         acts = np.flatnonzero(np.abs(factor[:, 0]) > 0)
         unit, growth = factor[acts, None, :1], factor[acts, None, 1:] / factor[acts, None, :1]
-        prompt_integrals = np.concatenate([_integrate_terms(plan, w, *fixed) for w in cut], 1)[acts]
-        weighted = {n: [_weigh_terms(plan, w, *x)[acts] for w in cut] for n, x in change.items()}
+        prompt_integrals = _integrate_terms(plan, w, *fixed)[acts]
+        weighted = {n: _integrate_terms(plan, w, x[0], x[1], "wk,wk...->wk...")[acts] for n, x in change.items()}
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            all_integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
+            integrals = prompt_integrals.copy()  # (equations, windows, 1 + z)
             for n, x in weighted.items():
-                by_run = zip(x, cut, strict=True)
-                all_integrals += np.concatenate(
-                    [np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x) for x, w in by_run], 1
-                )
-            all_integrals[..., 1:] -= all_integrals[..., :1] * growth
-            all_integrals /= unit
-            size = np.sqrt(np.mean(all_integrals[..., 0] ** 2, 1))
+                integrals += np.einsum("wk,ewk...->ew...", (means[n] - prompt[n])[w.rows], x)
+            integrals[..., 1:] -= integrals[..., :1] * growth
+            integrals /= unit
+            size = np.sqrt(np.mean(integrals[..., 0] ** 2, 1))
             for _ in range(3):  # the noise of each equation is what the regression leaves
-                scaled = all_integrals / np.maximum(size, 1e-300)[:, None, None]
-                flat = scaled.reshape(-1, all_integrals.shape[2])
+                flat = np.concatenate(integrals / np.maximum(size, 1e-300)[:, None, None])
                 jacobian = np.concatenate([flat[:, 1:][:, free], np.eye(len(free))])
                 target = np.concatenate([flat[:, 0], (z - centre)[free]])
                 move = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
-                remainder = all_integrals[..., 0] + all_integrals[..., 1:][..., free] @ move
+                remainder = integrals[..., 0] + integrals[..., 1:][..., free] @ move
                 size = np.sqrt(np.mean(remainder**2, 1))
-            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * all_integrals.shape[1] * APART)
+            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * len(w.rows) * APART)
             ends.append(z.copy())
             ends[-1][free] += move
         return np.array(costs) - np.min(costs), np.stack(ends)
@@ -569,76 +548,83 @@ def fit_weak_form(problem: Problem, effects: tuple[linearization.ScoredEffect, .
     sd = np.asarray(rows.sd)
 
     def terms(rows: LogPoints, z: np.ndarray) -> EquationTerms:
-        return jax.device_get(
-            _terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects)
-        )  # one program for all of them
+        return jax.device_get(_terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects))
 
-    def whole(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
+    def whiten(factors: list[np.ndarray], *given: tuple[Any, Any]) -> np.ndarray:
         windows = zip(factors, cut, strict=True)
         return np.concatenate([solve_triangular(x, window_errors(plan, w, *given), lower=True) for x, w in windows])
 
-    def of(z: np.ndarray) -> Callable[..., np.ndarray]:
-        """Function of the parameters that returns residuals and their derivatives, and at last signatures.
-
-        The covariance and the noise-free states (`with_smooth_states`) are computed once, at z."""
-        smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
-        terms_there = terms(smooth, z)
-        given, none = terms(rows, z), np.zeros(equations)
-        read = given.f, given.y  # the rest of a long log is large
-        plain = [covariance_factor(plan, w, sd, terms_there, none) for w in cut]
-        whitened_windows = [
-            (
-                window_errors(plan, w, read),
-                np.sum(x**2, 1),
-                np.tile(np.sum(w.weight**2 / w.steps, 1), equations),
-            )
-            for w, x in zip(cut, plain, strict=True)
-        ]
-        by_equation = (
-            np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
-        )
-        unknown = disturbance_intensities(*by_equation)
-        factors = [covariance_factor(plan, w, sd, terms_there, unknown) for w in cut] if unknown.any() else plain
-        offset = whole(factors, read) - whole(factors, (terms_there.f, terms_there.y))
-
-        states[:] = [centre, z, smooth, terms_there, read]
-        last: list[tuple[np.ndarray, np.ndarray, tuple[Any, Any]]] = []
-
-        def at(z: np.ndarray, signatures: bool = False) -> np.ndarray:
-            if not last or np.any(last[0][0] != z):
-                given = terms(smooth, z)
-                factored = whole(factors, (given.f[..., None], given.y[..., None]), given.by_z)
-                factored[:, 0] += offset
-                rest = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
-                last[:] = [(z.copy(), np.concatenate([factored, rest]), given.by_effects)]
-            return whole(factors, last[0][2]) if signatures else last[0][1]
-
-        return at
-
-    states: list[Any] = []
     coordinates, centre = problem.coordinates, np.array(problem.data.centre)
     if DELAY in coordinates.names:  # windows without jumps may not show it
         k = coordinates.names.index(DELAY)
         centre[k] = (late - float(coordinates.value(centre)[k])) / float(coordinates.spread[k])
+
+    def linearise_about(origin: np.ndarray) -> tuple[Any, ...]:
+        """Function that returns residuals and their derivatives at z, and derivatives of the terms with respect to
+        effects. Then the factors of the covariance, states without noise, and terms there and at the readings, all
+        of which are those of the origin.
+        """
+        smooth = with_smooth_states(problem, plan, rows, jnp.asarray(origin))
+        exact, of_readings = terms(smooth, origin), terms(rows, origin)
+        read = of_readings.f, of_readings.y  # the rest of a long log is large
+        factors = _window_factors(plan, cut, sd, exact, read)
+        offset = whiten(factors, read) - whiten(factors, (exact.f, exact.y))
+        last: dict[bytes, tuple[np.ndarray, tuple[Any, Any]]] = {}
+
+        def at(z: np.ndarray) -> tuple[np.ndarray, tuple[Any, Any]]:
+            if (key := z.tobytes()) not in last:
+                given = terms(smooth, z)
+                errors = whiten(factors, (given.f[..., None], given.y[..., None]), given.by_z)
+                errors[:, 0] += offset
+                priors = np.concatenate([(z - centre)[:, None], np.eye(len(z))], 1)
+                last.clear()
+                last[key] = np.concatenate([errors, priors]), given.by_effects
+            return last[key]
+
+        return at, factors, smooth, exact, read
+
     z = centre
     try:
         for _ in range(ROUNDS):
             return_memory()  # terms of a long log
-            terms_at_fit = of(z)
+            origin = z
+            at, factors, *states = linearise_about(origin)
             regression = least_squares(
-                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1:], method="lm",  # noqa: B023
+                lambda z: at(z)[0][:, 0], z, lambda z: at(z)[0][:, 1:], method="lm",  # noqa: B023
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
             step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
-            z, terms_after_step = z + step, terms_at_fit(z + step)
-            if np.abs(terms_after_step[:, 1:] @ step).max() < SETTLED:
+            z = z + step
+            residuals, by_effects = at(z)
+            if np.abs(residuals[:, 1:] @ step).max() < SETTLED:
                 break
-        signatures = terms_at_fit(z, True)
+        signatures = whiten(factors, by_effects)
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    return WeakFormFit(
-        z, terms_after_step[:, 0], terms_after_step[:, 1:], signatures, len(signatures), plan, cut, *states
+    about_fit = residuals[:, 0], residuals[:, 1:], signatures, len(signatures)
+    return WeakFormFit(z, *about_fit, plan, cut, centre, origin, *states)
+
+
+def _window_factors(
+    plan: StatePlan, cut: list[RunWindows], sd: np.ndarray, exact: EquationTerms, read: tuple[Any, Any]
+) -> list[np.ndarray]:
+    """Cholesky factors of the covariance of each part of the windows, with the disturbances of the equations.
+
+    Args:
+        exact, read: terms at states without noise, and at the readings.
+    """
+    equations = exact.f.shape[1]
+    plain = [covariance_factor(plan, w, sd, exact, np.zeros(equations)) for w in cut]
+    defect, noise, unit = (
+        np.concatenate([x.reshape(equations, -1).T for x in parts])
+        for parts in (
+            [window_errors(plan, w, read) for w in cut],
+            [np.sum(x**2, 1) for x in plain],
+            [np.tile(np.sum(w.weight**2 / w.steps, 1), equations) for w in cut],
+        )
     )
+    unknown = disturbance_intensities(defect, noise, unit)
+    return [covariance_factor(plan, w, sd, exact, unknown) for w in cut] if unknown.any() else plain
 
 
 def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np.ndarray:
@@ -649,17 +635,15 @@ def window_errors(plan: StatePlan, w: RunWindows, *terms: tuple[Any, Any]) -> np
     return np.concatenate(integrals)
 
 
-def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Integrals of terms over a run's windows, shape (equations, windows, ...)."""
-    slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
-    integral = functools.partial(np.einsum, "wk,wk...->w...")
-    return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
+def _integrate_terms(
+    plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray, form: str = "wk,wk...->w..."
+) -> np.ndarray:
+    """Integrals of terms over a run's windows, shape (equations, windows, ...).
 
-
-def _weigh_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Terms at each point of a run's windows with their weights, shape (equations, windows, length, ...)."""
+    With the form `wk,wk...->wk...`, each point's part of them, shape (equations, windows, length, ...).
+    """
     slopes = enumerate(derivative_weights(plan, w, f.shape[1]))
-    weigh = functools.partial(np.einsum, "wk,wk...->wk...")
+    weigh = functools.partial(np.einsum, form)
     return np.stack([weigh(w.weight, f[w.rows, k]) + weigh(slope, y[w.rows, k]) for k, slope in slopes])
 
 

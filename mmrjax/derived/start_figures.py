@@ -230,16 +230,14 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     times = jnp.asarray(np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)]))
     run = drive(robot, conditions, times, TOLERANCE)
     signals = run.signals
-    speed, rate, current = (jnp.asarray(x) for x in (signals.speed, signals.acceleration, signals.total_current))
-    power = jnp.asarray(signals.voltage) * current
+    speed, rate, current = (x for x in (signals.speed, signals.acceleration, signals.total_current))
+    power = signals.voltage * current
     k, share = first_crossing(times, speed, rate, SHARE * speed[-1])
     width = jnp.diff(times)
     energy_so_far = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     power_at_instant = power[k] + share * (power[k + 1] - power[k])
     columns = {
-        "peak_current": curve_peak(
-            times, jnp.asarray(robot.sides * signals.current), robot.sides * robot.driver.current_limit
-        ),
+        "peak_current": curve_peak(times, (robot.sides * signals.current), robot.sides * robot.driver.current_limit),
         "time_to_speed": times[k] + share * width[k],
         "energy_start": energy_so_far[k] + share * width[k] * (power[k] + power_at_instant) / 2,
     }

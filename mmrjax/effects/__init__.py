@@ -9,7 +9,7 @@ from mmrjax.effects import (
     turning_effects,
     voltage_effects,
 )
-from mmrjax.effects.base import Effect, amplitude, effects_of_module
+from mmrjax.effects.base import Effect, EffectClasses, amplitude, effects_of_module
 from mmrjax.effects.curve import CURVES, CURVES_ROUND, CURVES_SHOWN, WAVES
 from mmrjax.effects.signal_effects import OF_CHANNELS
 
@@ -19,16 +19,16 @@ _FILES = (mass_effects, voltage_effects, drive_effects, track_effects, travel_ef
 #: bootstrap depend on the position: add a new effect after the others of its balance.
 ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in effects_of_module(file))
 
-BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
+BY_NAME: EffectClasses = {effect.name: effect for effect in ALL}
 
 #: Unnamed discrepancies, which robot files accept but the library does not contain.
-UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND, **CURVES_SHOWN}
+UNNAMED: EffectClasses = {**CURVES, **WAVES, **CURVES_ROUND, **CURVES_SHOWN}
 
 #: Effects of a robot that turns; robot files accept them, and the loop tries them on tables of turns.
-OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in effects_of_module(turning_effects)}
+OF_TURNS: EffectClasses = {effect.name: effect for effect in effects_of_module(turning_effects)}
 
 #: Further effects that robot files accept. The loop tries those of a channel if the robot has the channel.
-BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS, **OF_CHANNELS}
+BESIDE: EffectClasses = {**UNNAMED, **OF_TURNS, **OF_CHANNELS}
 
 __all__ = [
     "ALL", "BESIDE", "BY_NAME", "CURVES", "CURVES_ROUND", "CURVES_SHOWN", "OF_CHANNELS", "OF_TURNS", "UNNAMED",

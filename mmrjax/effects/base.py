@@ -194,6 +194,10 @@ class Effect(eqx.Module):
         return math.inf
 
 
+#: Classes of effects by the names of the effects.
+EffectClasses = dict[str, type[Effect]]
+
+
 def name_class(kind: type[Effect], name: str) -> type[Effect]:
     """Names a class made by a function. Pickle finds it by that name in `Made` of its module."""
     kind.__name__, kind.__qualname__ = name, f"Made.{name}"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.effects.base import THE_SIDE, Effect, Periodic, amplitude, name_class, phase_parameter
+from mmrjax.effects.base import THE_SIDE, Effect, EffectClasses, Periodic, amplitude, name_class, phase_parameter
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
 from mmrjax.model.quantities import DEG, MM, RPM, TRAVEL, TURN
@@ -284,15 +284,15 @@ def _wave_class(place: str) -> type[Effect]:
 
 
 #: The wave of every balance that has curves; a time series shows it as an order.
-WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave_class, BALANCES)}
+WAVES: EffectClasses = {effect.name: effect for effect in map(_wave_class, BALANCES)}
 
 #: Every curve by name. Robot files accept them; the library that is scored does not contain them.
-CURVES: dict[str, type[Effect]] = {
+CURVES: EffectClasses = {
     effect.name: effect
     for effect in (_curve_class(place, over) for place in (*BALANCES, *channels.USUAL) for over in VARIABLES)
 }
 #: Curves of the readings of all other channels, over the variables that the loop tries for them.
-CURVES_SHOWN: dict[str, type[Effect]] = {
+CURVES_SHOWN: EffectClasses = {
     effect.name: effect
     for effect in (
         _curve_class(place, over)
@@ -302,7 +302,7 @@ CURVES_SHOWN: dict[str, type[Effect]] = {
     )
 }
 #: Curves of a robot that turns only.
-CURVES_ROUND: dict[str, type[Effect]] = {
+CURVES_ROUND: EffectClasses = {
     effect.name: effect
     for effect in (
         *(_curve_class(place, over) for place in (*BALANCES, *ROUND) for over in VARIABLES_ROUND),

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import jax.numpy as jnp
 
-from mmrjax.effects.base import Effect, amplitude, name_class
+from mmrjax.effects.base import Effect, EffectClasses, amplitude, name_class
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.params import Scalar, parameter
@@ -140,7 +140,7 @@ def _sensor_errors() -> Iterator[type[Effect]]:
 
 
 #: A rig has the errors of its channels.
-OF_CHANNELS: dict[str, type[Effect]] = {effect.name: effect for effect in _sensor_errors()}
+OF_CHANNELS: EffectClasses = {effect.name: effect for effect in _sensor_errors()}
 #: The same by class name, see `made`.
 Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})
 

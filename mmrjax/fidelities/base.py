@@ -21,7 +21,7 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.quantities import HEAT, VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
+from mmrjax.model.signals import BATTERY_EMPTY, CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
 from mmrjax.numerics.elementary import magnitude
 from mmrjax.undercarriage.side_contacts import GearReactions
 
@@ -270,9 +270,14 @@ def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     """Status of steady travel at `speed` under a motor `voltage`, which distinguishes motion driven by the motors
     from motion driven by gravity.
     """
-    backward = jnp.asarray(speed) < 0
-    has_asked_sign = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
+    backward = speed < 0
+    has_asked_sign = jnp.where(backward, voltage < 0, voltage >= 0)
     return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
+
+
+def status_unless_empty(status: Array, robot: Robot, conditions: Conditions, discharge: Scalar) -> Array:
+    """A status, or `battery_empty` if the charge taken [C] has emptied the on-board battery."""
+    return jnp.where((conditions.battery > 0.5) & robot.battery.empty(discharge), BATTERY_EMPTY, status)
 
 
 def movers_slip(robot: Robot, signals: Signals) -> Array:

@@ -13,7 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch, result_of_signals, withhold_numbers
+from mmrjax.fidelities.base import (
+    Fidelity,
+    History,
+    Progress,
+    RunBatch,
+    result_of_signals,
+    status_unless_empty,
+    withhold_numbers,
+)
 from mmrjax.fidelities.rest import HELD, holds, standing_signals, status_moving, voltage_at_rest
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.model import balances
@@ -113,7 +121,7 @@ def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, way: Scalar |
     winding = signals.voltage_left / signals.inductance
     shaft, moves = (
         jnp.where(is_standing, 0.0, x)
-        for x in (signals.acceleration_wheel * robot.gearbox.ratio, jnp.asarray(signals.acceleration))
+        for x in (signals.acceleration_wheel * robot.gearbox.ratio, signals.acceleration)
     )
     if conditions.motor_speed is not None:  # the current follows from torque, the shaft from the imposed speed
         imposed = conditions.motor_acceleration
@@ -135,7 +143,7 @@ def winding_rate(robot: Robot, conditions: Conditions, y: Unknowns) -> Array:
     """Rate of change of the current alone, in its unit [1/s], if the speed is not imposed."""
     state = state_of_unknowns(robot, y)
     signals = balances.driven_signals(robot, conditions, state, None)
-    return jnp.asarray(signals.voltage_left / signals.inductance / _UNITS[CURRENT])
+    return signals.voltage_left / signals.inductance / _UNITS[CURRENT]
 
 
 _norm = functools.partial(error_norm, own=len(_UNITS))
@@ -259,7 +267,7 @@ def _cut_at_empty_battery(
 
     The parabola of the battery alone would continue.
     """
-    going = jnp.asarray((conditions.battery < 0.5) | ~robot.battery.empty(discharge))
+    going = (conditions.battery < 0.5) | ~robot.battery.empty(discharge)
     signals, away = jax.tree.map(
         lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), (signals, away)
     )
@@ -358,8 +366,7 @@ def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: A
     voltage = voltage_at_rest(robot, conditions) if conditions.voltage_follows else end.voltage
     status = status_moving(robot, conditions, end, voltage)
     status = jnp.where(parked, STALLED, status)
-    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
-    status = jnp.where(empty, BATTERY_EMPTY, status)
+    status = status_unless_empty(status, robot, conditions, end.discharge)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
 
 
@@ -420,7 +427,7 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
     comes from the balances and includes a battery or an effect that changes the slope.
     """
 
-    def left(current: Scalar) -> Scalar:
+    def left(current: Array) -> Array:
         total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
         shifted = dataclasses.replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left

@@ -70,7 +70,7 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
     if conditions.motor_speed is not None:  # the voltage of the imposed speed
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
-        return jnp.asarray(robot.motor.resistance * conditions.motor_current)
+        return robot.motor.resistance * conditions.motor_current
     return balances.bridge_duty(robot, conditions) * jnp.where(
         conditions.open > 0.5, 0.0, _source_at_rest(robot, conditions)
     )
@@ -186,10 +186,10 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     memory = {effect.name: none for effect in robot.remembering}
     rest = State(none, none, none, conditions.discharge, memory, distance=none, gap=none if robot.loose else None)
     settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
-    return jnp.asarray(jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0)
+    return jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0
 
 
-def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
+def _ground_margin(forward: Signals, backward: Signals) -> Array:
     """Adhesion minus the pull of gravity that rolling resistance does not carry [-]. Negative if a robot slides
     down.
     """
@@ -197,7 +197,7 @@ def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
     return (forward.adhesion_limit - along) / forward.normal
 
 
-def holding_margin(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+def holding_margin(robot: Robot, conditions: Conditions, state: State) -> Array:
     """Margin of the friction that holds a robot at rest, negative if it cannot hold it [-].
 
     Its shafts rest if motors and gravity together cannot turn them against static friction, either by moving the

@@ -310,12 +310,12 @@ class Results:
         Over a profile the outcomes are those of the mission. Conditions that the profile states are NaN.
         """
         conditions, nan = self.conditions, np.full(self.shape, np.nan)
-        as_table = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
-        columns = {column: np.asarray(getattr(conditions, name)) for name, column in as_table.items()}
-        columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
-        columns |= {as_table[name]: nan for name in self.stated if name in as_table}
-        torque = nan if "load_torque" in self.stated else conditions.load_torque
-        braked = {} if torque is None else {"load_torque_Nm": np.asarray(torque)}
+
+        def of_run(name: str, values: Any) -> np.ndarray:
+            return nan if name in self.stated else np.asarray(values)
+
+        braked = "load_torque" in self.stated or conditions.load_torque is not None
+        external = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
         found = outputs.output_columns(self.result, self.channels, self.further)
         if self.mission is not None:
             found = {
@@ -324,11 +324,11 @@ class Results:
             }
         return {
             "configuration": self.configuration,
-            "supply_voltage_V": columns["supply_voltage_V"],
-            "total_mass_kg": nan if "payload" in self.stated else np.asarray(self.total_mass),
-            "payload_kg": columns["payload_kg"],
-            "slope_deg": columns["slope_deg"],
-            **braked,
+            "supply_voltage_V": of_run("voltage", external),
+            "total_mass_kg": of_run("payload", self.total_mass),
+            "payload_kg": of_run("payload", conditions.payload),
+            "slope_deg": of_run("slope_deg", conditions.slope_deg),
+            **({"load_torque_Nm": of_run("load_torque", conditions.load_torque)} if braked else {}),
             **found,
         }
 

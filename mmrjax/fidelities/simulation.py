@@ -75,10 +75,7 @@ def simulate(
     Raises:
         UsageError: a value that is not allowed, an unknown name, an option that the fidelity does not have.
     """
-    if not isinstance(robot, Robot):
-        raise UsageError(f"robot: got {type(robot).__name__}; expected a Robot such as mmrjax.nominal()")
-    if not isinstance(conditions, Conditions):
-        raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
+    check_types(robot, conditions)
     model = model or (fidelities.NAMES[0] if profile is None else mission_batch.MODEL)
     if model not in fidelities.TABLE:
         raise UsageError(f"model: got {model}; {allowed_words(str(model), fidelities.TABLE)}")
@@ -127,6 +124,14 @@ def simulate(
         channels=robot.channels,
     )  # fmt: skip
     return results if fidelities.fidelity_facts(model).reverse else _forward_mode_only(results)
+
+
+def check_types(robot: Any, conditions: Any) -> None:
+    """Raises UsageError for arguments that are no robot or no conditions."""
+    if not isinstance(robot, Robot):
+        raise UsageError(f"robot: got {type(robot).__name__}; expected a Robot such as mmrjax.nominal()")
+    if not isinstance(conditions, Conditions):
+        raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
 
 
 def _forward_mode_only(results: Results) -> Results:

@@ -20,6 +20,7 @@ from mmrjax.fidelities.base import (
     Progress,
     RunBatch,
     result_of_signals,
+    status_unless_empty,
     travel_status,
     withhold_numbers,
 )
@@ -37,7 +38,6 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
-    BATTERY_EMPTY,
     CODES,
     CONVERGED,
     FAILED,
@@ -88,12 +88,12 @@ def _signals_and_residuals(
         return (
             state,
             signals,
-            (jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(speed_error)),
+            (slip, (signals.torque_net / _TORQUE), speed_error),
         )
     if not robot.driver.returns_current:  # a diode takes the rest of the voltage
         settled = signals.voltage_back + signals.voltage_drop
         signals = dataclasses.replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
-    return state, signals, (jnp.asarray(slip), jnp.asarray(voltage), torque)
+    return state, signals, (slip, voltage, torque)
 
 
 def _is_held(conditions: Conditions) -> Bool[Array, "..."]:
@@ -290,8 +290,7 @@ def _state_at_unknowns(
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
     status = jnp.where(_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
-    empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
-    status = jnp.where(empty, BATTERY_EMPTY, status)
+    status = status_unless_empty(status, robot, conditions, conditions.discharge)
     status = jnp.where(sound, status, FAILED)
     return signals, status, sound, residual
 

@@ -21,7 +21,7 @@ from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import drive
 from mmrjax.fidelities.rest import holds
-from mmrjax.fidelities.simulation import check_conditions
+from mmrjax.fidelities.simulation import check_conditions, check_types
 from mmrjax.model import balances
 from mmrjax.model.conditions import OF_TURNS, Conditions
 from mmrjax.model.params import Scalar
@@ -133,11 +133,8 @@ def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: 
 
 def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions | None) -> Conditions:
     """Conditions of one run under a command, checked, with the index of their configuration."""
-    if not isinstance(robot, Robot):
-        raise UsageError(f"robot: got {type(robot).__name__}; expected a Robot such as mmrjax.nominal()")
     conditions = Conditions() if conditions is None else conditions
-    if not isinstance(conditions, Conditions):
-        raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
+    check_types(robot, conditions)
     values: Mapping[str, Any] = {}
     if command is not None:
         values = command if isinstance(command, Mapping) else {"duty": command}

@@ -73,6 +73,11 @@ class TrackTrajectory(eqx.Module):
     result: Result
 
 
+def _window_begin(time: Array) -> Array:
+    """Time at which the window of the averages begins [s]."""
+    return time[-1] - WINDOW * (time[-1] - time[0])
+
+
 def _period_averages(
     run: HalfRobotSystem, time: Array, travelled: Array, sums: tuple[Any, Array]
 ) -> tuple[Any, Scalar, Array, Changes]:
@@ -82,8 +87,9 @@ def _period_averages(
     # and varies smoothly with the place at which the run ends.
     pitch, end = run.path.pitch, travelled[-1]
     middle = (travelled[1:] + travelled[:-1]) / 2
-    plain = (time[1:] > time[-1] - WINDOW * (time[-1] - time[0])).astype(time.dtype)
-    window_start = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
+    window_begin = _window_begin(time)
+    plain = (time[1:] > window_begin).astype(time.dtype)
+    window_start = travelled[jnp.searchsorted(time, window_begin)]
     periods = jnp.floor(jax.lax.stop_gradient((end - window_start) / pitch))
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
@@ -178,7 +184,7 @@ def _assemble_trajectory(
     averages = kind.steady_averages(functools.partial(_period_averages, run, time), travelled, passed, guided)
     status = kind.status(run, averages, end)
     valid = (status != FAILED) & (status != TIPS)
-    window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
+    window = time[1:] > _window_begin(time)
     signals, answer = signals_of(passed), kind.result_of(run, averages, status)
     load = jnp.sum(jnp.reshape(signals.normal, (len(motions.q), -1)), axis=-1)
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))

@@ -39,8 +39,6 @@ from mmrjax.model.signals import (
 
 #: Relative tolerance of a step; the absolute one is the same in the units of the unknowns.
 TOLERANCE = 2e-5
-#: Most steps of one segment.
-MOST_STEPS = 4096
 #: A demanded speed counts as missed if its error at the end of a segment exceeds this share of the segment's largest
 #: speed [-].
 MISSED = 0.02
@@ -179,9 +177,9 @@ def _segment_status(
 ) -> tuple[Array, Array]:
     """Status at the end of a segment, and True if the robot has missed the demanded speed."""
     mode, signals = segment.mode[0], balances.signals_of(found)
-    driven = jnp.max(jnp.abs(jnp.asarray(signals.duty * signals.voltage_source)))
+    driven = jnp.max(jnp.abs(signals.duty * signals.voltage_source))
     status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
-    slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
+    slow = [jnp.max(jnp.abs(x)) < 1.0 for x in (signals.direction, signals.direction_travel)]
     rests = stands | (slow[0] & slow[1])
     wants_motion = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
     status = jnp.where(~wants_motion & (status == STALLED), CONVERGED, status)  # it stands as demanded
@@ -192,7 +190,7 @@ def _segment_status(
     largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
         mode == SPEED, per_speed, 1.0
     )
-    largest_error = jnp.max(jnp.abs(jnp.asarray(asked.error)))
+    largest_error = jnp.max(jnp.abs(asked.error))
     missed = controlled & (largest_error > MISSED * jnp.maximum(largest, 10.0))
     status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
     return status, missed
@@ -210,7 +208,6 @@ def mission(
     start: Start | None = None,
     *,
     tolerance: Scalar = TOLERANCE,
-    most_steps: int = MOST_STEPS,
     keep: int = 0,
 ) -> Mission:
     """Simulates one robot over a profile.
@@ -221,7 +218,6 @@ def mission(
         profile: profile of one mission.
         start: state at the start. None: at rest, at ambient temperature.
         tolerance: relative error of a step, also absolute in `UNITS`.
-        most_steps: largest number of steps of a segment. A mission that needs more ends as `failed`.
         keep: largest number of accepted steps to record, 0 for none.
 
     Returns:
@@ -231,14 +227,14 @@ def mission(
     """
     begin = Start() if start is None else start
     # free to turn if the profile or the conditions drive the sides differently or state a heading
-    law: MotionLaw = mission_turning if profile.turns or conditions.turns else mission_straight
+    law = mission_turning if profile.turns or conditions.turns else mission_straight
     no_peaks = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
 
     def run_segment(carry: IntegrationState, k: Array) -> tuple[IntegrationState, _SegmentEnd]:
         segment = profile.row(k)
         fresh = carry._replace(peaks=no_peaks, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
-        c = integrate_segment(law, robot, conditions, segment, fresh, tolerance, most_steps)
+        c = integrate_segment(law, robot, conditions, segment, fresh, tolerance)
         signals, _, _, demand = law.instant(robot, conditions, segment, c.y, c.stands)
         status, missed = _segment_status(law, robot, conditions, segment, signals, demand, c.stands)
         status = jnp.where(c.ended, _early_end_status(c), status)

@@ -107,7 +107,7 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
     """
     on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
     charge_used = found.discharge - conditions.discharge
-    time, path = jnp.asarray(found.total.time), jnp.asarray(found.total.of["path"])
+    time, path = found.total.time, found.total.of["path"]
     is_empty = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
     times = jnp.where(
         is_empty, 1.0, _safe_ratio(capacity - conditions.discharge, charge_used)

@@ -8,8 +8,8 @@ finds neither peaks nor flags (docs/lab/figures.md).
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from types import ModuleType
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,13 @@ from mmrjax.fidelities.base import flag_mask
 from mmrjax.fidelities.rest import smallest_of
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar, Scalars
+from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import Signals
 from mmrjax.numerics.batch_flow import compute_if_needed
 from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages, step_longest
 
+#: Most steps of one segment. A mission that needs more ends as `failed`.
+MOST_STEPS = 4096
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
 #: Events that steps land on: stopping, breaking away, an empty battery, cells falling below their cut-off,
@@ -59,109 +60,16 @@ class SegmentInputs(NamedTuple):
     error: Scalar
 
 
-class MotionLaw(Protocol):
-    """Equations of motion of a robot in a mission: unknowns, equations at an instant, and quantities read from it.
-
-    `found` is the result of `instant`: signals and, for a robot that turns, also its motion.
-
-    Attributes:
-        TOTALS: integrated quantities and their units.
-        PEAKS: quantities whose largest values are recorded, and their units.
-        CLOCK, DISCHARGE, WINDING, HOUSING: positions among the unknowns of the time in the segment [s], the charge
-            taken [C], and the temperatures [°C]. For a robot that turns, temperatures of both sides.
-        CURRENT, MOTOR, GROUND, HEADING: positions of currents, motor speeds, speed and heading.
-        STOPS: positions of the unknowns that are 0 at rest.
-        AT_REST: module for standing robots of this kind (`rest`, `turning`).
-        RESULT: function (robot, instant, status) that returns the result at the end of a run.
-        UNITS: units of the unknowns, except memories of effects.
-        LONG: True if an instant takes long to compile.
-    """
-
-    TOTALS: Mapping[str, str]
-    PEAKS: Mapping[str, str]
-    CLOCK: int
-    DISCHARGE: int
-    WINDING: Any
-    HOUSING: Any
-    CURRENT: Any
-    MOTOR: Any
-    GROUND: int
-    HEADING: Any
-    STOPS: tuple[Any, ...]
-    AT_REST: Any
-    RESULT: Any
-    UNITS: tuple[float, ...]
-    LONG: bool
-
-    def units(self, robot: Robot) -> Float[Array, " unknowns"]:
-        """Units of the unknowns."""
-        ...
-
-    def state_of(self, robot: Robot, y: Array, stands: Array) -> Any:
-        """State that the unknowns describe."""
-        ...
-
-    def asked_at(
-        self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
-    ) -> SegmentInputs:
-        """Inputs of the robot at an instant."""
-        ...
-
-    def instant(
-        self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
-    ) -> tuple[Any, Array, Array, SegmentInputs]:
-        """Signals of an instant, rates of the unknowns in their units and of the totals [1/s], and inputs."""
-        ...
-
-    def slowness(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """Slowness of the shafts and of the sliding contacts [-]: 1 - |v| / limit.
-
-        The limit is the speed that resolves friction. Slowness is 1 at rest, and negative above the limit.
-        """
-        ...
-
-    def supply_current_and_charge(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """Current that the motors take from the source [A], and the charge taken [C]."""
-        ...
-
-    def stored(self, robot: Robot, found: Any) -> Scalar:
-        """Kinetic energy [J]."""
-        ...
-
-    def peaks(self, robot: Robot, found: Any) -> Scalars:
-        """Values at an instant whose largest values are recorded. The cell voltage is negated."""
-        ...
-
-    def peaks_within(self, robot: Robot, y: Array, tops: Array) -> Scalars:
-        """Peaks of currents and temperatures from the largest unknowns within a step.
-
-        A current counts only up to the driver's limit. Above it, only the ends of a step are exact.
-        """
-        ...
-
-    def exceeded(self, robot: Robot, found: Any) -> Scalars:
-        """Limits exceeded at an instant."""
-        ...
-
-    def limited(self, robot: Robot, y: Array) -> Array:
-        """True for each motor at its driver's current limit."""
-        ...
-
-    def norm(self, error: Array) -> Scalar:
-        """Norm of an error of the unknowns, relative to the tolerance [-]."""
-        ...
-
-    def demanded(self, robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
-        """Demanded speed of each row [rad/s or m/s]."""
-        ...
-
-    def status(self, robot: Robot, conditions: Conditions, found: Any) -> Array:
-        """Status of a moving robot at its last instant."""
-        ...
-
-    def at_places(self, signals: Signals, so_far: dict[str, Array]) -> Signals:
-        """Signals over time, completed by quantities that follow from the totals so far."""
-        ...
+#: Equations of motion of a robot in a mission: the module `mission_straight`, whose functions say what they return,
+#: or `mission_turning` with the same names. `found` is the result of `instant`: signals and, for a robot that turns,
+#: also its motion.
+#: TOTALS, PEAKS: units of the integrated quantities, and of those whose largest values are recorded.
+#: CLOCK, DISCHARGE, WINDING, HOUSING, CURRENT, MOTOR, GROUND, HEADING: positions among the unknowns of the time in
+#: the segment [s], the charge taken [C], temperatures [°C], currents, motor speeds, speed and heading.
+#: STOPS: positions of the unknowns that are 0 at rest. AT_REST: module for standing robots of this kind.
+#: RESULT: function (robot, instant, status) that returns the result at the end of a run.
+#: UNITS: units of the unknowns, except memories of effects. LONG: True if an instant takes long to compile.
+MotionLaw = ModuleType
 
 
 def _holding_margins(
@@ -181,9 +89,7 @@ def _holding_margins(
 
 def _holding_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
     """Margin of the friction that would hold the robot at rest [-], see `rest.holding_margin`."""
-    return jnp.asarray(
-        law.AT_REST.holding_margin(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands))
-    )
+    return law.AT_REST.holding_margin(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands))
 
 
 class IntegrationState(NamedTuple):
@@ -221,7 +127,7 @@ def _peak_between(before: Array, after: Array, rise: Array, fall: Array) -> Arra
     return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
-def _cell_voltage_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
+def _cell_voltage_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
     """Margin of a cell above its cut-off voltage [V]. Large on an external supply."""
     battery = asked.robot.battery
     cell = battery.voltage_cell(*law.supply_current_and_charge(asked, y, stands))
@@ -298,7 +204,6 @@ def integrate_segment(
     segment: Profile,
     carry: IntegrationState,
     tolerance: Scalar,
-    most: int,
 ) -> IntegrationState:
     """Integrates one segment until its end, or until the mission ends."""
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
@@ -307,7 +212,7 @@ def integrate_segment(
     first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
 
     def is_running(c: IntegrationState) -> Array:
-        return (c.y[law.CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
+        return (c.y[law.CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < MOST_STEPS)
 
     def take_step(c: IntegrationState) -> IntegrationState:
         return leg.after(c, *leg.step_to_event(c))
@@ -336,7 +241,7 @@ class _SegmentIntegrator(NamedTuple):
         demand = law.asked_at(robot, otherwise, segment, y, carry.stands)
         stands = carry.stands & (_holding_margin(law, demand, y, carry.stands) >= 0)
         # They may also change the cell voltage across its cut-off.
-        below = jnp.asarray(_cell_voltage_margin(law, demand, y, stands) < 0)
+        below = _cell_voltage_margin(law, demand, y, stands) < 0
         low = jnp.where(below & carry.below, carry.low, 0.0)
         step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
         events = event_functions(law, robot, otherwise, segment, y, stands, below)

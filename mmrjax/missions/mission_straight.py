@@ -1,4 +1,4 @@
-"""A mission in straight travel with equal sides: its unknowns, inputs, rates and integrals."""
+"""A mission in straight travel with equal sides: its unknowns, inputs, rates and integrals, a `MotionLaw`."""
 
 from __future__ import annotations
 
@@ -44,10 +44,12 @@ PEAKS: dict[str, str] = {
 
 
 def units(robot: Robot) -> Unknowns:
+    """Units of the unknowns."""
     return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
 
 
 def state_of(robot: Robot, y: Unknowns, stands: Array) -> State:
+    """State that the unknowns describe."""
     x = y * units(robot).astype(y.dtype)
     memory = {effect.name: x[len(UNITS) + k] for k, effect in enumerate(robot.remembering)}
     motor, speed = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND))
@@ -100,6 +102,7 @@ def controlled_duty(
 
 
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
+    """Inputs of the robot at an instant."""
     demand = segment.at(y[CLOCK])
     robot, conditions = with_consumers(robot, demand), demand.conditions(otherwise)
     state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
@@ -147,12 +150,17 @@ def instant(
 
 
 def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    """Slowness of the shafts and of the sliding contacts [-]: 1 - |v| / limit.
+
+    The limit is the speed that resolves friction. Slowness is 1 at rest, and negative above the limit.
+    """
     load, state = asked.robot.chassis(asked.conditions.configuration), state_of(asked.robot, y, stands)
     rolling = load.radius * state.speed_motor / asked.robot.gearbox.ratio
     return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
 
 
 def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    """Current that the motors take from the source [A], and the charge taken [C]."""
     robot, state = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions), state.current)
     motors = robot.sides * state.current * robot.driver.share_drawn(duty)
@@ -160,10 +168,12 @@ def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> 
 
 
 def stored(robot: Robot, found: Signals) -> Scalar:
+    """Kinetic energy [J]."""
     return energy.stored_energy(robot, found)
 
 
 def peaks(robot: Robot, found: Signals) -> Scalars:
+    """Values at an instant whose largest values are recorded. The cell voltage is negated."""
     cell = jnp.where(found.battery > 0.5, found.voltage_source / robot.battery.cells, jnp.inf)
     assert found.temperature is not None
     return {
@@ -177,6 +187,10 @@ def peaks(robot: Robot, found: Signals) -> Scalars:
 
 
 def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
+    """Peaks of currents and temperatures from the largest unknowns within a step.
+
+    A current counts only up to the driver's limit. Above it, only the ends of a step are exact.
+    """
     return {
         "current": robot.sides * jnp.minimum(UNITS[CURRENT] * tops[CURRENT], robot.driver.current_limit),
         "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
@@ -184,25 +198,31 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
 
 
 def exceeded(robot: Robot, found: Signals) -> Scalars:
+    """Limits exceeded at an instant."""
     is_too_hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
     return {**base.exceeded_limits(robot, found), "too_hot": is_too_hot}
 
 
 def limited(robot: Robot, y: Array) -> Array:
-    return jnp.asarray(robot.driver.limits(UNITS[CURRENT] * y[CURRENT]))
+    """True for each motor at its driver's current limit."""
+    return robot.driver.limits(UNITS[CURRENT] * y[CURRENT])
 
 
+#: Norm of an error of the unknowns, relative to the tolerance [-].
 norm = functools.partial(rosenbrock.error_norm, own=len(UNITS))
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
+    """Demanded speed of each row [rad/s or m/s]."""
     return segment.demand
 
 
 def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
-    conditions_now = dataclasses.replace(conditions, discharge=jnp.asarray(found.discharge))
+    """Status of a moving robot at its last instant."""
+    conditions_now = dataclasses.replace(conditions, discharge=found.discharge)
     return rest.status_moving(robot, conditions_now, found, found.duty * found.voltage_source)
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:
+    """Signals over time, completed by quantities that follow from the totals so far."""
     return signals

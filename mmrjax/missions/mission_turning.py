@@ -90,7 +90,7 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
         return demand
     y = SIDES * robot.chassis(otherwise.configuration).turning.width
     yaw_rate = jnp.where(segment.mode == SPEED, segment.yaw_rate, 0.0)
-    return demand - jnp.asarray(yaw_rate)[..., None] * y
+    return demand - yaw_rate[..., None] * y
 
 
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
@@ -134,12 +134,12 @@ def instant(
         moves * travel.acceleration_lateral,
         moves * travel.acceleration_yaw,
         motion.yaw_rate,
-        balances.charge_drawn(demand.robot, demand.conditions, jnp.asarray(signals.total_current)[0]),
+        balances.charge_drawn(demand.robot, demand.conditions, signals.total_current[0]),
         1.0,
         *(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals) for effect in robot.remembering),
     ]
-    power = jnp.mean(jnp.asarray(energy.source_power(demand.robot, demand.conditions, signals)))
-    current, torque = (jnp.asarray(x) ** 2 for x in (signals.current, signals.torque_gear))
+    power = jnp.mean(energy.source_power(demand.robot, demand.conditions, signals))
+    current, torque = (x**2 for x in (signals.current, signals.torque_gear))
     goes = energy.sink_powers_turning(demand.robot, demand.conditions, travel)
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
     totals = [
@@ -159,14 +159,14 @@ def instant(
 
 def _ground_speed(motion: PlaneMotion) -> Scalar:
     """Speed of the robot over the ground [m/s], with a derivative at rest."""
-    square = jnp.asarray(motion.speed) ** 2 + jnp.asarray(motion.speed_lateral) ** 2
+    square = motion.speed**2 + motion.speed_lateral**2
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, conditions = asked.robot, asked.conditions
     load, motion = robot.chassis(conditions.configuration), state_of(robot, y, stands)
-    rolling = load.radius * jnp.asarray(motion.speed_motor) / robot.gearbox.ratio
+    rolling = load.radius * motion.speed_motor / robot.gearbox.ratio
     sliding = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
     across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
     slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - sliding / load.speed_grip
@@ -176,9 +176,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
 def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions.of_sides()), motion.current)
-    return robot.sides * sum_of_sides(
-        jnp.asarray(motion.current * robot.driver.share_drawn(duty))
-    ) / 2, motion.discharge
+    return robot.sides * sum_of_sides(motion.current * robot.driver.share_drawn(duty)) / 2, motion.discharge
 
 
 def stored(robot: Robot, found: TurningInstant) -> Scalar:
@@ -187,7 +185,7 @@ def stored(robot: Robot, found: TurningInstant) -> Scalar:
 
 def peaks(robot: Robot, found: TurningInstant) -> Scalars:
     peaks_of_sides = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
-    most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in peaks_of_sides.items()}
+    most: Scalars = {name: jnp.max(x) for name, x in peaks_of_sides.items()}
     most |= {
         "current": sum_of_sides(jnp.asarray(peaks_of_sides["current"])) / 2,
         "speed": _ground_speed(found.motion),
@@ -204,8 +202,8 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
 
 def _peaks_of_sides(robot: Robot, each: dict[str, Any]) -> Scalars:
     """Peaks of one motor of each side."""
-    current = jnp.asarray(each["current"]) / robot.sides
-    signed_quantities = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
+    current = each["current"] / robot.sides
+    signed_quantities = (("current", current), ("temperature", each["temperature"]))
     return {f"{name}_{side}": x[k] for name, x in signed_quantities for k, side in enumerate(channels.SIDES)}
 
 
@@ -215,7 +213,7 @@ def exceeded(robot: Robot, found: TurningInstant) -> Scalars:
 
 
 def limited(robot: Robot, y: Array) -> Array:
-    return jnp.asarray(robot.driver.limits(_EACH[0] * y[CURRENT]))
+    return robot.driver.limits(_EACH[0] * y[CURRENT])
 
 
 norm = functools.partial(

@@ -26,7 +26,7 @@ from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.numerics.elementary import at_least, clip, cosine, sine, value_and_slope
-from mmrjax.turning.two_sides import SIDES, GroundForces, Stance, ground_forces, sum_of_sides
+from mmrjax.turning.two_sides import SIDES, GroundForceInputs, GroundForces, Stance, ground_forces, sum_of_sides
 
 #: Each balance with its unit and its equation.
 BALANCES = {
@@ -176,7 +176,8 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     speed_still = chassis.speed_still
     duty = robot.driver.duty_limited(bridge_duty(robot, conditions), state.current, conditions.polarity)
     straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
-    signals = Signals(
+    signals = _fill_unset(
+        Signals(),
         **straight,
         configuration=conditions.configuration,
         on_tracks=chassis.on_tracks,
@@ -210,6 +211,12 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     mass = total_mass + effects_sum(robot, _fill_unset(signals, mass=total_mass), "mass")
     normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
     return _fill_unset(signals, mass=mass, normal=normal)
+
+
+def mass_with_effects(robot: Robot, conditions: Conditions) -> Scalar:
+    """Total mass of robot and payload, with the effects that change it [kg]."""
+    zero = jnp.zeros_like(conditions.voltage)
+    return begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
 
 
 def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
@@ -726,7 +733,7 @@ def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: 
     signals = jax.vmap(functools.partial(begin_signals, robot))(own, states_of_sides(robot, conditions, motion))
     return _fill_unset(
         signals,
-        total_current=_both_sides(sum_of_sides(jnp.asarray(signals.total_current)) / 2),
+        total_current=_both_sides(sum_of_sides(signals.total_current) / 2),
         side=jnp.sign(SIDES),
         direction_turn=_both_sides(
             contact.smooth_sign(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)
@@ -761,16 +768,17 @@ def turning_signals(
     chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
     signals = _begin_sides(robot, conditions, sides, motion)
-    sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
+    sine_slope, mass = sine(conditions.slope), jnp.maximum(*signals.mass)
     even = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
     stance_loads = stance(robot, conditions, chassis, mass)
-    load, sliding = sum_of_sides(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
-    contact_forces = ground_forces(
+    load, sliding = sum_of_sides(units * even.normal), even.speed_sliding
+    inputs = GroundForceInputs(
         stance_loads, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral,
-        motion.yaw_rate, jnp.asarray(rolling), loads,
+        motion.yaw_rate, rolling,
     )  # fmt: skip
+    contact_forces = ground_forces(inputs, loads)
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill_unset(even, normal=contact_forces.normal / units, moment_lateral=contact_forces.moment / units)
     )
@@ -786,7 +794,7 @@ def turning_signals(
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
         pulled = jax.vmap(lambda c, s: _signals_at_imposed_speed(robot, c, chassis, s))(sides, pulled)
-        pulled = _fill_unset(pulled, total_current=_both_sides(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
+        pulled = _fill_unset(pulled, total_current=_both_sides(sum_of_sides(pulled.total_current) / 2))
     return Travel(
         pulled,
         contact_forces,
@@ -814,7 +822,7 @@ def readings_of_sides(robot: Robot, signals: Signals) -> Scalars:
     """
     read = sensor(robot, signals)
     return {
-        c.name: jnp.mean(jnp.asarray(read[c.name]), -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
+        c.name: jnp.mean(read[c.name], -1) if c.side is None else jnp.asarray(read[c.name])[..., c.side]
         for c in channels.EVERY
     }
 

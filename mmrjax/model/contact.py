@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.model.signals import safe_quotient
@@ -60,7 +61,7 @@ class Friction(eqx.Module):
         """
         return 0.1 * self.speed_static
 
-    def coefficient(self, speed: Scalar) -> Scalar:
+    def coefficient(self, speed: Scalar) -> Array:
         """Friction coefficient [-] at sliding `speed` [m/s], with the sign of the speed."""
         size = jnp.abs(speed)
         falling = cubic_step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
@@ -85,7 +86,7 @@ class Friction(eqx.Module):
         falling = (self.rise(size) - self.per_speed(square)) / (2 * size**2)
         return jnp.where(slow, -self.static / (2 * self.speed_static**3), falling)
 
-    def rise(self, speed: Scalar) -> Scalar:
+    def rise(self, speed: Scalar) -> Array:
         """Derivative of the coefficient with respect to sliding `speed` [s/m]. Negative between V_s and V_d."""
         size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static
         u = jnp.clip((size - self.speed_static) / width, 0.0, 1.0)
@@ -185,11 +186,11 @@ class Ground(eqx.Module):
         """Largest traction φ R_z [N], eqs. (6), (7). `adhesion` is the surface's ratio [-]."""
         return self.friction.static * adhesion * normal
 
-    def traction(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+    def traction(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Array:
         """Traction [N] of a contact that slides at `speed_sliding` [m/s], eq. (25) with Fig. 7."""
         return self.friction.coefficient(speed_sliding) * adhesion * normal
 
-    def traction_rise(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+    def traction_rise(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Array:
         """Derivative of `traction` with respect to `speed_sliding` [N·s/m]."""
         return self.friction.rise(speed_sliding) * adhesion * normal
 

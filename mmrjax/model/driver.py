@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.numerics.elementary import at_least, at_most, clip
@@ -88,7 +89,7 @@ class Driver(eqx.Module):
         excess = at_least(0.0, jnp.abs(current) * (1 / self.current_limit) - 1)
         return clip(duty - polarity * jnp.sign(current) * STEEPNESS * excess, -1.0, 1.0)
 
-    def limits(self, current: Scalar) -> Scalar:
+    def limits(self, current: Scalar) -> Array:
         """True if the limit acts at a motor `current` [A]."""
         return jnp.abs(current) > self.current_limit
 

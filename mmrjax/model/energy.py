@@ -62,13 +62,13 @@ def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) ->
     """Same as `sink_powers` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
     powers_of_sides = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
-    means: Scalars = {name: jnp.mean(jnp.asarray(power)) for name, power in powers_of_sides.items()}
-    weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
-    across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
+    means: Scalars = {name: jnp.mean(power) for name, power in powers_of_sides.items()}
+    weight = jnp.mean(signals.mass) * GRAVITY * sine(conditions.slope)
+    across = jnp.mean(signals.speed_lateral) * sine(jnp.mean(signals.heading))
     means["sliding"] = means["sliding"] + jnp.sum(travel.grip.across)
     for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
         effect_terms = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
-        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(effect_terms * jnp.asarray(rate))
+        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(effect_terms * rate)
     means["lift"] = means["lift"] - weight * across
     return means
 
@@ -76,7 +76,7 @@ def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) ->
 def stored_energy_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
     """Same as `stored_energy` for a robot that turns, with lateral and yaw motion [J]."""
     signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
-    turning = robot.chassis(jnp.max(jnp.asarray(signals.configuration))).turning
+    turning = robot.chassis(jnp.max(signals.configuration)).turning
     mean_energy = jnp.mean(jax.vmap(lambda s: stored_energy(robot, s))(signals))
-    across = jnp.mean(jnp.asarray(signals.mass)) * motion.speed_lateral**2
+    across = jnp.mean(signals.mass) * motion.speed_lateral**2
     return mean_energy + 0.5 * (across + turning.inertia * motion.yaw_rate**2)

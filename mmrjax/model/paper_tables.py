@@ -11,7 +11,7 @@ TRACKED, WHEELED = CONFIGURATIONS = ("6T2A", "4W2T")
 #: Main track of one side: teeth of belt and pulley, grousers (Section 3.4.4); pitches [m] (Section 3.2.4).
 TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24
 #: Track of one lever (Section 3.4.4).
-TEETH_LEVER, GROUSERS_LEVER = 112, 16
+GROUSERS_LEVER = 16
 PITCH_TOOTH, PITCH_GROUSER = 5e-3, 35e-3
 RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 #: Height of the body [m], Table 6.

@@ -80,10 +80,6 @@ class Configurations(eqx.Module):
         return np.array([float(load.on_tracks) > 0.5 for load in self.members])
 
 
-def _configurations(value: Any) -> Any:
-    return Configurations(value) if isinstance(value, Mapping) else value
-
-
 class Robot(eqx.Module):
     """Battery, one motor and gearbox per side, a load for each configuration, and effects.
 
@@ -100,7 +96,9 @@ class Robot(eqx.Module):
     battery: Battery
     motor: Motor
     gearbox: Gearbox
-    configurations: Configurations = eqx.field(converter=_configurations)
+    configurations: Configurations = eqx.field(
+        converter=lambda value: Configurations(value) if isinstance(value, Mapping) else value
+    )
     effects: tuple[Effect, ...] = ()
     sides: Scalar = eqx.field(default=2.0, converter=as_float)
     running_gear: RunningGear = eqx.field(default_factory=RunningGear)

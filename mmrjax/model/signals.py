@@ -36,8 +36,9 @@ FLAGS = (
 )  # fmt: skip
 
 
-#: Value of a quantity that the balances have not computed yet.
-UNSET = math.nan
+#: Values of a quantity that the balances have not computed yet, and of a motion that straight travel lacks.
+UNSET: Any = math.nan
+NONE: Any = 0.0
 
 
 class State(eqx.Module):
@@ -88,17 +89,17 @@ class PlaneMotion(eqx.Module):
         temperature: temperature of the windings of each side [°C], shape (2,). None: not followed.
     """
 
-    current: Scalar
-    speed_motor: Scalar
-    speed: Scalar
-    speed_lateral: Scalar
-    yaw_rate: Scalar
-    heading: Scalar
-    place_x: Scalar
-    place_y: Scalar
-    discharge: Scalar
+    current: Array
+    speed_motor: Array
+    speed: Array
+    speed_lateral: Array
+    yaw_rate: Array
+    heading: Array
+    place_x: Array
+    place_y: Array
+    discharge: Array
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
-    temperature: Scalar | None = None
+    temperature: Array | None = None
 
 
 class Signals(eqx.Module):
@@ -109,78 +110,76 @@ class Signals(eqx.Module):
 
     # conditions and state
     configuration: Index = 0  # index
-    on_tracks: Scalar = UNSET  # 1 on tracks, 0 on wheels
-    slope: Scalar = UNSET
-    payload: Scalar = UNSET
-    adhesion: Scalar = UNSET
-    battery: Scalar = UNSET  # 1 if the on-board battery feeds the motors
-    discharge: Scalar = UNSET
-    order: Scalar = UNSET  # place in the sequence of runs [-]
-    load_torque: Scalar | None = None  # of a brake on the output, against forward rotation [N·m]
+    on_tracks: Array = UNSET  # 1 on tracks, 0 on wheels
+    slope: Array = UNSET
+    payload: Array = UNSET
+    adhesion: Array = UNSET
+    battery: Array = UNSET  # 1 if the on-board battery feeds the motors
+    discharge: Array = UNSET
+    order: Array = UNSET  # place in the sequence of runs [-]
+    load_torque: Array | None = None  # of a brake on the output, against forward rotation [N·m]
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
-    current: Scalar = UNSET  # I_d of one motor [A]
-    speed_motor: Scalar = UNSET  # [rad/s]
-    speed: Scalar = UNSET  # V of the robot [m/s]
-    temperature: Scalar | None = None  # of the winding, if it is followed [°C]
+    current: Array = UNSET  # I_d of one motor [A]
+    speed_motor: Array = UNSET  # [rad/s]
+    speed: Array = UNSET  # V of the robot [m/s]
+    temperature: Array | None = None  # of the winding, if it is followed [°C]
     # motion of the robot in the plane of the ground; 0 in straight travel
-    side: Scalar = 0.0  # 1 of the left side, -1 of the right one [-]
-    speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
-    yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
-    direction_turn: Scalar = 0.0  # direction of the turn, -1..1, positive to the left [-]
-    moment_lateral: Scalar = 0.0  # of the lateral forces about the centre of mass, positive to the left [N·m]
-    heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]
-    place_x: Scalar = 0.0  # uphill of the start [m]
-    place_y: Scalar = 0.0  # to the left of the start [m]
+    side: Array = NONE  # 1 of the left side, -1 of the right one [-]
+    speed_lateral: Array = NONE  # v_y to the left [m/s]
+    yaw_rate: Array = NONE  # ω, positive to the left [rad/s]
+    direction_turn: Array = NONE  # direction of the turn, -1..1, positive to the left [-]
+    moment_lateral: Array = NONE  # of the lateral forces about the centre of mass, positive to the left [N·m]
+    heading: Array = NONE  # ψ from uphill, positive to the left [rad]
+    place_x: Array = NONE  # uphill of the start [m]
+    place_y: Array = NONE  # to the left of the start [m]
     # kinematics
-    direction: Scalar = UNSET  # of the shafts, -1..1, 0 at rest [-]
-    direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]
-    speed_wheel: Scalar = UNSET  # of driving wheel or pulley [rad/s]
-    speed_theoretical: Scalar = UNSET  # r_k ω_k, eq. (32) [m/s]
-    speed_output: Scalar = UNSET  # of the load's side of the output, not the wheel's within a backlash [rad/s]
-    angle: Scalar = UNSET  # of the output since the start of the run, of a load on a shaft [rad]
+    direction: Array = UNSET  # of the shafts, -1..1, 0 at rest [-]
+    direction_travel: Array = UNSET  # of the robot, -1..1 [-]
+    speed_wheel: Array = UNSET  # of driving wheel or pulley [rad/s]
+    speed_theoretical: Array = UNSET  # r_k ω_k, eq. (32) [m/s]
+    speed_output: Array = UNSET  # of the load's side of the output, not the wheel's within a backlash [rad/s]
+    angle: Array = UNSET  # of the output since the start of the run, of a load on a shaft [rad]
     # mass
-    mass: Scalar = UNSET  # total M [kg]; effects of balance `mass` see the stated one
-    normal: Scalar = UNSET  # normal load of one side [N]
+    mass: Array = UNSET  # total M [kg]; effects of balance `mass` see the stated one
+    normal: Array = UNSET  # normal load of one side [N]
     # supply and electrical
-    command: Scalar = UNSET  # duty that is demanded of the driver [-]
-    duty: Scalar = UNSET  # D that the driver gives, after its current limit [-]
-    pause: Scalar = UNSET  # share of a period without pulses, 1 - |D|; 0 if the motors are open or shorted [-]
-    share_drawn: Scalar = UNSET  # share of the motors' current that the supply gives [-]
-    total_current: Scalar = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]
-    voltage_source: Scalar = UNSET  # of battery or external supply, eq. (8) [V]
-    voltage: Scalar = UNSET  # U_e at the motors [V]
-    voltage_back: Scalar = UNSET  # E, eq. (16) [V]
-    voltage_drop: Scalar = UNSET  # I R and all further drops [V]
-    voltage_left: Scalar = UNSET  # drives L dI/dt, eq. (15) [V]
-    inductance: Scalar = UNSET  # L_d of the armature circuit, eq. (15) [H]
+    command: Array = UNSET  # duty that is demanded of the driver [-]
+    duty: Array = UNSET  # D that the driver gives, after its current limit [-]
+    pause: Array = UNSET  # share of a period without pulses, 1 - |D|; 0 if the motors are open or shorted [-]
+    share_drawn: Array = UNSET  # share of the motors' current that the supply gives [-]
+    total_current: Array = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]
+    voltage_source: Array = UNSET  # of battery or external supply, eq. (8) [V]
+    voltage: Array = UNSET  # U_e at the motors [V]
+    voltage_back: Array = UNSET  # E, eq. (16) [V]
+    voltage_drop: Array = UNSET  # I R and all further drops [V]
+    voltage_left: Array = UNSET  # drives L dI/dt, eq. (15) [V]
+    inductance: Array = UNSET  # L_d of the armature circuit, eq. (15) [H]
     # motor
-    torque_electromagnetic: Scalar = UNSET  # C_m I, eq. (17) [N·m]
-    torque_motor_loss: Scalar = UNSET  # M_df, eq. (14) [N·m]
-    torque_motor: Scalar = UNSET  # M_d, eq. (18), before the armature takes its share [N·m]
+    torque_electromagnetic: Array = UNSET  # C_m I, eq. (17) [N·m]
+    torque_motor_loss: Array = UNSET  # M_df, eq. (14) [N·m]
+    torque_motor: Array = UNSET  # M_d, eq. (18), before the armature takes its share [N·m]
     # ground and slip
-    resistance: Scalar = UNSET  # motion resistance F_f, eq. (5) [N]
-    gravity: Scalar = UNSET  # m_i g sin(slope) [N]
-    demand: Scalar = UNSET  # traction that holds the speed constant [N]
-    speed_slip_terms: Scalar = UNSET  # slip that is not sliding (effects) [m/s]
-    speed_sliding: Scalar = UNSET  # of the contact patch over the ground [m/s]
-    traction: Scalar = UNSET  # P_t [N]
-    adhesion_limit: Scalar = UNSET  # largest traction of the friction law [N]
+    resistance: Array = UNSET  # motion resistance F_f, eq. (5) [N]
+    gravity: Array = UNSET  # m_i g sin(slope) [N]
+    demand: Array = UNSET  # traction that holds the speed constant [N]
+    speed_slip_terms: Array = UNSET  # slip that is not sliding (effects) [m/s]
+    speed_sliding: Array = UNSET  # of the contact patch over the ground [m/s]
+    traction: Array = UNSET  # P_t [N]
+    adhesion_limit: Array = UNSET  # largest traction of the friction law [N]
     # track and gearbox
-    torque_track_loss: Scalar = UNSET  # eq. (24), (26) at the pulley [N·m]
-    torque_carried: Scalar = UNSET  # at the gearbox output, with what accelerates the load [N·m]
-    inertia_added: Scalar = UNSET  # by effects, of one side at the driving wheel [kg·m²]
-    torque_load: Scalar = UNSET  # all load of the gearbox output except inertia [N·m]
-    efficiency_load: Scalar = UNSET  # η_rm, or 1/η_rm if power flows back [-]
-    torque_idle: Scalar = UNSET  # M_rf_idle at the gearbox input, eq. (20) [N·m]
-    torque_input: Scalar = UNSET  # into the gearbox, less the armature's share [N·m]
-    torque_gear: Scalar = UNSET  # M_r, eq. (23) [N·m]
-    torque_output: Scalar = (
-        UNSET  # M_r less the effects of the gearbox: reading of a torque meter at the output [N·m]
-    )
-    torque_net: Scalar = UNSET  # drives the rotating masses, at the pulley [N·m]
+    torque_track_loss: Array = UNSET  # eq. (24), (26) at the pulley [N·m]
+    torque_carried: Array = UNSET  # at the gearbox output, with what accelerates the load [N·m]
+    inertia_added: Array = UNSET  # by effects, of one side at the driving wheel [kg·m²]
+    torque_load: Array = UNSET  # all load of the gearbox output except inertia [N·m]
+    efficiency_load: Array = UNSET  # η_rm, or 1/η_rm if power flows back [-]
+    torque_idle: Array = UNSET  # M_rf_idle at the gearbox input, eq. (20) [N·m]
+    torque_input: Array = UNSET  # into the gearbox, less the armature's share [N·m]
+    torque_gear: Array = UNSET  # M_r, eq. (23) [N·m]
+    torque_output: Array = UNSET  # M_r less the effects of the gearbox: reading of a torque meter at the output [N·m]
+    torque_net: Array = UNSET  # drives the rotating masses, at the pulley [N·m]
     # motion
-    acceleration_wheel: Scalar = UNSET  # [rad/s²]
-    acceleration: Scalar = UNSET  # of the robot [m/s²]
+    acceleration_wheel: Array = UNSET  # [rad/s²]
+    acceleration: Array = UNSET  # of the robot [m/s²]
 
 
 class Result(eqx.Module):

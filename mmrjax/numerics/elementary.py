@@ -80,7 +80,7 @@ def _half_turns(angle: Array) -> tuple[Array, Array]:
 @jax.jit
 def sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """sin of an angle within ±1e5 [rad], accurate to 3e-16."""
-    sign, angle_left = _half_turns(jnp.asarray(angle))
+    sign, angle_left = _half_turns(angle)
     return angle_left * _polynomial(angle_left * angle_left, _SINE) / sign
 
 
@@ -88,7 +88,7 @@ def sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 @jax.jit
 def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """cos of an angle within ±1e5 [rad], accurate to 3e-16."""
-    sign, angle_left = _half_turns(jnp.asarray(angle))
+    sign, angle_left = _half_turns(angle)
     return _polynomial(angle_left * angle_left, _COSINE) / sign
 
 
@@ -96,7 +96,7 @@ def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 @jax.jit
 def sine_third(share: Float[Array, "..."]) -> Float[Array, "..."]:
     """sin(asin(x) / 3), a root of 3 y - 4 y³ = x, for x within ±1, accurate to 2e-16, NaN beyond."""
-    share = jnp.asarray(share)
+    share = share
     size = jnp.abs(share)
     small = size < 0.5
     # asin x = π/2 - 2 asin √((1 - x) / 2) if the fraction is not accurate.

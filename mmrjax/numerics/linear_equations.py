@@ -21,7 +21,7 @@ They are here instead of lineax for two reasons, measured in one run (two cores,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -115,13 +115,19 @@ def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Arr
     return matrix, determinant
 
 
+def _eliminate(matrix: Array, b: Array, turn: Callable[[Array, Array], Array]) -> Array:
+    """Right side after a turn (k, rows) for each unknown k on the rows of matrix and right side."""
+    n = matrix.shape[0]
+    done = jax.lax.fori_loop(0, n, turn, jnp.concatenate([matrix, b.reshape(n, -1)], 1))
+    return done[:, n:].reshape(b.shape)
+
+
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """A⁻¹ b by Gauss-Jordan elimination, with row exchanges for the largest pivot. b may have columns.
 
     Not finite if A is singular.
     """
-    n = matrix.shape[0]
-    index = jnp.arange(n)
+    index = jnp.arange(matrix.shape[0])
 
     def turn(k: Array, rest: Array) -> Array:
         pivot = jnp.argmax(jnp.where(index < k, -1.0, jnp.abs(rest[:, k])))
@@ -131,8 +137,7 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array,
         column = jnp.where(index == k, 0.0, exchanged[:, k])
         return jnp.where((index == k)[:, None], row, exchanged - column[:, None] * row)
 
-    done = jax.lax.fori_loop(0, n, turn, jnp.concatenate([matrix, b.reshape(n, -1)], 1))
-    return done[:, n:].reshape(b.shape)
+    return _eliminate(matrix, b, turn)
 
 
 def invert(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -150,5 +155,4 @@ def solve_lower(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[
         column = jnp.where(index > k, row[:n], 0.0)
         return jnp.where((index == k)[:, None], row, rest - column[:, None] * row)
 
-    done = jax.lax.fori_loop(0, n, turn, jnp.concatenate([matrix, b.reshape(n, -1)], 1))
-    return done[:, n:].reshape(b.shape)
+    return _eliminate(matrix, b, turn)

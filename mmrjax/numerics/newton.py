@@ -1,11 +1,10 @@
 """Newton's method for a few unknowns over a large batch, with derivatives by the implicit function theorem.
 
-`FewUnknowns` is a root finder of optimistix, called through `optimistix.root_find`. For 65 536 points of `steady` on
-two cores it takes 29 ms of processor time. A loop of our own took 27 ms (medians of four turns of ten calls,
-alternating in one run, 2026-11-28). optimistix's `Newton` takes 3.1 times as long, because it factorises by batched
-calls of LAPACK. The derivative is written here. A program with optimistix's derivative (`ImplicitAdjoint`) contains a
-host callback, through lineax, and JAX's cache never stores such a program. With `elimination` as lineax's solver it
-is as fast (0.5 ms for 4096 gradients). With `Newton` it takes seven times as long.
+For 65 536 points of `steady` on two cores the loop takes 27 ms of processor time, and the same method called through
+optimistix 29 ms (medians of four turns of ten calls, alternating in one run, 2026-11-28). optimistix's `Newton` takes
+3.1 times as long, because it factorises by batched calls of LAPACK. The derivative is written here. A program with
+optimistix's derivative (`ImplicitAdjoint`) contains a host callback, through lineax. JAX's cache never stores such a
+program.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
@@ -29,8 +27,6 @@ from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, r
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
 
-#: The same in the form of optimistix: f(y, (shared, own)), without further arguments.
-Function = Callable[[Vector, tuple[Any, Any]], tuple[Vector, Any]]
 
 #: Linearisations after which a search has failed.
 MAX_STEPS = 60
@@ -40,7 +36,7 @@ PATIENCE = 8
 TOGETHER = 64
 
 
-def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix, Vector]:
+def _linearised(residual: Residual, y: Vector, args: tuple[Any, Any], apart: bool) -> tuple[Matrix, Vector]:
     """∂f/∂y by its rows, and f.
 
     `apart`: one unknown after another, so that rows that do not depend on it cost nothing, else all together, in a
@@ -49,7 +45,7 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
     if not apart:
 
         def together(y: Array) -> tuple[Vector, Vector]:
-            values = fn(tuple(y), args)[0]
+            values = residual(tuple(y), *args)
             return values, values
 
         slopes, value = jax.jacfwd(together, has_aux=True)(jnp.stack(y))
@@ -60,7 +56,7 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
         moved_inputs: set[int] = set()
 
         def along(x: Array, k: int = k, moved: set[int] = moved_inputs) -> Vector:
-            values = fn((*y[:k], x, *y[k + 1 :]), args)[0]
+            values = residual((*y[:k], x, *y[k + 1 :]), *args)
             return tuple(_watch_derivative(v, i, moved) for i, v in enumerate(values))
 
         value, column = value_and_slope(along, y[k])
@@ -116,16 +112,16 @@ class NewtonState(eqx.Module):
     low: Array
     high: Array
 
-    def after(self, jacobian: Matrix, value: Vector, atol: float) -> NewtonState:
-        """The search after one turn, from ∂f/∂y and f at its unknowns."""
+    def after(self, jacobian: Matrix, value: Vector, tolerance: float) -> NewtonState:
+        """The search after one turn, from ∂f/∂y and f at its unknowns.
+
+        It is solved after a step whose square is below `tolerance`.
+        """
         factors = factorise(jacobian)
         step, unknowns, residual = _solve_step(factors, value), self.y[-1], value[-1]
         # Such a small step leaves an error of the order of its square.
-        solved, is_value_small, is_late = (
-            _is_small(step, atol**0.7),
-            _is_small(value[:-1], atol**0.5),
-            self.turns >= PATIENCE,
-        )
+        solved, is_late = _is_small(step, tolerance**0.7), self.turns >= PATIENCE
+        is_value_small = _is_small(value[:-1], tolerance**0.5)
         low = jnp.where(is_value_small & (residual < 0), unknowns, self.low)
         high = jnp.where(is_value_small & (residual > 0), unknowns, self.high)
         then = unknowns - step[-1]
@@ -139,69 +135,13 @@ class NewtonState(eqx.Module):
         return NewtonState(_subtract_step(self.y, damped_step), solved, self.turns + 1, low, high)
 
 
-class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, NewtonState]):
-    """Newton's method for a few scalars, each determined by the equation of the same index (see `factorise`).
+def _begin(start: Vector) -> NewtonState:
+    least = jnp.full_like(start[-1], -jnp.inf)
+    return NewtonState(start, jnp.asarray(False), jnp.asarray(0), least, -least)
 
-    A member is solved after a step whose square is below `atol`.
 
-    Attributes:
-        atol: absolute tolerance of f.
-        rtol, norm: not read.
-        apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches. False: all
-            together, a program of a third of the size.
-    """
-
-    rtol: float = 0.0
-    atol: float = 1e-12
-    norm: Callable[[Any], Array] = optx.max_norm
-    apart: bool = False
-
-    def init(
-        self,
-        fn: Function,
-        y: Vector,
-        args: tuple[Any, Any],
-        options: dict[str, Any],
-        f_struct: Any,
-        aux_struct: Any,
-        tags: frozenset,
-    ) -> NewtonState:
-        """Returns the state of a search before its first turn."""
-        least = jnp.full_like(y[-1], -jnp.inf)
-        return NewtonState(y, jnp.asarray(False), jnp.asarray(0), least, -least)
-
-    def step(
-        self,
-        fn: Function,
-        y: Vector,
-        args: tuple[Any, Any],
-        options: dict[str, Any],
-        state: NewtonState,
-        tags: frozenset,
-    ) -> tuple[Vector, NewtonState, Any]:
-        """One turn: y - J⁻¹ f."""
-        state = state.after(*_linearised(fn, state.y, args, self.apart), self.atol)
-        return state.y, state, None
-
-    def terminate(
-        self, fn: Function, y: Vector, args: Any, options: dict[str, Any], state: NewtonState, tags: frozenset
-    ) -> tuple[Array, optx.RESULTS]:
-        """True if f is 0 at the unknowns."""
-        return state.solved, optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
-
-    def postprocess(
-        self,
-        fn: Function,
-        y: Vector,
-        aux: Any,
-        args: Any,
-        options: dict[str, Any],
-        state: NewtonState,
-        tags: frozenset,
-        result: optx.RESULTS,
-    ) -> tuple[Vector, Any, dict[str, Any]]:
-        """Returns the unknowns."""
-        return state.y, aux, {}
+def _has_ended(state: NewtonState) -> Array:
+    return state.solved | (state.turns >= MAX_STEPS)
 
 
 @eqx.filter_custom_jvp
@@ -213,7 +153,7 @@ def root(
     tolerance: float,
     linear: Residual | None,
 ) -> tuple[Vector, Bool[Array, ""]]:
-    """Solves f(y) = 0 by `FewUnknowns`, until every member of a batch has converged.
+    """Solves f(y) = 0, until every member of a batch has converged.
 
     Args:
         residual: f, scaled to the order of one. Pure, without differentiated data of its own. Equation k
@@ -222,7 +162,7 @@ def root(
         shared, own: arguments of f other than y: data of all members of a batch and of each. Derivatives with respect
             to both are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero if
             ∂f/∂y is singular. The program holds no host callback.
-        tolerance: as `FewUnknowns.atol`.
+        tolerance: absolute tolerance of f.
         linear: f in its usual branches, where it is linear in y, None if it has none. Its root is computed first, so
             that XLA fuses it over a batch with the code before and after. The search runs only for members in which
             that leaves |f| above the tolerance.
@@ -230,19 +170,18 @@ def root(
     Returns:
         y, and whether it converged within `MAX_STEPS` turns, False for a residual that is not finite.
     """
-    function: Any = _function(residual)
     own = jax.tree.map(jnp.asarray, own)
 
     def search(start: Vector, shared: Any, own: Any) -> tuple[Vector, Array]:
-        method: Any = FewUnknowns(atol=tolerance, apart=True)
-        solution: optx.Solution = optx.root_find(
-            function, method, start, (shared, own), has_aux=True, max_steps=MAX_STEPS, throw=False
-        )
-        return solution.value, solution.state.solved
+        def turn(state: NewtonState) -> NewtonState:
+            return state.after(*_linearised(residual, state.y, (shared, own), True), tolerance)
+
+        end = jax.lax.while_loop(lambda state: ~_has_ended(state), turn, _begin(start))
+        return end.y, end.solved
 
     if linear is None:
         return search(start, shared, own)
-    jacobian, value = _linearised(_function(linear), start, (shared, own), True)
+    jacobian, value = _linearised(linear, start, (shared, own), True)
     y = _subtract_step(start, _solve_step(factorise(jacobian), value))
     solved = _is_small(residual(y, shared, own), tolerance)
     return compute_if_needed(~solved, search, (y, shared, own), (y, solved))
@@ -253,20 +192,15 @@ def root_alone(residual: Residual, start: Vector, shared: Any, own: Any, toleran
 
     In a batch each member ends on its own. One without a root takes every turn, but does not delay the others.
     """
-    method, function = FewUnknowns(atol=tolerance), _function(residual)
     found: tuple[Vector, Array] = batch_flow.loop_until(
-        lambda given: method.init(function, given[0], given[1:], {}, None, None, frozenset()),
-        lambda given, state: method.step(function, state.y, given[1:], {}, state, frozenset())[1],
-        lambda state: state.solved | (state.turns >= MAX_STEPS),
+        lambda given: _begin(given[0]),
+        lambda given, state: state.after(*_linearised(residual, state.y, given[1:], False), tolerance),
+        _has_ended,
         (start, shared, own),
         lambda state: (state.y, state.solved),
         TOGETHER,
     )
     return found
-
-
-def _function(residual: Residual) -> Function:
-    return lambda y, args: (residual(y, *args), None)
 
 
 @root.def_jvp
@@ -276,7 +210,7 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tu
     input_change = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, inputs), tangents[2:4])[1]
     if input_change is None or all(m is None for m in input_change):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, inputs), True)[0]))
+    factors, own_factors = regularise(factorise(_linearised(residual, y, (shared, inputs), True)[0]))
     step = substitute(factors, input_change)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)

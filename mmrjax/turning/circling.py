@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import rest
-from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, withhold_numbers
+from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, status_unless_empty, withhold_numbers
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
@@ -102,15 +102,15 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
     free = conditions.of_sides().motor_speed is None
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
     residuals = [
-        *jnp.asarray(free * signals.voltage_left / signals.inductance),
-        *jnp.asarray(free * signals.acceleration_wheel * robot.gearbox.ratio),
+        *(free * signals.voltage_left / signals.inductance),
+        *(free * signals.acceleration_wheel * robot.gearbox.ratio),
         travel.acceleration,
         travel.acceleration_lateral,
         travel.acceleration_yaw,
         motion.yaw_rate,
         motion.speed * cos - motion.speed_lateral * sin,
         motion.speed * sin + motion.speed_lateral * cos,
-        balances.charge_drawn(robot, conditions, jnp.asarray(signals.total_current)[0]),
+        balances.charge_drawn(robot, conditions, signals.total_current[0]),
     ]
     for effect in memory_effects:
         residuals.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
@@ -354,7 +354,7 @@ def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tu
     current, is_limited = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(
         conditions.of_sides(), motion.current
     )
-    motion = dataclasses.replace(motion, current=current)
+    motion = dataclasses.replace(motion, current=jnp.asarray(current))
     travel = _turning(rest.without_diode(robot), conditions, motion, y[SETTLING:] * _load_units(robot, conditions))
     signals = travel.signals
     signals = dataclasses.replace(
@@ -417,9 +417,10 @@ def status_of_steady_motion(
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
     motion_size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
     status = jnp.where(jnp.minimum(shafts, motion_size) < chassis.speed_still, STALLED, CONVERGED)
-    status = jnp.where(has_tipped(robot, travel), TIPS, status)
-    empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
-    return jnp.where(empty, BATTERY_EMPTY, status)
+    grip, load = travel.grip, jnp.sum(travel.grip.normal)
+    tips = (jnp.abs(grip.moved) >= load / 2) | (jnp.abs(grip.centre) >= robot.running_gear.wheelbase / 2)
+    status = jnp.where(tips, TIPS, status)
+    return status_unless_empty(status, robot, conditions, motion.discharge)
 
 
 def status_after_run(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
@@ -457,13 +458,13 @@ def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -
     return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(sides, state))
 
 
-def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
+def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Array:
     """Margin of the friction that holds the robot at rest at its heading, negative if it cannot hold it [-].
 
     The friction of each side has to hold its motor and its share of gravity. The ground has to hold all of gravity.
     """
     own, state = _sides_at_rest(robot, conditions, motion)
-    sides = jnp.asarray(jax.vmap(lambda c, s: rest.holding_margin(robot, c, s))(own, state))
+    sides = jax.vmap(lambda c, s: rest.holding_margin(robot, c, s))(own, state)
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
     lateral_slope = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
@@ -474,15 +475,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     """True if friction holds a standing robot at the currents one millisecond after the start."""
     motion = motion_of_unknowns(robot, turning_start(robot, conditions))
     settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
-    return jnp.asarray(jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0)
-
-
-def has_tipped(robot: Robot, travel: balances.Travel) -> Array:
-    """True if no load is left on one side, or if all load is at an end of the contact."""
-    load = jnp.sum(travel.grip.normal)
-    return (jnp.abs(travel.grip.moved) >= load / 2) | (
-        jnp.abs(travel.grip.centre) >= robot.running_gear.wheelbase / 2
-    )
+    return jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0
 
 
 def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Result:

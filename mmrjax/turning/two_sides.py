@@ -32,7 +32,7 @@ BETWEEN, OVER = 0.208, 0.278
 #: Square of a sliding speed that is too small to have a direction [m²/s²].
 STILL = 1e-16
 #: Newton steps of the load transfer; the contact's forces are nearly bilinear in it. The loop over three steps is
-#: unrolled: for 1024 turns `newton.FewUnknowns` takes 1.28 times its time, and optimistix's `Newton` 4.8 times, for
+#: unrolled: for 1024 turns `newton.root` takes 1.28 times its time, and optimistix's `Newton` 4.8 times, for
 #: the same loads (two cores, processor time in one run, 2026-11-28).
 LOAD_STEPS = 3
 
@@ -166,7 +166,7 @@ class ContactLaw(eqx.Module):
         powers = np.arange(most + 1)
         of_line = share[:, None] * line[:, None] ** powers
         of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
-        line_and_ends = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
+        line_and_ends = x @ np.concatenate([of_line, of_ends], axis=1)
         return jnp.where(self.on_tracks > 0.5, line_and_ends[..., : most + 1], line_and_ends[..., most + 1 :])
 
     def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
@@ -177,12 +177,8 @@ class ContactLaw(eqx.Module):
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
         """Derivatives of `per_speed` with respect to the squares of the sliding speeds [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
-        direction_gain, friction_per_speed = (
-            jnp.sqrt((square + STILL) / (weighed + STILL)),
-            self.friction.per_speed(square),
-        )
-        slower = direction_gain * self.friction.per_speed_rise(square)
-        share = friction_per_speed * direction_gain / 2
+        slower = jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed_rise(square)
+        share = self.per_speed(along, across) / 2
         return (
             slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
             slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
@@ -243,8 +239,19 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return moments, change
 
 
-class _GroundForceInputs(NamedTuple):
-    """Arguments of `ground_forces`."""
+class GroundForceInputs(NamedTuple):
+    """What both sides do on the ground.
+
+    Attributes:
+        stance: stance of the robot.
+        friction: friction of the ground.
+        adhesion: adhesion relative to the robot's surface [-].
+        load: load of both sides, normal to the ground [N].
+        sliding: longitudinal sliding speed u_x of each side [m/s].
+        lateral_speed: lateral speed v_y [m/s].
+        yaw_rate: yaw rate ω [rad/s].
+        resistance: rolling resistance relative to the normal load, with sign, for each side [-].
+    """
 
     stance: Stance
     friction: Friction
@@ -256,35 +263,17 @@ class _GroundForceInputs(NamedTuple):
     resistance: Array
 
 
-def ground_forces(
-    stance: Stance,
-    friction: Friction,
-    adhesion: Scalar,
-    load: Scalar,
-    sliding: Pair,
-    lateral_speed: Scalar,
-    yaw_rate: Scalar,
-    resistance: Pair,
-    loads: Pair | None = None,
-) -> GroundForces:
+def ground_forces(inputs: GroundForceInputs, loads: Pair | None = None) -> GroundForces:
     """Ground forces and loads of both sides, which depend on each other.
 
     The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR). The load of a
     side is never negative.
 
     Args:
-        stance: stance of the robot.
-        friction: friction of the ground.
-        adhesion: adhesion relative to the robot's surface [-].
-        load: load of both sides, normal to the ground [N].
-        sliding: longitudinal sliding speed u_x of each side [m/s].
-        lateral_speed: lateral speed v_y [m/s].
-        yaw_rate: yaw rate ω [rad/s].
-        resistance: rolling resistance relative to the normal load, with sign, for each side [-].
+        inputs: motion and stance of both sides.
         loads: load transfer T [N] and centre of pressure x_p [m], if they are unknowns of a larger search. None: they
             are solved here.
     """
-    inputs = _GroundForceInputs(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
         return _forces_at_loads(loads, None, inputs)
     detached_inputs = jax.lax.stop_gradient(inputs)
@@ -302,7 +291,7 @@ def _load_step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
+def _solve_loads(given: GroundForceInputs) -> tuple[Pair, GroundForces]:
     """Load transfer [N] and centre of pressure [m], and the derivatives of `GroundForces` with respect to them.
 
     The results carry no derivatives. While the whole contact is loaded, the moments of its law do not depend on the
@@ -310,7 +299,7 @@ def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
     """
     stance, load = given.stance, given.load
 
-    def steps(loads: Array, given: _GroundForceInputs, even: Array | None) -> tuple[Array, GroundForces]:
+    def steps(loads: Array, given: GroundForceInputs, even: Array | None) -> tuple[Array, GroundForces]:
         def step(_: int, loads: Array) -> Array:
             def lacking(x: Array) -> tuple[Array, Array]:
                 return (_forces_at_loads(x, even, given).lacking,) * 2
@@ -331,7 +320,7 @@ def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
     return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (first_loads, given), solution)
 
 
-def _moment_arguments(centre: Scalar, given: _GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
+def _moment_arguments(centre: Scalar, given: GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
     """Arguments of `law_moments` for a centre of pressure."""
     stance, yaw = given.stance, given.yaw_rate
     place, half, _ = loaded_part(stance, centre)
@@ -339,7 +328,7 @@ def _moment_arguments(centre: Scalar, given: _GroundForceInputs) -> tuple[Contac
     return law, given.sliding, -given.lateral_speed - yaw * (place - stance.ahead), -yaw * half
 
 
-def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs) -> GroundForces:
+def _forces_at_loads(loads: Array, even: Array | None, given: GroundForceInputs) -> GroundForces:
     """Ground forces for a given load transfer and centre of pressure.
 
     The lateral speed is linear along a contact, and so is its load. Forces and moments are therefore sums of four

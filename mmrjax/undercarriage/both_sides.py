@@ -44,6 +44,8 @@ X, Y, HEIGHT, YAW, PITCH, ROLL = range(6)
 PULLEYS = np.array([[6, 7], [8, 9]])
 SHAFTS = PULLEYS[:, 0]
 COORDINATES = 10
+#: Coordinates of the motion in the plane of the ground.
+PLANE = np.array([X, Y, YAW])
 #: Coordinates that the contacts of left and right side act on.
 OF_SIDE = np.array([[*range(6), *pulleys] for pulleys in PULLEYS])
 
@@ -72,20 +74,26 @@ class _ContactsOfSides(eqx.Module):
         return jax.vmap(side)(signals, self.at, self.aside, self.height)
 
 
-def _width(run: HalfRobotSystem) -> Scalar:
-    return run.chassis.turning.width
+def _places_of_sides(run: HalfRobotSystem) -> Pair:
+    """Distances of the sides to the left of the middle of the robot [m]."""
+    return jnp.asarray(SIDES * run.chassis.turning.width)
 
 
-def _mid_wheelbase_speeds(run: HalfRobotSystem, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
+def _heading(motion: HalfRobotState) -> tuple[Array, Array]:
+    """Cosine and sine of the yaw angle."""
+    return cosine(motion.q[YAW]), sine(motion.q[YAW])
+
+
+def _mid_wheelbase_speeds(motion: HalfRobotState, v: Coordinates) -> tuple[Array, Array]:
     """Speeds of the middle of the wheelbase, ahead and to the left, in the frame of the robot [m/s]."""
-    cos, sin = cosine(yaw), sine(yaw)
+    cos, sin = _heading(motion)
     return cos * v[X] + sin * v[Y], cos * v[Y] - sin * v[X]
 
 
 def plane_motion(run: HalfRobotSystem, motion: HalfRobotState) -> PlaneMotion:
     """Motion in the form of the other fidelities: speeds of the centre of mass of a level robot."""
     q, v = motion.q, motion.v
-    speed, lateral = _mid_wheelbase_speeds(run, v, q[YAW])
+    speed, lateral = _mid_wheelbase_speeds(motion, v)
     forward, up = run.half.centre
     return PlaneMotion(
         current=motion.current,
@@ -103,8 +111,8 @@ def plane_motion(run: HalfRobotSystem, motion: HalfRobotState) -> PlaneMotion:
 
 def _contacts_of_sides(run: HalfRobotSystem, motion: HalfRobotState) -> _ContactsOfSides:
     q, v = motion.q, motion.v
-    speed, lateral = _mid_wheelbase_speeds(run, v, q[YAW])
-    y = SIDES * _width(run)
+    speed, lateral = _mid_wheelbase_speeds(motion, v)
+    y = _places_of_sides(run)
     heights, rises = q[HEIGHT] + y * q[ROLL], v[HEIGHT] + y * v[ROLL]
     nothing = jnp.zeros_like(y)
     of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
@@ -140,9 +148,7 @@ def _loss_derivatives(run: HalfRobotSystem, motion: PlaneMotion, sides: _Contact
 
     def shaft(change: Scalar) -> Array:
         faster = motion.speed_motor + run.robot.gearbox.ratio * change
-        return jnp.asarray(
-            _resolve_signals(run, dataclasses.replace(motion, speed_motor=faster), sides)[0].torque_net
-        )
+        return _resolve_signals(run, dataclasses.replace(motion, speed_motor=faster), sides)[0].torque_net
 
     zero, one = jnp.zeros_like(motion.speed), jnp.ones_like(motion.speed)
     return jnp.stack([jnp.maximum(-jax.jvp(f, (zero,), (one,))[1], 0.0) for f in (along, shaft)])
@@ -154,8 +160,8 @@ _ContactLevers = tuple[Array, Array, Array]
 
 
 def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactState) -> _ContactLevers:
-    cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
-    one, y = jnp.ones_like(at.gap), (SIDES * _width(run))[:, None]
+    cos, sin = _heading(motion)
+    one, y = jnp.ones_like(at.gap), (_places_of_sides(run))[:, None]
     none = jnp.zeros_like(one)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     x, z = at.lever_x, at.lever_z
@@ -169,8 +175,8 @@ def generalized_forces(
     run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, at: ContactState, pulled: ContactPull
 ) -> Coordinates:
     """Generalized forces on q [N, N·m]."""
-    cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
-    y, several = SIDES * _width(run), run.robot.sides / 2
+    cos, sin = _heading(motion)
+    y, several = _places_of_sides(run), run.robot.sides / 2
     assert pulled.aside is not None
     moment_lateral = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
     lateral, yaw = balances.lateral_and_yaw_effects(
@@ -181,7 +187,7 @@ def generalized_forces(
     turn = several * (jnp.sum(pulled.aside * at.lever_x) - y @ forward) - yaw
     roll_moment = several * (y @ normal - jnp.sum(pulled.aside * at.lever_z))
     body = [cos * ahead - sin * aside, sin * ahead + cos * aside, several * jnp.sum(normal), turn]
-    shafts = several * jnp.asarray(signals.torque_net), several * rear
+    shafts = several * signals.torque_net, several * rear
     pulleys = [x[k] for k in range(2) for x in shafts]
     return jnp.stack([*body, several * jnp.sum(moment), roll_moment, *pulleys])
 
@@ -198,7 +204,7 @@ def damping_matrix(
     along, across, off = levers
     assert pulled.aside is not None
     sliding = jax.vmap(side_contacts.sliding_speeds)(signals, touching)
-    weight = jnp.asarray(signals.adhesion)[:, None] * touching.force
+    weight = signals.adhesion[:, None] * touching.force
     rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
     rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]
     least = jnp.maximum(touching.force, 1e-9)
@@ -211,10 +217,10 @@ def damping_matrix(
     side_matrices = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
     losses = _loss_derivatives(run, plane_motion(run, motion), sides)
     # Rolling resistance acts at each side, along the robot.
-    cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
+    cos, sin = _heading(motion)
     total = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
-    for k, y in enumerate(SIDES):
-        way = jnp.zeros(8).at[jnp.asarray([X, Y, YAW])].set(jnp.stack([cos, sin, -y * _width(run)]))
+    for k, y in enumerate(_places_of_sides(run)):
+        way = jnp.zeros(8).at[PLANE].set(jnp.stack([cos, sin, -y]))
         of_side = side_matrices[k] + losses[0, k] * jnp.outer(way, way)
         of_side = of_side.at[6, 6].add(losses[1, k])
         total = total.at[np.ix_(OF_SIDE[k], OF_SIDE[k])].add(of_side)
@@ -258,9 +264,7 @@ def _step_forces(run: HalfRobotSystem, motion: HalfRobotState, stored: bool = Fa
     sides = found(_contacts_of_sides(run, motion))
     signals, pulled = found(_resolve_signals(run, plane_motion(run, motion), sides))
     damping, levers, rises = damping_matrix(run, motion, signals, sides, pulled)
-    mass, bias = mass_matrix_and_bias(
-        run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.armature_inertia(run, signals))
-    )
+    mass, bias = mass_matrix_and_bias(run, motion, run.robot.sides / 2 * half_robot.armature_inertia(run, signals))
     push = run.step * (generalized_forces(run, motion, signals, sides.at, pulled) - bias)
     return _StepForces(sides, signals, pulled, levers, rises, mass, damping, push)
 
@@ -306,11 +310,11 @@ def _damping_product(
     assert pulled.aside is not None
     after = contact_forces_after_step(touching, pulled, levers, found.rises, gained)
     losses, shafts = _loss_derivatives(run, plane_motion(run, motion), found.sides)
-    cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
+    (cos, sin), y = _heading(motion), _places_of_sides(run)
     ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
     rolling_damping = losses * (ahead - y * turn)
     gained_forces = jnp.zeros(COORDINATES, motion.v.dtype).at[SHAFTS].set(shafts * gained[SHAFTS])
-    gained_forces = gained_forces.at[jnp.asarray([X, Y, YAW])].add(
+    gained_forces = gained_forces.at[PLANE].add(
         jnp.stack([cos * jnp.sum(rolling_damping), sin * jnp.sum(rolling_damping), -y @ rolling_damping])
     )
     for lever, now, then in zip(levers, (pulled.force, pulled.aside, touching.force), after, strict=True):
@@ -362,10 +366,10 @@ def _signals_after_step(
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
     signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
     # Of the centre of mass, in the rotating frame of the robot.
-    speed, lateral = _mid_wheelbase_speeds(run, motion.v, motion.q[YAW])
-    ahead_gained, aside_gained = _mid_wheelbase_speeds(run, gained / run.step, motion.q[YAW])
+    speed, lateral = _mid_wheelbase_speeds(motion, motion.v)
+    ahead_gained, aside_gained = _mid_wheelbase_speeds(motion, gained / run.step)
     turn = gained[YAW] / run.step
-    y = SIDES * _width(run)
+    y = _places_of_sides(run)
     acceleration = ahead_gained + motion.v[YAW] * lateral
     signals = dataclasses.replace(signals, acceleration=acceleration - turn * y)
     grip = GroundForces(
@@ -394,7 +398,7 @@ def stand(run: HalfRobotSystem) -> HalfRobotState:
     )
     q = (
         jnp.zeros(COORDINATES, half.q.dtype)
-        .at[jnp.asarray([HEIGHT, PITCH, YAW])]
+        .at[np.array([HEIGHT, PITCH, YAW])]
         .set(jnp.stack([half.q[1], half.q[2], heading + jnp.zeros_like(half.q[1])]))
     )
     memory = {name: jnp.stack([x, x]) for name, x in half.memory.items()}
@@ -409,7 +413,7 @@ def roll(run: HalfRobotSystem) -> HalfRobotState:
     lateral = rolls.speed_lateral - run.half.centre[0] * rolls.yaw_rate
     shafts = rolls.speed_motor / run.robot.gearbox.ratio
     plane = [cos * rolls.speed - sin * lateral, sin * rolls.speed + cos * lateral, rolls.yaw_rate]
-    v = begins.v.at[jnp.asarray([X, Y, YAW])].set(jnp.stack(plane)).at[PULLEYS].set(jnp.asarray(shafts)[:, None])
+    v = begins.v.at[PLANE].set(jnp.stack(plane)).at[PULLEYS].set(shafts[:, None])
     return dataclasses.replace(begins, v=v, current=rolls.current, memory=rolls.memory)
 
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.base import result_of_signals, travel_status
+from mmrjax.fidelities.base import result_of_signals, status_unless_empty, travel_status
 from mmrjax.fidelities.drive import current_after
 from mmrjax.fidelities.rest import STARTS, is_at_rest, status_with_slip, travel_direction, voltage_at_rest
 from mmrjax.fidelities.steady import steady
@@ -26,7 +26,6 @@ from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
-    BATTERY_EMPTY,
     FAILED,
     GRAVITY,
     NOT_SETTLED,
@@ -75,8 +74,8 @@ class HalfRobotState(eqx.Module):
 
     q: Coordinates
     v: Coordinates
-    current: Scalar
-    discharge: Scalar
+    current: Array
+    discharge: Array
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
 
 
@@ -123,9 +122,7 @@ class HalfRobotSystem(eqx.Module):
 
 def build_system(robot: Robot, conditions: Conditions, step: Scalar) -> HalfRobotSystem:
     """Constants of one run (scalar fields), for half a robot or a whole one. The robot may hold tracers."""
-    zero = jnp.zeros_like(conditions.voltage)
-    mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
-    half = masses_of_parts(robot, conditions, mass)
+    half = masses_of_parts(robot, conditions, balances.mass_with_effects(robot, conditions))
     model, data = mjcf.model_template(conditions.turns)
     model = mjcf.member_model(model, mjcf.robot_bodies(robot, half, conditions), conditions.slope, step)
     path, chassis = BeltPath(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
@@ -173,7 +170,7 @@ def _loss_derivatives(run: HalfRobotSystem, motion: HalfRobotState, mover: balan
         return pulled.traction - signals.resistance
 
     def shaft(speed: Scalar) -> Scalar:
-        return jnp.asarray(_resolve_signals(run, motion, mover, motion.v[0], speed)[0].torque_net)
+        return _resolve_signals(run, motion, mover, motion.v[0], speed)[0].torque_net
 
     one = jnp.ones_like(motion.v[0])
     fall_x, fall_shaft = (jax.jvp(f, (motion.v[k],), (one,))[1] for f, k in ((forward, 0), (shaft, 3)))
@@ -188,7 +185,7 @@ def generalized_forces(
     return force, jnp.zeros_like(force).at[3].set(armature_inertia(run, signals))
 
 
-def armature_inertia(run: HalfRobotSystem, signals: Signals) -> Scalar:
+def armature_inertia(run: HalfRobotSystem, signals: Signals) -> Any:
     """Inertia of the armature at the driving shaft [kg·m²], eq. (31)."""
     motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
     return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
@@ -205,7 +202,8 @@ def damping_matrix(
     out. The drive's losses and the resistance of the ground rise steeply from rest and are on K's diagonal.
     """
     losses = _loss_derivatives(run, motion, _SideContacts(run.path, at, motion.q[1]))
-    rises = jnp.maximum(side_contacts.friction_derivative(run.chassis, signals, at), 0.0)
+    sliding = side_contacts.sliding_speeds(signals, at)
+    rises = jnp.maximum(run.chassis.ground.traction_rise(sliding, at.force, signals.adhesion), 0.0)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
     along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
@@ -253,9 +251,7 @@ def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors
     after, is_over = _state_after_motion(
         motion, run.step, other_states_after_step(run, motion, signals), damping @ gained, gained, signals
     )
-    return _StepFactors(
-        after, is_over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms)
-    )
+    return _StepFactors(after, is_over, pulled.guided, damping, factors, gained, signals.speed_slip_terms)
 
 
 def other_states_after_step(
@@ -480,8 +476,7 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     status = status_with_slip(
         status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, at_rest
     )
-    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
-    status = jnp.where(empty, BATTERY_EMPTY, status)
+    status = status_unless_empty(status, robot, conditions, end.discharge)
     status = jnp.where(tipping_margin(run) < 0, TIPS, status)
     return status_unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
 

@@ -17,7 +17,6 @@ from mmrjax.model import balances, masses, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import State
 from mmrjax.undercarriage import mjcf
 from mmrjax.undercarriage.half_robot import (
     HalfRobotState,
@@ -40,9 +39,9 @@ def step_derivative(run: HalfRobotSystem, at: HalfRobotState) -> Float[Array, "1
 
     def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
         next_state, _, _ = advance(run, HalfRobotState(y[:5], y[5:10], y[10], at.discharge, at.memory))
-        return jnp.concatenate([next_state.q, next_state.v, jnp.asarray(next_state.current)[None]])
+        return jnp.concatenate([next_state.q, next_state.v, next_state.current[None]])
 
-    return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]))
+    return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, at.current[None]]))
 
 
 @compiled
@@ -61,8 +60,7 @@ def _step_derivatives(
 
 def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
     """Period of rolling over that of bouncing, for a robot on contacts at ±B/2 [-]."""
-    zero = jnp.zeros_like(conditions.voltage)
-    mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
+    mass = balances.mass_with_effects(robot, conditions)
     parts = mjcf.robot_bodies(robot, masses.masses_of_parts(robot, conditions, mass), conditions)
     half_width = robot.chassis(conditions.configuration).turning.width / 2
     inertia = jnp.sum(parts.inertia[:, 0] + parts.mass * parts.place[:, 1] ** 2)

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model import params
@@ -25,7 +24,7 @@ _NORMAL, _TRACTION, _RESISTANCE, _GUIDE, _WEIGHT = "#d1495b", "#2e933c", "#b07d1
 
 
 class RunScene(NamedTuple):
-    """Data for pictures of one run, as plain arrays.
+    """Data for pictures of one run.
 
     Attributes:
         slope: [rad].
@@ -35,9 +34,7 @@ class RunScene(NamedTuple):
         wheel: radius of the wheels [m].
         path: path of the belt.
         levers: tips in the chassis frame, empty on wheels.
-        time, q, total_current, speed, theoretical: over the run.
-        place, normal, guided, support: reactions over the run, of one side.
-        traction, resistance: traction and resistance of one side [N].
+        run: motion, signals and reactions of one side.
         weight: weight of half the robot [N].
     """
 
@@ -48,17 +45,7 @@ class RunScene(NamedTuple):
     wheel: float
     path: BeltPath
     levers: list[tuple[float, float]]
-    time: Float[np.ndarray, " n"]
-    q: Float[np.ndarray, "n 5"]
-    total_current: Float[np.ndarray, " n"]
-    speed: Float[np.ndarray, " n"]
-    theoretical: Float[np.ndarray, " n"]
-    place: Float[np.ndarray, "n 24"]
-    normal: Float[np.ndarray, "n 24"]
-    guided: Float[np.ndarray, "n 24"]
-    support: Float[np.ndarray, "n 2"]
-    traction: Float[np.ndarray, " n"]
-    resistance: Float[np.ndarray, " n"]
+    run: Any  # TrackTrajectory, of one run
     weight: float
 
     def sheet(self, k: int) -> Any:
@@ -66,6 +53,7 @@ class RunScene(NamedTuple):
         from matplotlib.figure import Figure
         from matplotlib.lines import Line2D
 
+        time, signals = self.run.time, self.run.signals
         sheet = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
         upper, current, speed = sheet.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
         draw_sample(upper, self, k)
@@ -73,8 +61,8 @@ class RunScene(NamedTuple):
         upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
         upper.axis("off")
         upper.set_title(
-            f"{self.name}, slope {np.degrees(self.slope):.0f}°, t = {self.time[k]:.3f} s, x = {self.q[k, 0]:.3f} m, "
-            f"V = {self.speed[k]:.2f} m/s",
+            f"{self.name}, slope {np.degrees(self.slope):.0f}°, t = {time[k]:.3f} s, x = {self.run.q[k, 0]:.3f} m, "
+            f"V = {signals.speed[k]:.2f} m/s",
             fontsize=11,
         )
         legend_entries = [entry for entry in _LEGEND if not (self.wheeled and "guide" in entry[0])]
@@ -83,15 +71,15 @@ class RunScene(NamedTuple):
         foot = -0.14 - rise * 0.5
         upper.plot([span - 0.02 - 50 * FORCE, span - 0.02], [foot] * 2, color=_INK, lw=2)
         upper.text(span - 0.02 - 25 * FORCE, foot + 0.004, "50 N", fontsize=8, va="bottom", ha="center")
-        current.plot(self.time, self.total_current, color=_NORMAL, lw=0.9)
-        top = 1.3 * np.percentile(self.total_current, 98)
-        current.set(ylabel="I, A", ylim=(0.0, max(top, 0.1)), xlim=(self.time[0], self.time[-1]), xticklabels=[])
-        speed.plot(self.time, self.theoretical, color="#888888", lw=0.9, label="theoretical")
-        speed.plot(self.time, self.speed, color=_TRACTION, lw=1.2, label="robot")
-        speed.set(xlabel="time, s", ylabel="V, m/s", xlim=(self.time[0], self.time[-1]))
+        current.plot(time, signals.total_current, color=_NORMAL, lw=0.9)
+        top = 1.3 * np.percentile(signals.total_current, 98)
+        current.set(ylabel="I, A", ylim=(0.0, max(top, 0.1)), xlim=(time[0], time[-1]), xticklabels=[])
+        speed.plot(time, signals.speed_theoretical, color="#888888", lw=0.9, label="theoretical")
+        speed.plot(time, signals.speed, color=_TRACTION, lw=1.2, label="robot")
+        speed.set(xlabel="time, s", ylabel="V, m/s", xlim=(time[0], time[-1]))
         speed.legend(fontsize=8, frameon=False, loc="lower right")
         for axes in (current, speed):
-            axes.axvline(self.time[k], color=_INK, lw=0.8)
+            axes.axvline(time[k], color=_INK, lw=0.8)
             axes.grid(alpha=0.25)
             axes.spines[["top", "right"]].set_visible(False)
         return sheet
@@ -109,7 +97,6 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
-    signals, reactions = run.signals, run.reactions
     return RunScene(
         slope=float(conditions.slope),
         name=robot.configurations.names[int(conditions.configuration)],
@@ -118,18 +105,8 @@ def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> 
         wheel=float(chassis.radius),
         path=path,
         levers=[(float(x), float(z)) for x, z in levers],
-        time=np.asarray(run.time),
-        q=np.asarray(run.q),
-        total_current=np.asarray(signals.total_current),
-        speed=np.asarray(signals.speed),
-        theoretical=np.asarray(signals.speed_theoretical),
-        place=np.asarray(reactions.place),
-        normal=np.asarray(reactions.grouser),
-        guided=np.asarray(reactions.guided),
-        support=np.asarray(reactions.support),
-        traction=np.asarray(signals.traction),
-        resistance=np.asarray(signals.resistance),
-        weight=float(np.asarray(signals.mass)[0]) / float(robot.sides) * GRAVITY,
+        run=run,
+        weight=float(np.asarray(run.signals.mass)[0]) / float(robot.sides) * GRAVITY,
     )
 
 
@@ -150,8 +127,8 @@ def draw_sample(axes: Any, view: RunScene, k: int) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle, Polygon
 
-    q, radius = view.q[k], float(view.path.radius)
-    axle_x, height = q[0], q[1]
+    q, radius = view.run.q[k], float(view.path.radius)
+    axle_x, height, place = q[0], q[1], np.asarray(view.run.reactions.place[k])
 
     def world(points: Any) -> np.ndarray:  # chassis frame -> slope -> page
         return _rotate(_rotate(points, -q[2], (0.0, height)), view.slope)
@@ -180,15 +157,15 @@ def draw_sample(axes: Any, view: RunScene, k: int) -> None:
         for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
             _draw_disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
     else:
-        base = world(belt_outline(view.path, 0.0, view.place[k]))
-        tip = world(belt_outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
+        base = world(belt_outline(view.path, 0.0, place))
+        tip = world(belt_outline(view.path, float(view.path.gear.grouser_height), place))
         axes.add_collection(LineCollection(list(np.stack([base, tip], axis=1)), colors=_BELT, lw=4, zorder=3))
-    teeth = (view.place[k][:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
+    teeth = (place[:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
     root, inner = (world(belt_outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
     axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
     for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
         _draw_disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
-    _draw_forces(axes, view, k, world, ground)
+    _draw_forces(axes, view, k, ground)
 
 
 def _draw_disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: float, colour: str) -> None:
@@ -199,26 +176,26 @@ def _draw_disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angl
         axes.plot(*world(np.array([arm, -arm]) + np.array([x, 0.0])).T, color=_INK, lw=0.8, zorder=4)
 
 
-def _draw_forces(axes: Any, view: RunScene, k: int, world: Any, ground: Any) -> None:
+def _draw_forces(axes: Any, view: RunScene, k: int, ground: Any) -> None:
     def arrow(start: Any, along: Any, colour: str) -> None:
         tail, head = ground([start])[0], ground([np.asarray(start) + np.asarray(along) * FORCE])[0]
         if np.hypot(*(head - tail)) > 2e-3:
             style = dict(arrowstyle="-|>", color=colour, lw=1.6, shrinkA=0, shrinkB=0, mutation_scale=9)
             axes.annotate("", head, tail, arrowprops=style, zorder=6)
 
-    q = view.q[k]
+    q, signals, reactions = view.run.q[k], view.run.signals, view.run.reactions
     if view.wheeled:
-        for x, force in zip((view.axle, -view.axle), view.support[k], strict=True):
+        for x, force in zip((view.axle, -view.axle), reactions.support[k], strict=True):
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
     else:
-        tip = belt_outline(view.path, float(view.path.gear.grouser_height), view.place[k])
+        tip = belt_outline(view.path, float(view.path.gear.grouser_height), reactions.place[k])
         for j in range(GROUSERS):
-            force = view.normal[k, j]
+            force = reactions.grouser[k, j]
             x = _rotate([tip[j]], -q[2])[0, 0]
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
-        arrow((-view.axle / 2, 0.012), (0.0, view.guided[k].sum()), _GUIDE)
-    arrow((0.0, -0.012), (view.traction[k], 0.0), _TRACTION)
-    arrow((0.0, -0.024), (-view.resistance[k], 0.0), _RESISTANCE)
+        arrow((-view.axle / 2, 0.012), (0.0, reactions.guided[k].sum()), _GUIDE)
+    arrow((0.0, -0.012), (signals.traction[k], 0.0), _TRACTION)
+    arrow((0.0, -0.024), (-signals.resistance[k], 0.0), _RESISTANCE)
     down = _rotate([(0.0, -view.weight)], -view.slope)[0]
     arrow((0.0, q[1]), down, _WEIGHT)
 
@@ -252,10 +229,10 @@ def render(scene: RunScene, file: str | File, time: float = 0.0) -> File:
         ValueError: as for `check_picture`.
     """
     file = File(file)
-    check_picture(file, time, float(scene.time[-1]))
+    check_picture(file, time, float(scene.run.time[-1]))
     import matplotlib
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # a file matplotlibrc of the working folder could run LaTeX
-        scene.sheet(int(np.argmin(np.abs(scene.time - time)))).savefig(file)
+        scene.sheet(int(np.argmin(np.abs(scene.run.time - time)))).savefig(file)
     return file

@@ -89,16 +89,6 @@ def join_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | fl
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
-def bearing_contacts(chassis: Chassis) -> PerContact:
-    """1 for contacts that carry load in this configuration, otherwise 0 [-]."""
-    return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
-
-
-def tension_free(path: BeltPath, belt: BeltRuns) -> Scalar:
-    """Tension of the free part of the lower run, P - P_ct [N], kept above that of a slack belt."""
-    return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
-
-
 def compute_contacts(
     path: BeltPath, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array
 ) -> ContactState:
@@ -132,10 +122,12 @@ def compute_contacts(
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
-    compliance = join_contacts(tip_places.compliance / tension_free(path, belt))
+    # Tension of the lower run without its centrifugal part: a slack belt keeps 1 % of its pre-tension.
+    tension = jnp.maximum(belt.lower - belt.centrifugal, 0.01 * gear.pretension)
+    compliance = join_contacts(tip_places.compliance / tension)
     depth = jnp.maximum(-gap, 1e-9)
     yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
-    bears = bearing_contacts(chassis)
+    bears = jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
     stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
     force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
     return ContactState(
@@ -148,7 +140,7 @@ def compute_contacts(
         gap=gap,
         gap_rate=gap_rate,
         compliance=compliance,
-        force=jnp.asarray(force * bears),
+        force=(force * bears),
         damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
         guided=join_contacts(tip_places.guided),
         place=place,
@@ -186,11 +178,6 @@ def sliding_speeds(signals: Signals, at: ContactState) -> PerContact:
     return -at.speed_x - signals.speed_slip_terms
 
 
-def friction_derivative(chassis: Chassis, signals: Signals, at: ContactState) -> PerContact:
-    """Derivative of the traction of each contact with respect to its sliding speed [N·s/m]."""
-    return jnp.asarray(chassis.ground.traction_rise(sliding_speeds(signals, at), at.force, signals.adhesion))
-
-
 def contact_forces(
     path: BeltPath, chassis: Chassis, signals: Signals, at: ContactState, height: Scalar, force: Array | None = None
 ) -> ContactPull:
@@ -208,7 +195,7 @@ def contact_forces(
         force: traction of each contact, if contacts slide laterally too [N]. None: by Fig. 7.
     """
     if force is None:
-        force = jnp.asarray(chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion))
+        force = chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion)
     guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
     # Power of the contact forces per belt speed, then on the pulleys in their shares of that speed.
     along = force * at.rate_x + at.force * at.rate_z - guide

@@ -112,20 +112,17 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
     factors = {channel.column: channel.factor for channel in EVERY}
 
     def reading(column: str) -> np.ndarray | None:
-        if not runs.has(column):
+        if not runs.has(column) or not np.isfinite(runs[column]).any():
             return None
-        values = runs[column] * factors[column]
-        return values if np.isfinite(values).any() else None
+        return runs[column] * factors[column]
 
-    for pair in (*PAIRS, ROTOR):
-        velocity, position = map(reading, pair)
-        if velocity is not None or position is not None:
-            break
-    else:
+    pair = next((pair for pair in (*PAIRS, ROTOR) if any(reading(column) is not None for column in pair)), None)
+    if pair is None:
         raise BadData(
             f"{runs.source}: no velocity and no position; expected output_speed_rpm, output_angle_deg, "
             "speed_mm_s, position_mm or motor_speed_rpm, or --columns sysid"
         )
+    velocity, position = map(reading, pair)
     unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
     if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
         raise BadConfiguration(f"--unit: got {unit}, but the log has {pair[0]}; expected a unit of that position")

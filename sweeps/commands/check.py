@@ -20,7 +20,10 @@ from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.report import check_report
 from sweeps.report.check_report import CheckResult, requirement_limit, worst_corner_text
-from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
+from sweeps.store import finish_run_folder, open_folder, print_report
+
+#: Columns of requirements.csv.
+COLUMNS = ("name", "sense", "required", "value", "margin", "unit", "met", "status", "at")
 
 
 def execute(config: configuration.Check, beside: configuration.FolderPart) -> int:
@@ -37,7 +40,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
         if depends and r.envelope.battery and not capabilities.has_battery(robot):
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: the robot's file has no battery; add [battery] to it, or set "
+                f"{demands.source}, {r.name}: the robot's file has no battery; add it, or set "
                 "supply_voltage_V in [envelope]"
             )
     lacking = robot.unknown(HEAT)
@@ -45,13 +48,21 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         if lacking and r.name in OF_HEAT:
             raise BadConfiguration(
                 f"{demands.source}, {r.name}: needs the winding temperature, for which the robot's file lacks "
-                f"{', '.join(lacking)}; add them, or remove the requirement"
+                f"{', '.join(lacking)}; add them"
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as report:
             outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(report))
             result = CheckResult(demands, robot, outcomes)
-        _write_folder(folder, config, result)
+        folder.write_text("requirements.toml", demands.text)
+        rows = [
+            (r.name, r.sense, requirement_limit(o), np.nan if o.value is None else o.value,
+             np.nan if o.margin is None else o.margin, r.quantity.unit, o.met, o.status, worst_corner_text(o))
+            for o in outcomes for r in (o.requirement,)
+        ]  # fmt: skip
+        columns = zip(COLUMNS, zip(*rows, strict=True), strict=True)
+        folder.write_table("requirements.csv", {name: np.array(values) for name, values in columns})
+        folder.write_json("result.json", result.to_json())
         document = print_report(
             check_report.check_document(result, capabilities.displayed_name(file), config.changes), file
         )
@@ -60,24 +71,3 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
         return finish_run_folder(
             folder, config, manifest, robot=result.robot, note="the robot of this check", solved=solved, page=document
         )
-
-
-def _write_folder(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
-    folder.write_text("requirements.toml", found.asked.text)
-    # outcomes as a table, one row for each requirement
-    nan = float("nan")
-    folder.write_table(
-        "requirements.csv",
-        {
-            "name": np.array([o.requirement.name for o in found.outcomes]),
-            "sense": np.array([o.requirement.sense for o in found.outcomes]),
-            "required": np.array([requirement_limit(o) for o in found.outcomes]),
-            "value": np.array([nan if o.value is None else o.value for o in found.outcomes]),
-            "margin": np.array([nan if o.margin is None else o.margin for o in found.outcomes]),
-            "unit": np.array([o.requirement.quantity.unit for o in found.outcomes]),
-            "met": np.array([o.met for o in found.outcomes]),
-            "status": np.array([o.status for o in found.outcomes]),
-            "at": np.array([worst_corner_text(o) for o in found.outcomes]),
-        },
-    )
-    folder.write_json("result.json", found.to_json())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,6 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.config_campaign import SIZE
-from sweeps.console import progress_bar
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import scale
 from sweeps.points.tasks import NEAR, SLOW, SOUGHT, climb_refusal
@@ -35,6 +35,8 @@ from sweeps.report import climb_report
 from sweeps.report.climb_report import Along, ClimbResult
 from sweeps.store import finish_run_folder, open_folder, print_report
 
+#: Size of an obstacle [mm], None if it has none or is searched, its terrain by size, and its description.
+Obstacle = tuple[float | None, Callable[[Scalar], Terrain], str]
 #: Number of runs in a round of a search.
 ROUND = 12
 #: Widths over which slopes are fitted, in the units of the axes. Other variables: share of their value.
@@ -58,14 +60,14 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}
     )
     sequence = _lever_sequence(config, robot, name)
-    _, words = _obstacle_terrain(config, 0.1)
+    obstacle = _obstacle(config)
     conditions = Conditions(
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
-    derivative_variables = _derivative_variables(config, robot, conditions, sequence)
+    derivative_variables = _derivative_variables(config, robot, conditions, sequence, obstacle)
     with open_folder("climb", config, robot, beside) as folder:
-        climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, derivative_variables)
+        climbed = _climb_of_configuration(config, robot, obstacle, conditions, sequence, derivative_variables)
         folder.write_table("history.csv", climbed.table)
         if rows := climbed.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
@@ -86,8 +88,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
 def _climb_of_configuration(
     config: configuration.Climb,
     robot: Robot,
-    name: str,
-    words: str,
+    obstacle: Obstacle,
     conditions: Conditions,
     sequence: LeverSequence,
     along: Along | None,
@@ -95,48 +96,35 @@ def _climb_of_configuration(
     """The climb of a configuration: over one obstacle, a search for the largest one, or with derivatives."""
 
     def run(sizes: np.ndarray) -> tuple[Terrain, ClimbRuns]:
-        all_terrains = [_obstacle_terrain(config, float(size) / 1000)[0] for size in sizes]
-        grounds = jax.tree.map(lambda *x: jnp.stack(x), *all_terrains)
-        alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
-        with progress_bar(1, quiet=False) as advance:
-            counter = scale.share_counter(advance, 1)
-            climb_runs = climb_batch(
-                robot,
-                alike[0],
-                grounds,
-                alike[1],
-                duration=config.duration_s,
-                step=config.time_step_s,
-                progress=counter,
-            )
-            counter(1.0)
-        return grounds, climb_runs
+        grounds = jax.tree.map(lambda *x: jnp.stack(x), *(make(float(size)) for size in sizes))
+        alike = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), (conditions, sequence))
+        with scale.share_progress() as told:
+            return grounds, climb_batch(robot, alike[0], grounds, alike[1], progress=told, **integration)
 
+    size, make, words = obstacle
+    integration: Any = {"duration": config.duration_s, "step": config.time_step_s}
     shown_index, largest = 0, None
     tried: tuple[tuple[float, str], ...] = ()
     derivatives: ClimbDerivatives | None = None
     if config.find is not None:
         grounds, all_climbs, shown_index, tried, largest = _search_largest(config.find, run)
     elif along is None:
-        grounds, all_climbs = run(np.array([np.nan]))
+        grounds, all_climbs = run(np.array([size], float))  # NaN for a terrain
     else:
-        with progress_bar(1, quiet=False) as advance:
-            derivatives = climb_derivatives(
-                along.given, along.values, along.widths, duration=config.duration_s, step=config.time_step_s,
-                progress=scale.share_counter(advance, 1),
-            )  # fmt: skip
+        with scale.share_progress() as told:
+            derivatives = climb_derivatives(along.given, along.values, along.widths, progress=told, **integration)
         all_climbs = derivatives.climb
         grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
     one = jax.tree.map(lambda x: x[shown_index : shown_index + 1], all_climbs)
     return ClimbResult(
-        robot, name, words, jax.tree.map(lambda x: x[shown_index], grounds), one, tried, largest,
+        robot, str(config.configuration), words, jax.tree.map(lambda x: x[shown_index], grounds), one, tried, largest,
         {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
         along, derivatives,
     )  # fmt: skip
 
 
 def _derivative_variables(
-    config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: LeverSequence
+    config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: LeverSequence, obstacle: Obstacle
 ) -> Along | None:
     """Variables with respect to which derivatives are computed. None: no derivatives.
 
@@ -146,14 +134,11 @@ def _derivative_variables(
     names = config.derivatives
     if not names:
         return None
-    sizes = {"step": config.step_mm, "gap": config.gap_mm}
-    if config.stairs is not None:
-        sizes["stairs"] = 1000 * terrains.parse_stairs(config.stairs)[0]
-    kind = next((k for k, size in sizes.items() if size is not None), None)
+    size, make, _ = obstacle
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
     variables = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
     levers_move = sequence.begins is None and not reason_without_levers(robot, config.configuration or "")
-    variables += [*(levers if levers_move else ()), *([SIZE] if kind is not None else [])]
+    variables += [*(levers if levers_move else ()), *([SIZE] if size is not None else [])]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
@@ -169,9 +154,8 @@ def _derivative_variables(
     usual = {name: float(np.asarray(getattr(conditions, name))) for name in of_run if hasattr(conditions, name)}
     usual |= {name: a.value for name, a in axes.items() if name not in usual and a.value is not None}
     usual |= {name: float(np.degrees(np.asarray(getattr(sequence, end))[0])) for name, end in levers.items()}
-    usual |= {SIZE: sizes[kind] or 0.0} if kind is not None else {}
+    usual |= {SIZE: size} if size is not None else {}
     units = {name: a.unit for name, a in axes.items()} | dict.fromkeys(levers, "deg") | {SIZE: "mm"}
-    searched = config.model_copy(update={"step_mm": None, "gap_mm": None, "find": kind})
 
     def given(values: Array) -> ClimbInputs:
         value_of = dict(zip(names, values, strict=True))
@@ -183,10 +167,8 @@ def _derivative_variables(
             for name, end in levers.items()
             if name in value_of
         }
-        ground = (
-            _obstacle_terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _obstacle_terrain(config, 0.1)
-        )
-        return ClimbInputs(changed_robot, run, ground[0], dataclasses.replace(sequence, **levers_move))
+        ground = make(value_of.get(SIZE, size or 0.0))
+        return ClimbInputs(changed_robot, run, ground, dataclasses.replace(sequence, **levers_move))
 
     values = [usual[name] for name in names]
     widths = [WIDTHS.get(name, WIDTH * abs(value) or 1.0) for name, value in zip(names, values, strict=True)]
@@ -209,26 +191,22 @@ def _search_largest(
         grounds, climb_runs = run(sizes)
         verdict_of_size |= {float(s): v for s, v in zip(sizes, climb_runs.names, strict=True)}
         order = sorted(verdict_of_size)
-        climbed_sizes = [
-            s
-            for s in order
-            if verdict_of_size[s] == "over" and all(verdict_of_size[t] == "over" for t in order if t < s)
-        ]
-        best = max(climbed_sizes, default=None)
+        missed = next((k for k, s in enumerate(order) if verdict_of_size[s] != "over"), len(order))
+        best, larger = order[missed - 1] if missed else None, order[missed:]
         if largest_climbed is None or best in sizes:
             largest_climbed = grounds, climb_runs, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
-        larger_sizes = [s for s in order if best is None or s > best]
-        if best is None or not larger_sizes or min(larger_sizes) - best <= NEAR:
-            return *largest_climbed, tuple((s, verdict_of_size[s]) for s in order), best
-        inner = np.linspace(best, min(larger_sizes), ROUND + 2)[1:-1]
+        if best is None or not larger or larger[0] - best <= NEAR:
+            return *largest_climbed, tuple(sorted(verdict_of_size.items())), best
+        inner = np.linspace(best, larger[0], ROUND + 2)[1:-1]
         sizes = np.unique(np.round(inner, 1))
 
 
-def _obstacle_terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
-    """Obstacle (in a search, with this `size` [m]) and its description."""
+def _obstacle(config: configuration.Climb) -> Obstacle:
+    """Obstacle of a configuration."""
     nose = config.nose_mm / 1000
     if config.terrain is not None:
-        return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"
+        ground = terrains.read_terrain(config.terrain)
+        return None, lambda _: ground, f"the terrain of {config.terrain.name}"
     if config.stairs is not None:
         rise, tread, count = terrains.parse_stairs(config.stairs)
         if nose >= min(rise, tread) / 2:
@@ -236,16 +214,12 @@ def _obstacle_terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrai
                 f"--nose: got {config.nose_mm:g} mm; expected less than half of rise and tread, "
                 f"{500 * min(rise, tread):g} mm"
             )
-        if config.find is None:
-            return terrain.stairs(rise, tread, count, nose), f"{count} stairs of {1e3 * rise:g} x {1e3 * tread:g} mm"
-        return terrain.stairs(size, tread, count, nose), f"{count} stairs of {1e3 * tread:g} mm tread"
-    if config.gap_mm is not None or config.find == "gap":
-        width = size if config.gap_mm is None else config.gap_mm / 1000
-        return terrain.gap(width), "a gap" if config.gap_mm is None else f"a gap of {config.gap_mm:g} mm"
-    height = size if config.step_mm is None else config.step_mm / 1000
-    return terrain.single_step(
-        height, nose
-    ), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
+        size = f"{1e3 * tread:g} mm tread" if config.find else f"{1e3 * rise:g} x {1e3 * tread:g} mm"
+        return 1e3 * rise, lambda s: terrain.stairs(s / 1000, tread, count, nose), f"{count} stairs of {size}"
+    is_gap = config.gap_mm is not None or config.find == "gap"
+    size_mm, words = (config.gap_mm, "a gap") if is_gap else (config.step_mm, "a step")
+    make = lambda s: terrain.gap(s / 1000) if is_gap else terrain.single_step(s / 1000, nose)  # noqa: E731
+    return size_mm, make, words if size_mm is None else f"{words} of {size_mm:g} mm"
 
 
 def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> LeverSequence:
@@ -260,18 +234,12 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Lev
     tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
     if not tracked and lever_options != (None, None, None):
         raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {reason_without_levers(robot, name)}")
-    folded_angles = (
-        float(np.degrees(np.asarray(gear.lever_front))),
-        180 - float(np.degrees(np.asarray(gear.lever_rear))),
-    )
+    usual = np.degrees(np.asarray(gear.lever_front)), 180 - np.degrees(np.asarray(gear.lever_rear))
     angles = []
-    for option, option_value, usual in zip(
-        ("--levers-front", "--levers-rear"), lever_options[1:], folded_angles, strict=True
-    ):
-        angle = usual if option_value is None else option_value
-        if option_value is not None and (why := terrains.lever_angle_refusal(robot, angle)):
+    for option, stated, angle in zip(("--levers-front", "--levers-rear"), lever_options[1:], usual, strict=True):
+        if stated is not None and (why := terrains.lever_angle_refusal(robot, stated)):
             raise BadConfiguration(f"{option}: {why}")
-        angles.append(float(np.radians(angle)))
+        angles.append(float(np.radians(angle if stated is None else stated)))
     if config.sequence is None:
         sequence = climb_simulation.constant_angles(*angles)
     else:
@@ -284,8 +252,8 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Lev
     if config.levers_voltage_V is not None:
         sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))
     if tracked:
-        first_angles = (float(sequence.first[0]), float(np.pi - sequence.first[1]))
-        for option, angle in zip(("front", "rear"), first_angles, strict=True):
+        first_angles = sequence.first[0], np.pi - sequence.first[1]
+        for end, angle in zip(("front", "rear"), first_angles, strict=True):
             if why := terrains.lever_start_refusal(robot, float(np.degrees(angle))):
-                raise BadConfiguration(f"levers {option}: {why}")
+                raise BadConfiguration(f"levers {end}: {why}")
     return sequence

@@ -114,7 +114,8 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
     if declarations := ", ".join(experiment_words.effect_declarations(effect)):
         yield "properties", declarations
-    yield "in data", f"{effect.family()}{_histories_sentence(effect)}"
+    hidden = f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
+    yield "in data", f"{effect.family()}{'. Only time histories show it' if effect.transient else hidden}"
     for line in _change_sentences(example):
         yield "", line
     for k, test in enumerate(experiment_words.effect_tests(effect)):
@@ -122,12 +123,6 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
     if source:
         yield "source", source
     yield "in a file", f"[effects.{name}] amplitude = ..."
-
-
-def _histories_sentence(effect: type[Effect]) -> str:
-    if effect.transient:
-        return ". Only time histories show it"
-    return f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
 
 
 def _change_sentences(effect: Effect) -> Iterator[str]:
@@ -157,7 +152,7 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
                 shares[c.label] = 100 * (reading_with / reading_without - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):
             changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
-            yield f"change of the readings at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
+            yield f"change at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
 
 
 def _status_lines(name: str, library: Library) -> Iterator[Line]:

@@ -112,7 +112,7 @@ def export(
     if out is not None:
         folder = Path(out)
         if existing_file := next((folder / name for name in texts if (folder / name).exists()), None):
-            raise BadConfiguration(f"out: {existing_file} exists already; choose another folder, or remove it")
+            raise BadConfiguration(f"out: {existing_file} exists already; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in texts.items():
             with naming_file(folder / name):

@@ -118,7 +118,9 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                _report_out_of_time(time_budget, begun=bool(stages))
+                minutes = max(5, math.ceil(time_budget / 30))  # with twice the time
+                hint = f", and no fit of the base model; allow more, such as --within {minutes}min"
+                print_message(f"no verdict within {time_budget:g} s{hint * (not stages)}")
                 for note in lost_motion_notes(runs, robot):  # then no effect is ranked
                     print_message(describe(note))
             _report_stored_stages(stages, folder, config.robot)
@@ -130,15 +132,6 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             progress("writing the report")
         manifest = {"seed": config.seed, "verdict": verdict.verdict}
         return finish_run_folder(folder, config, manifest, solved=verdict.converged, page=page, runs=verdict.runs)
-
-
-def _report_out_of_time(within: float, begun: bool) -> None:
-    """Reports that the time budget [s] ended before a verdict. `begun`: True if at least one stage has finished."""
-    suggested_minutes = max(5, math.ceil(within / 30))  # with twice the time
-    base_words = (
-        "" if begun else f", and no fit of the base model; allow more time, such as --within {suggested_minutes}min"
-    )
-    print_message(f"no verdict within {within:g} s{base_words}")
 
 
 @contextlib.contextmanager

@@ -62,14 +62,12 @@ class Chain:
                 constraints close a loop.
         """
         self.library, self.model = library, model = mujoco.mujoco_module(), read_mujoco_model(source)
-        names = [library.mj_id2name(model, library.mjtObj.mjOBJ_JOINT, k) or "" for k in range(model.njnt)]
-        on_joint = [int(library.mjtTrn.mjTRN_JOINT), int(library.mjtTrn.mjTRN_JOINTINPARENT)]
-        driven = [int(model.actuator_trnid[k, 0]) for k in range(model.nu) if model.actuator_trntype[k] in on_joint]
+        names = [model.joint(k).name for k in range(model.njnt)]
+        on_joint = (library.mjtTrn.mjTRN_JOINT, library.mjtTrn.mjTRN_JOINTINPARENT)
+        driven = list(model.actuator_trnid[np.isin(model.actuator_trntype, on_joint), 0])
         for k, name in enumerate(names):
-            if model.jnt_type[k] != int(library.mjtJoint.mjJNT_HINGE) or not name:
-                raise BadConfiguration(
-                    f"--model: {source.name}, joint {name or k + 1} is no named hinge; expected only named hinges"
-                )
+            if model.jnt_type[k] != library.mjtJoint.mjJNT_HINGE or not name:
+                raise BadConfiguration(f"--model: {source.name}, joint {name or k + 1} is no named hinge")
             if driven.count(k) > 1:
                 raise BadConfiguration(
                     f"--model: {source.name}, joint {name} has several actuators; expected one drive per joint"
@@ -146,9 +144,7 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
         clock = columns.get("time_s")
         if column is None or clock is None:
             lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
-            raise BadData(
-                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the model"
-            )
+            raise BadData(f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint")
         check_units(joint, [Column(ANGLE, c, units[c]) if c in units else None for c in joint.header])
         time = column_numbers(clock)
         angle = math.radians(ANGLE.units[units[column]]) * column_numbers(columns[column])

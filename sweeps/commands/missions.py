@@ -14,9 +14,9 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
+from mmrjax.missions import profile as mission_profile
 from mmrjax.missions.mission import Mission
 from mmrjax.missions.mission_steps import MARKS
-from mmrjax.missions.profile import PAIRS
 from mmrjax.model import balances, channels, contact, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import COULOMB_PER_MAH, lateral_ratio
@@ -50,7 +50,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         imposed_words = capabilities.IMPOSED_WORDS[robot.rig.imposed].words
         raise BadConfiguration(
             f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the voltage; "
-            'simulate a table, or set imposed = "voltage" in the robot\'s file'
+            'simulate a table, or set imposed = "voltage"'
         )
     if robot.loose:
         raise BadConfiguration(
@@ -58,7 +58,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:
-            raise BadConfiguration(f"--profile: {name} is an arm, which profiles do not cover; use --model drive")
+            raise BadConfiguration(f"--profile: {name} is an arm; use --model drive")
     source = profiles.read_profile(config.profile)
     for note in source.notes:
         print_message(note)
@@ -78,8 +78,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
     if config.battery and config.discharge_mAh >= capacity:
         raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
-            "mission"
+            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh"
         )
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
@@ -88,21 +87,25 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     if "current_other" in source.values and not config.battery:
         print_message(f"{source.source}, current_other_A: not used, because the battery supplies other consumers")
     _check_turning(robot, runs, source)
-    _check_cutoff(robot, runs, source, config)
+    conditions = _conditions_of_runs(robot, runs, source, config)
+    profile = source.profile(robot, conditions)
+    cell = mission_batch.cell_below_cutoff(robot, conditions, profile, source.start)
+    if np.isfinite(cell).any():
+        raise BadConfiguration(
+            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[np.isfinite(cell)][0]:.4g} V, "
+            f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission"
+        )
     with open_folder("simulate", config, robot, beside, runs) as folder:
-        mission_batch_result = run_missions(robot, runs, source, config)
-        folder.write_table(
-            "segments.csv", capabilities.drop_inapplicable_columns(robot, mission_batch_result.segments)
-        )
-        folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, mission_batch_result.course))
-        if not mission_batch_result.whole:
-            print_message("history.csv is cut short: the mission has more steps than can be saved")
-        result = run.SimulationResult(
-            "simulate", config.model, robot, runs, mission_batch_result.table, mission_batch_result.to_json()
-        )
-        return run.write_run_folder(
-            folder, config, result, print_report(mission_report.missions_document(file, mission_batch_result), file)
-        )
+        missions = run_missions(robot, runs, source, conditions, profile)
+        columns = _condition_columns(robot, runs, source, config)
+        missions = dataclasses.replace(missions, table=columns | missions.table)
+        folder.write_table("segments.csv", capabilities.drop_inapplicable_columns(robot, missions.segments))
+        folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, missions.course))
+        if not missions.whole:
+            print_message("history.csv is cut short: the mission has too many steps")
+        result = run.SimulationResult("simulate", config.model, robot, runs, missions.table, missions.to_json())
+        page = print_report(mission_report.missions_document(file, missions), file)
+        return run.write_run_folder(folder, config, result, page)
 
 
 def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:
@@ -114,7 +117,8 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
     names = sorted({str(name) for name in runs.configurations_named(robot)})
     capabilities.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
     highest = max(
-        (float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0
+        (float(np.abs(source.values[name]).max()) for name in mission_profile.PAIRS[1] if name in source.values),
+        default=0.0,
     )
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
     if highest > supply:
@@ -136,59 +140,34 @@ def _conditions_of_runs(
     return dataclasses.replace(conditions, adhesion_lateral=jax.numpy.asarray(lateral))
 
 
-def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
-    """Rejects missions that start with cells below their cut-off voltage."""
-    if not config.battery:
-        return
-    conditions = run.conditions_of_runs(robot, runs, config)
-    cell = mission_batch.cell_below_cutoff(robot, conditions, source.profile(robot, conditions), source.start)
-    too_low = np.flatnonzero(np.isfinite(cell))
-    if len(too_low):
-        raise BadConfiguration(
-            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[too_low[0]]:.4g} V, below its "
-            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission"
-        )
-
-
-def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Missions:
-    """Simulates runs over a profile."""
-    conditions = _conditions_of_runs(robot, runs, source, config)
-    profile = source.profile(robot, conditions)
+def run_missions(
+    robot: Robot, runs: records.Runs, source: ProfileTable, conditions: Conditions, profile: mission_profile.Profile
+) -> Missions:
+    """Simulates runs over a profile. The table has no conditions yet."""
     names = run.run_names(runs)
-    rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
+    most = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
     tables: list[Columns] = []
     segments: list[Columns] = []
     courses: list[Columns] = []
-    done, is_complete = 0, True
+    is_complete = True
     with progress_bar(len(runs), quiet=False) as advance:
         for batch in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
-            count = len(batch.steps)
-            rows_done = slice(done, done + count)
-            conditions_of_batch = jax.tree.map(lambda x, own=rows_done: x[own], conditions)
-            numbers = jax.device_get(mission_batch.mission_numbers(robot, conditions_of_batch, batch))
-            tables.append(
-                {
-                    **mission_batch.numbers_by_column(numbers),
-                    **outputs.status_words(batch.result.status, batch.result.flags),
-                }
-            )
-            segments.append(_segment_rows(robot, conditions_of_batch, source, batch, names[rows_done]))
-            courses += [
-                _course_rows(robot, conditions_of_batch, source, batch, k, str(names[done + k]), rows)
-                for k in range(count)
-            ]
+            first, count = len(courses), len(batch.steps)
+            part = jax.tree.map(lambda x, a=first, b=first + count: np.asarray(x)[a:b], conditions)
+            numbers = mission_batch.mission_numbers(robot, part, batch)
+            words = outputs.status_words(batch.result.status, batch.result.flags)
+            tables.append({**mission_batch.numbers_by_column(jax.device_get(numbers)), **words})
+            totals = mission_batch.mission_totals(batch.segments, batch.segment_peaks)
+            of_segments = mission_batch.numbers_by_column(jax.device_get(totals))
+            for k, name in enumerate(names[first : first + count]):
+                one, given, of_run = jax.tree.map(lambda x, k=k: x[k], (batch, part, of_segments))
+                segments.append(_segment_rows(robot, given, source, one, of_run, name))
+                courses.append(_course_rows(robot, given, source, one, name, most))
             assert batch.course is not None  # it was asked for
             is_complete &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
-            done += count
             advance(count)
-    conditions_table = _condition_columns(robot, runs, source, config)
-    return Missions(
-        {**conditions_table, **_concatenate_tables(tables)},
-        _concatenate_tables(segments),
-        _concatenate_tables(courses),
-        source,
-        is_complete,
-    )
+    table, segment_rows, course = map(_concatenate_tables, (tables, segments, courses))
+    return Missions(table, segment_rows, course, source, is_complete)
 
 
 def _concatenate_tables(tables: list[Columns]) -> Columns:
@@ -212,55 +191,27 @@ def _condition_columns(
 
 
 def _segment_rows(
-    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
+    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, numbers: Columns, name: str
 ) -> Columns:
-    """Table with a row for each segment of each cycle of each run, up to the end of the run."""
-    numbers = mission_batch.numbers_by_column(
-        jax.device_get(mission_batch.mission_totals(found.segments, found.segment_peaks))
-    )
-    (runs, cycles, segments) = found.status.shape
-    time = np.asarray(found.segments.time).reshape(runs, -1)
-    begin_times = np.cumsum(time, 1) - time
-    count = cycles * segments
-    last = np.stack(
-        [np.searchsorted(_segment_of_steps(found, k), np.arange(count), side="right") - 1 for k in range(runs)]
-    )
-    is_whole_segment = np.stack(
-        [_segment_of_steps(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)]
-    )
+    """Rows of segments.csv for one run: each segment of each cycle, up to the end of the run."""
     assert found.course is not None  # it was asked for
-    discharge = np.asarray(found.course.signals.discharge).reshape(*found.course.time.shape, -1)[..., 0]
-    discharge = np.take_along_axis(discharge, np.maximum(last, 0), 1)
-    on_battery = np.asarray(conditions.battery)[:, None] > 0.5
-    charge = np.where(on_battery & is_whole_segment, 1 - discharge / float(robot.battery.capacity), np.nan)
-    segment = np.tile(np.arange(segments), cycles)
+    cycles, segments = found.status.shape
+    number, time = np.arange(cycles * segments), np.ravel(found.segments.time)
+    steps = np.where(found.course.segment < 0, len(number), found.course.segment)  # after the end, beyond the last
+    last = np.maximum(np.searchsorted(steps, number, side="right") - 1, 0)
+    discharge = np.reshape(found.course.signals.discharge, (len(steps), -1))[last, 0]
+    has_charge = (conditions.battery > 0.5) & (steps[last] == number)
+    numbers["state_of_charge"] = np.where(has_charge, 1 - discharge / float(robot.battery.capacity), np.nan)
     rows = {
-        "run_id": np.repeat(names, count),
-        "cycle": np.tile(np.repeat(np.arange(1, cycles + 1), segments), runs),
-        "segment": np.tile(segment + 1, runs),
-        "time_s": begin_times.ravel(),
-        "mode": np.tile(np.array(source.modes)[segment], runs),
-        **{column: np.asarray(numbers[column]).ravel() for column in numbers},
-        "state_of_charge": charge.ravel(),
+        "run_id": np.full(len(number), name),
+        "cycle": number // segments + 1,
+        "segment": number % segments + 1,
+        "time_s": np.cumsum(time) - time,
+        "mode": np.array(source.modes)[number % segments],
+        **{c: np.ravel(numbers[c]) for c in mission_batch.mission_columns(source.turns) if c in numbers},
         **outputs.status_words(found.status.ravel(), found.flags.ravel()),
     }
-    order = [
-        "run_id",
-        "cycle",
-        "segment",
-        "time_s",
-        "mode",
-        *(c for c in mission_batch.mission_columns(source.turns) if c in rows),
-    ]
-    is_reached = time.ravel() > 0
-    return {column: rows[column][is_reached] for column in (*order, "status", "flags")}
-
-
-def _segment_of_steps(found: Mission, k: int) -> np.ndarray:
-    """Segment of each stored step of a run. Steps after the end have an index beyond the last segment."""
-    assert found.course is not None  # it was asked for
-    segment = np.asarray(found.course.segment[k])
-    return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
+    return {column: values[time > 0] for column, values in rows.items()}
 
 
 def select_course_rows(
@@ -288,15 +239,14 @@ def select_course_rows(
 
 
 def _course_rows(
-    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, k: int, name: str, most: int
+    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, name: str, most: int
 ) -> Columns:
     """Rows of history.csv for one run."""
-    course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
-    filled = course.segment >= 0
-    signals = course.signals
-    marked = course.event[filled] >= _LASTING
-    largest = np.abs(signals.current).reshape(len(filled), -1).max(1)  # both sides
-    picked = np.flatnonzero(filled)[select_course_rows(course.segment[filled], largest[filled], most, marked)]
+    assert found.course is not None  # it was asked for
+    is_step = found.course.segment >= 0
+    course = jax.tree.map(lambda x: x[is_step], found.course)
+    largest = np.abs(course.signals.current).reshape(len(course.segment), -1).max(1)  # both sides
+    picked = select_course_rows(course.segment, largest, most, course.event >= _LASTING)
     course = jax.tree.map(lambda x: x[picked], course)
     signals, of_sides = course.signals, {}
     winding, housing = course.temperature_winding, course.temperature_housing
@@ -311,11 +261,9 @@ def _course_rows(
     # Demands act this much later than in the profile, as do the values written next to them.
     delay = float(robot.rig.delay)
     segment = course.segment % source.segment_count
-    length = np.asarray(found.segments.time[k]).ravel()
+    length = np.ravel(found.segments.time)
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
-    configuration_index = int(np.asarray(conditions.configuration)[k])
-    per_speed = float(robot.gearbox.ratio) / float(robot.configurations.members[configuration_index].radius)
-    battery = float(np.asarray(conditions.battery)[k]) > 0.5
+    per_speed = float(robot.gearbox.ratio / robot.configurations.members[int(conditions.configuration)].radius)
     state_of_charge = 1 - signals.discharge / float(robot.battery.capacity)
     demanded = source.demanded(segment, elapsed, per_speed)
     of_shaft = {}
@@ -344,7 +292,7 @@ def _course_rows(
         "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
         "housing_temperature_C": housing,
         "energy_Wh": course.energy / quantities.SIZES["Wh"],
-        "state_of_charge": state_of_charge if battery else np.full(len(picked), np.nan),
+        "state_of_charge": np.where(conditions.battery > 0.5, state_of_charge, np.nan),
         "cycle": course.segment // source.segment_count + 1,
         "segment": segment + 1,
         **of_sides,

@@ -35,12 +35,8 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     capabilities.check_on_ground(robot, "render")
     conditions = run.conditions_of_runs(robot, one_run(robot, picture.stated, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
-    with progress_bar(1, quiet=False) as advance:
-        counter = scale.share_counter(advance, 1)
-        trajectory = track_batch(
-            robot, conditions, duration=options["duration"], step=options["step"], progress=counter
-        )
-        counter(1.0)
+    with scale.share_progress() as told:
+        trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     with replacing(file) as temporary, progress_bar(1, quiet=False, doing="drawing") as advance:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -60,17 +59,15 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
             "payloads_kg": tuple(sorted(set(config.payloads_kg))),
         }
     )
-    if config.voltages_V[0] <= 0:
-        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected above 0 and up to 100, forward")
-    if len(config.voltages_V) < FEWEST:
+    voltages, duration = config.voltages_V, config.options["duration"]
+    if voltages[0] <= 0:
+        raise BadConfiguration(f"--voltages: got {voltages[0]:g}; expected above 0 and up to 100, forward")
+    if len(voltages) < FEWEST:
+        values = count_noun(len(voltages), "value")
+        raise BadConfiguration(f"--voltages: got {values}; expected at least {FEWEST}, to find peaks over speed")
+    if duration < SHORTEST:
         raise BadConfiguration(
-            f"--voltages: got {count_noun(len(config.voltages_V), 'value')}; expected at least {FEWEST}, to find "
-            "peaks over speed"
-        )
-    if config.options["duration"] < SHORTEST:
-        raise BadConfiguration(
-            f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, so that "
-            "grousers pass"
+            f"--duration: got {duration:g} s; expected at least {SHORTEST:g} s, so that grousers pass"
         )
     runs = grid_conditions(_speed_grid(config, config.voltages_V), robot)
     conditions = run.conditions_of_runs(robot, runs, config)
@@ -80,7 +77,11 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         columns = _ripple_columns(folder, robot, conditions, config, parts_words)
         table = {**run.condition_table(robot, runs), **columns}
         result = _modes_and_peaks(config, robot, parts_words, table)
-        _write_folder(folder, config, result)
+        folder.write_table("points.csv", table)
+        rows = [{"payload_kg": p, **m._asdict()} for p, modes in result.modes.items() for m in modes]
+        folder.write_table("modes.csv", _tuple_columns(rows, Mode))
+        folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in result.peaks], RipplePeak))
+        folder.write_json("result.json", result.to_json())
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
         return finish_run_folder(
@@ -154,10 +155,9 @@ def _modes_and_peaks(
 ) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
-    payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
-    middle_runs = _speed_grid(config, (middle,))
-    linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_runs, robot), config))
-    by_payload = dict(zip(payloads, linear, strict=True))
+    middle = _speed_grid(config, (config.voltages_V[len(config.voltages_V) // 2],))
+    linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle, robot), config))
+    by_payload = dict(zip(config.payloads_kg, linear, strict=True))
     tops: list[RipplePeak] = []
     ends: dict[float, tuple[float, float]] = {}
     for payload, peaks in by_payload.items():
@@ -166,15 +166,9 @@ def _modes_and_peaks(
         if not len(rows):
             continue
         speed = table["speed_mean_mm_s"][rows] * MM
-        peaks_here = [
-            peak
-            for name in SIGNALS
-            for peak in peaks_over_speed(
-                name, payload, speed, table["passing_Hz"][rows], table[f"{name}_ripple_percent"][rows] / 100,
-                table[f"{name}_frequency_Hz"][rows], peaks,
-            )
-        ]  # fmt: skip
-        tops += peaks_here
+        for name in SIGNALS:
+            ripple, frequency = table[f"{name}_ripple_percent"][rows] / 100, table[f"{name}_frequency_Hz"][rows]
+            tops += peaks_over_speed(name, payload, speed, table["passing_Hz"][rows], ripple, frequency, peaks)
         ends[payload] = float(speed[0]), float(speed[-1])
     tops = drop_unconfirmed_modes(tops, by_payload)
     meets = [c for p, peaks in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *peaks, tops)]
@@ -183,24 +177,14 @@ def _modes_and_peaks(
     )
 
 
-def _write_folder(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
-    folder.write_table("points.csv", found.table)
-    folder.write_table(
-        "modes.csv",
-        _tuple_columns([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
-    )
-    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], RipplePeak))
-    folder.write_json("result.json", found.to_json())
-
-
 _COLUMNS = {
     "frequency": "frequency_Hz", "low": "low", "natural": "natural_Hz", "payload": "payload_kg", "speed": "speed_m_s",
 }  # fmt: skip
 
 
-def _tuple_columns(rows: Iterable[Json], kind: type) -> Columns:
+def _tuple_columns(rows: list[Json], kind: type) -> Columns:
     """Columns, with units in their names, of a list of named tuples."""
-    rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
+    unit = "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)
     names = _COLUMNS | {"low": f"low_{unit}", "high": f"high_{unit}"}
     return {names.get(key, key): np.array([row[key] for row in rows]) for key in keys}

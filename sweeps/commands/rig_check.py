@@ -27,7 +27,6 @@ from calibration.inference.identifiability import undetermined_names
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
-from mmrjax.model.channels import Channel
 from mmrjax.model.driver import FAST
 from mmrjax.model.gearmotor import UNLIMITED
 from mmrjax.model.quantities import GOALS, HEAT
@@ -80,17 +79,18 @@ class RigCheck:
         for name, load in robot.configurations.items():
             names.setdefault(_load_words(load), []).append(name)
         loads = "; ".join(f"{_few(one)}: {load}" for load, one in names.items())
-        imposed = "the voltage (times the duty in histories)"
-        words = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}
-        words |= {goal: f"the goal of a controller ({goal.removeprefix('goal_')})" for goal in GOALS}
-        imposed = words.get(rig.imposed, imposed)
+        imposed = {
+            "voltage": "the voltage (times the duty in histories)",
+            "motor_speed": "the motors' speed",
+            "motor_current": "the current of each motor",
+            **{goal: f"the goal of a controller ({goal.removeprefix('goal_')})" for goal in GOALS},
+        }[rig.imposed]
         starts = {
             "rest": "start at rest",
             "measured": "start from the state in their first samples",
             "free": "start from a fitted state",
         }
-        delay = float(rig.delay)
-        late = f", with a delay of {delay:g} s" if delay else ""
+        late = f", with a delay of {float(rig.delay):g} s" * bool(rig.delay)
         lines = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
         coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
@@ -102,36 +102,28 @@ class RigCheck:
         """Sentences on points to check, one each."""
         notes = []
         if self.robot.rig.inherits:
-            notes.append(
-                'values missing in the file come from its base, a packaged robot. base = "none" prevents this'
-            )
-        if self.examples:
-            lines = ", ".join(map(str, self.examples))
-            count = count_noun(len(self.examples), "line")
-            wide = f"a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
-            notes.append(f"{count} with the template's example number ({EXAMPLE}): {lines}. {wide}")
-        if self.unmarked:
-            lines = ", ".join(map(str, self.unmarked))
-            count = count_noun(len(self.unmarked), "line")
-            notes.append(f"{count} with the template's example: {lines}. Check that it is yours")
+            notes.append('missing values come from the base, a packaged robot. base = "none" prevents this')
+        widened = f"({EXAMPLE}): {{}}. a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
+        for lines, text in (
+            (self.examples, f"example number {widened}"), (self.unmarked, "example: {}. Check that it is yours"),
+        ):  # fmt: skip
+            if lines:
+                numbers = text.format(", ".join(map(str, lines)))
+                notes.append(f"{count_noun(len(lines), 'line')} with the template's {numbers}")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
-            notes.append(
-                "with a duty, total_current is that of the supply. A sensor in the motor leads measures motor_current"
-            )
+            notes.append("with a duty, total_current is that of the supply. Motor leads carry motor_current")
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
-        loose = [
-            _default_origin(self.robot, o)
-            for o in self.origins
-            if o.why.startswith("the file") and o.sd is None and o.value
-        ]
+        loose = [o for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value]
         if loose and not self.robot.rig.inherits:
-            notes.append(f"no ± is given, so the default ± is used: {_few(loose)}")
+            sds = priors.parameter_coordinates(self.robot, [o.name for o in loose]).prior_sd
+            shares = [f"{o.name} (±{100 * sd / abs(o.value):.2g} %)" for o, sd in zip(loose, sds, strict=True)]
+            notes.append(f"no ± is given, so the default ± is used: {_few(shares)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
             notes.append(f"motor.temperature_limit cannot be checked without {lacking}: add {lacking}")
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
-            notes.append("motor.voltage_limit is not given: experiments go up to the table's highest voltage")
+            notes.append("no motor.voltage_limit: experiments go up to the table's highest voltage")
         return notes
 
     def channels(self) -> list[Json]:
@@ -140,7 +132,14 @@ class RigCheck:
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
             instrument = rig.instrument(channel.name)
-            usual = f"{channel.sd_column} of the table, otherwise {100 * channel.sd_share:g} % of the reading"
+            share = f"{100 * channel.sd_share:g} %"
+            sd = f"{channel.sd_column} of the table, otherwise {share} of the reading"
+            if self.foresight is not None:
+                words_by_source = {
+                    "columns": "of the table", "series": "estimated along series of rows",
+                    "assumed": f"assumed, {share}, since there is no column {channel.sd_column}",
+                }  # fmt: skip
+                sd = words_by_source.get(self.foresight.noise[k], self.foresight.noise[k])
             rows.append(
                 {
                     "channel": channel.name,
@@ -148,7 +147,7 @@ class RigCheck:
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
-                    "sd": usual if self.foresight is None else _noise_source_words(self.foresight.noise[k], channel),
+                    "sd": sd,
                 }
             )
         return rows
@@ -157,9 +156,14 @@ class RigCheck:
         """Use and range of each column of the table."""
         if self.runs is None:
             return []
-        rows, headings = [], self.runs.headings
+        rows, headings, layout = [], self.runs.headings, Layout.of(self.robot)
+        # columns of ground, or of another kind of drive
+        idle = {*layout.idle, *([SUPPLY] if self.robot.rig.imposed != "voltage" else [])}
+        uses = {c.sd_column: f"sd of {c.name}" for c in channels.EVERY}
+        uses |= {c.column: f"channel {c.name}" for c in self.robot.channels}
+        uses[IMPOSED[self.robot.rig.imposed][0]] = "imposed"
         for name, values in self.runs.columns.items():
-            if name not in headings and self._does_not_apply(name):
+            if name not in headings and name in idle:
                 continue
             number = np.issubdtype(values.dtype, np.number)
             finite = values[np.isfinite(values)] if number else values
@@ -168,7 +172,7 @@ class RigCheck:
                 {
                     "column": name,
                     "theirs": headings.get(name, ""),
-                    "use": _use_of_column(name, self.robot) if name in headings else "not in the table",
+                    "use": uses.get(name, "condition") if name in headings else "not in the table",
                     "values": len(kinds),
                     "least": float(finite.min()) if number and len(finite) else None,
                     "greatest": float(finite.max()) if number and len(finite) else None,
@@ -177,27 +181,20 @@ class RigCheck:
             )
         return rows
 
-    def _does_not_apply(self, column: str) -> bool:
-        """True if a column that the table lacks does not apply to this rig: ground, or another kind of drive."""
-        idle = Layout.of(self.robot).idle
-        return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
-
     def unused(self) -> list[str]:
         """Reason why each unused column is not used."""
         if self.runs is None:
             return []
-        names_by_column = {c.column: c.name for c in channels.EVERY}
+        names = {c.column: c.name for c in channels.EVERY}
         notes = [
-            f"{name}: not a channel of the rig. To use it, add {names_by_column[name]} to channels in the rig's file"
+            f"{name}: not a channel of the rig. To use it, add {names[name]} to its channels"
             for name in self.runs.unknown
-            if name in names_by_column
+            if name in names
         ]
-        others = [name for name in self.runs.unknown if name not in names_by_column]
-        without = (
-            f"{', '.join(others)}: not used by the model, only to group residuals. To use one, name it under "
-            "[columns]"
-        )
-        return [*notes, *([without] if others else [])]
+        if others := [name for name in self.runs.unknown if name not in names]:
+            text = "used only to group residuals. To use one, name it under [columns]"
+            notes.append(f"{', '.join(others)}: {text}")
+        return notes
 
     def statement(self) -> str:
         """Sentence on the parameters that the table can determine."""
@@ -208,11 +205,8 @@ class RigCheck:
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         determined = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
         determined += [fit_words.determined_combination(p) for p in pairs]
-        parts = [
-            f"These data determine {', '.join(determined)}" if determined else "These data determine no parameter"
-        ]
-        parts += [f"{', '.join(prior_bound)} are not determined by these runs"] * bool(prior_bound)
-        return "; ".join(parts) + "."
+        answer = f"These data determine {', '.join(determined) or 'no parameter'}"
+        return answer + f"; {', '.join(prior_bound)} are not determined by these runs" * bool(prior_bound) + "."
 
     def determined(self, parameter: ParameterInformation) -> str:
         """`yes`, `no`, or the parameters with which the table determines this one in combination."""
@@ -253,21 +247,6 @@ class RigCheck:
         }
 
 
-def _noise_source_words(word: str, channel: Channel) -> str:
-    """Origin of the sd of a channel, in words."""
-    words_by_source = {
-        "columns": "of the table", "series": "estimated along series of rows",
-        "assumed": f"assumed, {100 * channel.sd_share:g} %, since there is no column {channel.sd_column}",
-    }  # fmt: skip
-    return words_by_source.get(word, word)
-
-
-def _default_origin(robot: Robot, origin: NumberOrigin) -> str:
-    """Line on a number without ±, with the default prior width that a fit uses."""
-    sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
-    return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
-
-
 def _few(names: Sequence[str]) -> str:
     """The first names of a list, and the number of others."""
     return ", ".join(names[:NAMED]) + f" and {len(names) - NAMED} others" * (len(names) > NAMED)
@@ -283,17 +262,6 @@ def _load_words(load: Any) -> str:
     travel = float(load.radius)
     words += [f"{2e3 * np.pi * travel:.4g} mm of travel per turn"] if travel != 1.0 else []
     return ", ".join(words)
-
-
-def _use_of_column(column: str, robot: Robot) -> str:
-    if column == IMPOSED[robot.rig.imposed][0]:
-        return "imposed"
-    for channel in channels.EVERY:
-        if channel in robot.channels and column == channel.column:
-            return f"channel {channel.name}"
-        if column == channel.sd_column:
-            return f"sd of {channel.name}"
-    return "condition"
 
 
 def check_rig_file(
@@ -389,23 +357,16 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     ]  # fmt: skip
     notes_of_data = [*found.unused(), *runs.missing()]
     if len(seen.status) < len(runs):
-        notes_of_data.insert(
-            0, f"loop and calibrate use {len(seen.status)} of these rows, evenly spaced in time (--rows)"
-        )
+        notes_of_data.insert(0, f"loop and calibrate use {len(seen.status)} of these rows (--rows)")
     has_clamped_rows = runs.has("held") or (
         runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any()
     )
-    settled = {
-        *words.SETTLED,
-        *(["stalled"] if has_clamped_rows else []),
-    }  # a held shaft is meant to stand still
+    settled = {*words.SETTLED, *(["stalled"] if has_clamped_rows else [])}  # a held shaft is meant to stand still
     others = [
         f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]
     if others:
-        notes_of_data.append(
-            f"with the file's numbers, some rows have no steady state ({', '.join(others)}), and do not count"
-        )
+        notes_of_data.append(f"some rows have no steady state with the file's numbers ({', '.join(others)})")
     determined = [
         (p.name, p.value, p.prior_sd, p.unit, p.share, found.determined(p))
         for p in sorted(seen.parameters, key=lambda p: p.share)

@@ -137,28 +137,23 @@ class _MujocoModel:
         self.library, self.model, self.file = library, model, file
         self.data = library.MjData(model)
         library.mj_forward(model, self.data)
-        self.joints = [self._name(library.mjtObj.mjOBJ_JOINT, k) for k in range(model.njnt)]
-        on_joint = [int(library.mjtTrn.mjTRN_JOINT), int(library.mjtTrn.mjTRN_JOINTINPARENT)]
-        self.is_motor = model.actuator_gaintype == int(library.mjtGain.mjGAIN_DCMOTOR)
+        self.joints = [model.joint(k).name for k in range(model.njnt)]
+        on_joint = (library.mjtTrn.mjTRN_JOINT, library.mjtTrn.mjTRN_JOINTINPARENT)
+        self.is_motor = model.actuator_gaintype == library.mjtGain.mjGAIN_DCMOTOR
+        of_joints = np.flatnonzero(np.isin(model.actuator_trntype, on_joint))
         #: Actuator of each driven joint, a `<dcmotor>` before others.
         self.actuators = {
-            int(model.actuator_trnid[k, 0]): k
-            for k in sorted(range(model.nu), key=lambda k: (self.is_motor[k], -k))
-            if model.actuator_trntype[k] in on_joint
+            int(model.actuator_trnid[k, 0]): int(k) for k in sorted(of_joints, key=lambda k: (self.is_motor[k], -k))
         }
 
-    def _name(self, kind: Any, k: int) -> str:
-        return self.library.mj_id2name(self.model, kind, k) or ""
-
     def _chosen(self, joint: str | None) -> int:
-        model, hinge = self.model, int(self.library.mjtJoint.mjJNT_HINGE)
-        hinges = [k for k in range(model.njnt) if model.jnt_type[k] == hinge and self.joints[k]]
-        hinge_names = [self.joints[k] for k in hinges]
-        driven = [self.joints[k] for k in hinges if k in self.actuators]
-        joint = choose_joint(joint, self.joints, hinge_names, driven, self.file, "named hinge")
-        if joint not in hinge_names:
+        turns = self.model.jnt_type == self.library.mjtJoint.mjJNT_HINGE
+        hinges = {name: k for k, name in enumerate(self.joints) if turns[k] and name}
+        driven = [name for name, k in hinges.items() if k in self.actuators]
+        joint = choose_joint(joint, self.joints, list(hinges), driven, self.file, "named hinge")
+        if joint not in hinges:
             raise BadConfiguration(f"--joint: got {joint}, a slide or free joint; expected a hinge")
-        return self.joints.index(joint)
+        return hinges[joint]
 
     def numbers(self, name: str | None) -> JointNumbers:
         joint = self._chosen(name)
@@ -173,28 +168,28 @@ class _MujocoModel:
         drive: dict[str, StatedNumber] = {}
         if actuator is not None and self.is_motor[actuator]:
             drive = _dc_motor(model, actuator, dof, gear, self.file)
-        value_and_source = lambda value, what: (float(value), f"{joint_words}, {what}") if value else None  # noqa: E731
         root = model.body_rootid[model.jnt_bodyid[joint]]
-        free = any(
-            model.jnt_type[k] == int(library.mjtJoint.mjJNT_FREE) and model.jnt_bodyid[k] == root
-            for k in range(model.njnt)
-        )
+        is_free = model.jnt_type == library.mjtJoint.mjJNT_FREE
         radius = self._radius(joint)
-        rolls = free and radius is not None and abs(float(self.data.xaxis[joint][2])) <= LEVEL
+        level = abs(float(self.data.xaxis[joint][2])) <= LEVEL
+        rolls = bool((is_free & (model.jnt_bodyid == root)).any()) and radius is not None and level
         weight = None if rolls else weight
-        return JointNumbers(
-            self.file, self.joints[joint], rolls,
-            mass=(float(model.body_subtreemass[root]), "mass of its body tree"),
-            sides=self._sides(joint, radius[0]) if rolls and radius is not None else None, radius=radius,
-            inertia=(inertia, f"{joint_words}, inertia that turns with it, without armature"),
-            ratio=(gear, f"{joint_words}, gear of its actuator") if gear > 1 or drive else None,
-            friction=value_and_source(model.dof_frictionloss[dof], "frictionloss"),
-            damping=value_and_source(np.ravel(model.dof_damping[dof])[0], "damping"),
-            armature=value_and_source(armature, "armature"),
-            weight=None if weight is None else (weight[0], f"{joint_words}, largest torque from its weight"),
-            angle=None if weight is None else (weight[1], f"{joint_words}, hanging position"),
-            drive=drive,
-        )  # fmt: skip
+        losses = {
+            "friction": (model.dof_frictionloss[dof], "frictionloss"),
+            "damping": (np.ravel(model.dof_damping[dof])[0], "damping"),
+            "armature": (armature, "armature"),
+        }
+        found = {
+            "mass": (float(model.body_subtreemass[root]), "mass of its body tree"),
+            "sides": self._sides(joint, radius[0]) if rolls and radius is not None else None,
+            "radius": radius,
+            "inertia": (inertia, f"{joint_words}, inertia that turns with it, without armature"),
+            "ratio": (gear, f"{joint_words}, gear of its actuator") if gear > 1 or drive else None,
+            "weight": None if weight is None else (weight[0], f"{joint_words}, largest torque from its weight"),
+            "angle": None if weight is None else (weight[1], f"{joint_words}, hanging position"),
+            **{key: (float(x), f"{joint_words}, {what}") if x else None for key, (x, what) in losses.items()},
+        }
+        return JointNumbers(self.file, self.joints[joint], rolls, found, drive)
 
     def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
         """Inertia of the rotating parts, and their weight as `hanging`, with other joints in the reference pose."""
@@ -223,9 +218,8 @@ class _MujocoModel:
             radius, centre = float(model.geom_size[k, 0]), data.geom_xpos[k] - data.xanchor[joint]
             if is_round(centre, data.xaxis[joint], radius, cylinder_axis):
                 shape = "sphere" if cylinder_axis is None else "cylinder"
-                geom_name = self._name(self.library.mjtObj.mjOBJ_GEOM, k)
                 collides = bool(model.geom_contype[k] or model.geom_conaffinity[k])
-                radii.append((collides, radius, " ".join(filter(None, ("geom", geom_name, f"({shape})")))))
+                radii.append((collides, radius, " ".join(filter(None, ("geom", model.geom(k).name, f"({shape})")))))
         return max(radii)[1:] if radii else None
 
     def _sides(self, joint: int, radius: float) -> Found:
@@ -250,7 +244,7 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
         "motor.inertia": number(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
         "motor.friction_coulomb": number(0.0, "N·m", "all friction is at the joint"),
         "motor.friction_viscous": number(0.0, "N·m·s", "all damping is at the joint"),
-        "gearbox.efficiency_load": number(1.0, "-", "no loss proportional to the torque: add one if you know it"),
+        "gearbox.efficiency_load": number(1.0, "-", "no loss proportional to the torque"),
         "load.loss_coulomb": number(friction, "N·m", "frictionloss and lugre of the joint", "100 %"),
         "load.loss_viscous": number(np.ravel(model.dof_damping[dof])[0], "N·m·s", "damping of the joint", "100 %"),
     }

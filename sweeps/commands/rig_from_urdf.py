@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax.errors import list_some
@@ -34,37 +35,25 @@ LEAST_INERTIA = 1e-12
 Pose = tuple[np.ndarray, np.ndarray]
 
 
-def read_urdf_joint(root: Element, file: str, joint: str | None) -> JointNumbers:
-    """Numbers of a joint of a robot.
+class UrdfRobot:
+    """Robot of an element `<robot>`, from a file of this name."""
 
-    Args:
-        root: element `<robot>`.
-        file: its name.
-        joint: name of the joint. None: the only driven one.
-
-    Raises:
-        BadConfiguration: the joint is unknown or does not turn, links form a loop, a number is wrong or negative, or
-            there is no inertia.
-    """
-    robot = _UrdfRobot(root, file)
-    return robot.numbers(robot.chosen(joint))
-
-
-class _UrdfRobot:
     def __init__(self, root: Element, file: str) -> None:
+        """Reads links and joints.
+
+        Raises:
+            BadConfiguration: xacro elements, a name is missing or occurs twice, or a joint has no known link.
+        """
         self.root, self.file = root, file
         if any("xacro}" in element.tag for element in root.iter()):
             raise BadConfiguration(
                 f"{file}: contains xacro elements; run xacro {file} > robot.urdf, and use that file"
             )
         self.links, self.joints = self._named("link"), self._named("joint")
-        for name, element in self.joints.items():
-            for end in ("parent", "child"):
-                self._link(element, end, name)
-        self.above = {self._link(j, "child", name): name for name, j in self.joints.items()}
-        self.below: dict[str, list[str]] = {link: [] for link in self.links}
-        for name, j in self.joints.items():
-            self.below[self._link(j, "parent", name)].append(name)
+        #: Link at each end of a joint.
+        self.parent, self.child = (
+            {name: self._link(j, end, name) for name, j in self.joints.items()} for end in ("parent", "child")
+        )
 
     def _named(self, tag: str) -> dict[str, Element]:
         elements: dict[str, Element] = {}
@@ -84,7 +73,7 @@ class _UrdfRobot:
         return stated_word(link, self.links, f"{self.file}, joint {name}, <{end}>", f"got {link or 'no link'}")
 
     def chosen(self, joint: str | None) -> str:
-        """Name of a joint that turns.
+        """Name of a joint that turns, None for the only driven one.
 
         Raises:
             BadConfiguration: the joint is unknown, fixed, or slides.
@@ -100,7 +89,12 @@ class _UrdfRobot:
         return joint
 
     def numbers(self, joint: str) -> JointNumbers:
-        element, link = self.joints[joint], self._link(self.joints[joint], "child", joint)
+        """Numbers of a joint.
+
+        Raises:
+            BadConfiguration: links form a loop, a number is wrong or negative, or there is no inertia.
+        """
+        element, link = self.joints[joint], self.child[joint]
         axis = self._axis(joint)
         to_root, root_link = self._to_root(joint)
         moved_links = list(self._moved(link))
@@ -121,17 +115,26 @@ class _UrdfRobot:
         radius = self._radius(joint)
         level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
         rolls = radius is not None and level and root_link != FIXED_ROOT and element.get("type") == "continuous"
-        weight = None if rolls else _hanging_weight(to_root[0].T @ [0.0, 0.0, -GRAVITY], axis, moment)
-        return JointNumbers(
-            self.file, joint, rolls,
-            mass=self._mass(), 
-            sides=self._sides(joint, radius[0]) if rolls and radius is not None else None, radius=radius,
-            inertia=(inertia, f"{named}, <inertia> about the axis"), ratio=self._ratio(joint),
-            friction=self._dynamics(element, "friction"), damping=self._dynamics(element, "damping"),
-            armature=self._dynamics(element, "armature"),
-            weight=None if weight is None else (weight[0], f"{named}, <mass> and its lever"),
-            angle=None if weight is None else (weight[1], f"{named}, hanging position"),
-        )  # fmt: skip
+        weight = None
+        if not rolls:
+            gravity, across = to_root[0].T @ [0.0, 0.0, -GRAVITY], np.cross(axis, moment)
+            # without the component of the first moment along the axis
+            torque = axis @ np.cross(np.cross(across, axis), gravity)
+            weight = hanging_torque_and_angle(float(torque), float(axis @ np.cross(across, gravity)))
+        found = {
+            "mass": self._mass(),
+            "sides": self._sides(joint, radius[0]) if rolls and radius is not None else None,
+            "radius": radius,
+            "inertia": (inertia, f"{named}, <inertia> about the axis"),
+            "ratio": self._ratio(joint),
+            "weight": None if weight is None else (weight[0], f"{named}, <mass> and its lever"),
+            "angle": None if weight is None else (weight[1], f"{named}, hanging position"),
+        }
+        for key, unit in {"friction": "N·m", "damping": "N·m·s", "armature": "kg·m²"}.items():
+            place = f"joint {joint}, <dynamics {key}>"
+            value = self._number(element.find("dynamics"), key, place, unit, 0.0)
+            found[key] = (value, place) if value else None
+        return JointNumbers(self.file, joint, rolls, found)
 
     # --- frames
 
@@ -145,8 +148,8 @@ class _UrdfRobot:
 
     def _origin(self, owner: Element, where: str) -> Pose:
         element = owner.find("origin")
-        roll, pitch, yaw = self._vector(element, "rpy", f"{where}, <origin>", (0.0, 0.0, 0.0))
-        rotation = _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
+        angles = self._vector(element, "rpy", f"{where}, <origin>", (0.0, 0.0, 0.0))
+        rotation = Rotation.from_euler("xyz", angles).as_matrix()
         return rotation, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
 
     def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
@@ -158,12 +161,9 @@ class _UrdfRobot:
             self._once(name, met)
             yield name, pose
             pending += [
-                (
-                    self._link(self.joints[j], "child", j),
-                    _compose(pose, self._origin(self.joints[j], f"joint {j}")),
-                )
-                for j in self.below[name]
-                if not rigid or self.joints[j].get("type") == "fixed"
+                (self.child[j], _compose(pose, self._origin(element, f"joint {j}")))
+                for j, element in self.joints.items()
+                if self.parent[j] == name and (not rigid or element.get("type") == "fixed")
             ]
 
     def _once(self, link: str, met: set[str]) -> None:
@@ -174,13 +174,13 @@ class _UrdfRobot:
     def _to_root(self, joint: str) -> tuple[Pose, str]:
         """Pose of a joint in the frame of the root link, and the name of the root link."""
         pose: Pose = (np.eye(3), np.zeros(3))
+        link, met, above = "", set[str](), {link: j for j, link in self.child.items()}
         joint_name: str | None = joint
-        link, met = "", set[str]()
         while joint_name is not None:
             pose = _compose(self._origin(self.joints[joint_name], f"joint {joint_name}"), pose)
-            link = self._link(self.joints[joint_name], "parent", joint_name)
+            link = self.parent[joint_name]
             self._once(link, met)
-            joint_name = self.above.get(link)
+            joint_name = above.get(link)
         return pose, link
 
     # --- numbers
@@ -216,10 +216,9 @@ class _UrdfRobot:
     def _radius(self, joint: str) -> Found | None:
         """Radius of the largest cylinder or sphere about the axis, from collision or else visual geometry."""
         axis = self._axis(joint)
-        link = self._link(self.joints[joint], "child", joint)
         for tag in ("collision", "visual"):
             radii: list[Found] = []
-            for name, pose in self._moved(link, rigid=True):
+            for name, pose in self._moved(self.child[joint], rigid=True):
                 for shape in self.links[name].findall(tag):
                     rotation, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
                     for kind, cylinder_axis in (("cylinder", rotation[:, 2]), ("sphere", None)):
@@ -271,12 +270,6 @@ class _UrdfRobot:
             return ratio, name + (": 1 is often a placeholder" if ratio == 1 else "")
         return None
 
-    def _dynamics(self, joint: Element, key: str) -> Found | None:
-        unit = {"friction": "N·m", "damping": "N·m·s", "armature": "kg·m²"}[key]
-        place_words = f"joint {joint.get('name')}, <dynamics {key}>"
-        value = self._number(joint.find("dynamics"), key, place_words, unit, 0.0)
-        return (value, place_words) if value else None
-
     # --- cells
 
     def _number(self, element: Element | None, key: str, where: str, unit: str, least: float | None) -> float:
@@ -309,25 +302,6 @@ class _UrdfRobot:
         return value
 
 
-def _rotation_about(axis: int, angle: float) -> np.ndarray:
-    """Rotation about a coordinate axis, shape (3, 3)."""
-    one, other = (axis + 1) % 3, (axis + 2) % 3
-    rotation = np.eye(3)
-    rotation[one, one] = rotation[other, other] = math.cos(angle)
-    rotation[other, one] = math.sin(angle)
-    rotation[one, other] = -math.sin(angle)
-    return rotation
-
-
 def _compose(outer: Pose, inner: Pose) -> Pose:
     """Pose composed with another one."""
     return outer[0] @ inner[0], outer[1] + outer[0] @ inner[1]
-
-
-def _hanging_weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
-    """As `hanging`, for a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
-    across = np.cross(axis, moment)
-    moment_across = np.cross(across, axis)  # moment without its component along the axis
-    return hanging_torque_and_angle(
-        float(axis @ np.cross(moment_across, gravity)), float(axis @ np.cross(across, gravity))
-    )

@@ -43,7 +43,8 @@ def joint_numbers(source: Path, joint: str | None) -> JointNumbers:
         if root.tag == "robot":
             from sweeps.commands import rig_from_urdf
 
-            return rig_from_urdf.read_urdf_joint(ElementTree.fromstring(text), source.name, joint)
+            robot = rig_from_urdf.UrdfRobot(ElementTree.fromstring(text), source.name)
+            return robot.numbers(robot.chosen(joint))
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # unknown encoding
         raise BadConfiguration(
             f"{source}: not a readable XML file ({error}); expected URDF or MuJoCo's XML"

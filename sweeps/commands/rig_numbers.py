@@ -28,44 +28,33 @@ LEAST_WEIGHT = 1e-9
 OFF_AXIS = 0.02
 #: Upper limit of a loss that the model does not state, as a share of the stall torque.
 UNSTATED = 0.05
-#: Sd of each number: models round masses and guess losses.
-WIDTHS = {
-    "mass": "20 %", "radius": "5 %", "inertia": "50 %", "ratio": "5 %", "armature": "50 %", "friction": "100 %",
-    "damping": "100 %", "weight": "20 %", "angle": "0.1",
+#: Line of a rig's file for each number of a joint: name, unit and ±. Models round masses and guess losses.
+LINES = {
+    "mass": ("load.mass", "kg", "20 %"), "radius": ("load.radius", "m", "5 %"),
+    "weight": ("load.torque_gravity", "N·m", "20 %"), "angle": ("load.angle_zero", "rad", "0.1"),
+    "sides": ("sides", "-", ""), "friction": ("load.loss_coulomb", "N·m", "100 %"),
+    "damping": ("load.loss_viscous", "N·m·s", "100 %"), "ratio": ("gearbox.ratio", "-", "5 %"),
+    "armature": ("motor.inertia", "kg·m^2", "50 %"), "inertia": ("load.inertia", "kg·m^2", "50 %"),
 }  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class JointNumbers:
-    """Numbers of a joint and its load [SI]. None if the model has no value.
+    """Numbers of a joint and its load.
 
     Attributes:
         file, joint: names of the file and the joint.
         rolls: True if the joint turns a wheel of a body that is free to move.
-        mass: mass of the whole model.
-        sides: number of equal joints, such as wheels on both sides.
-        inertia: moment of inertia about the joint's axis of everything that turns with it, without `armature`.
-        radius: radius of the wheel.
-        ratio: motor turns per turn of the joint.
-        friction, damping, armature: friction, damping and armature at the joint.
-        weight: largest gravity torque [N·m].
-        angle: angle of the load at rest under gravity.
+        found: number [SI] for each key of `LINES`, None if the model has none. `mass` is that of the whole model,
+            `sides` the number of equal joints, `inertia` that of everything that turns with the joint, without
+            `armature`, `weight` the largest gravity torque, and `angle` that of the load at rest under gravity.
         drive: numbers of the motor by dotted name. They take precedence over values that follow from the others.
     """
 
     file: str
     joint: str
     rolls: bool
-    mass: Found | None
-    inertia: Found
-    sides: Found | None = None
-    radius: Found | None = None
-    ratio: Found | None = None
-    friction: Found | None = None
-    damping: Found | None = None
-    armature: Found | None = None
-    weight: Found | None = None
-    angle: Found | None = None
+    found: Mapping[str, Found | None]
     drive: Mapping[str, StatedNumber] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
@@ -75,7 +64,7 @@ class JointNumbers:
             BadConfiguration: the load of this kind slides.
         """
         if stated is None:
-            return "wheeled" if self.rolls else "bench" if self.weight is None else "pendulum"
+            return "wheeled" if self.rolls else "bench" if self.found["weight"] is None else "pendulum"
         if stated not in TURNING:
             raise BadConfiguration(f"--kind: got {stated} with --from, which reads a revolute joint; "
                                    f"{allowed_words(stated, TURNING)}")  # fmt: skip
@@ -83,36 +72,25 @@ class JointNumbers:
 
     def numbers(self, kind: str) -> dict[str, StatedNumber]:
         """Numbers for the rig file of this kind, by dotted name."""
-        by_name: dict[str, StatedNumber] = {}
-
-        def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
-            if number is not None:
-                by_name[name] = StatedNumber(
-                    number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, "")
-                )
-
         moving = kind in VEHICLES
-        losses = "load.track" if moving else "load"
-        if moving:
-            put("load.mass", "kg", "mass", self.mass)
-            put("load.radius", "m", "radius", self.radius)
-        else:
-            put("load.torque_gravity", "N·m", "weight", self.weight)
-            put("load.angle_zero", "rad", "angle", self.angle)
-        if self.sides is not None:
-            by_name["sides"] = StatedNumber(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
-        put(f"{losses}.loss_coulomb", "N·m", "friction", self.friction)
-        put(f"{losses}.loss_viscous", "N·m·s", "damping", self.damping)
-        put("gearbox.ratio", "-", "ratio", self.ratio)
-        inertia = self.inertia
-        if self.armature is not None and self.ratio is not None:
-            rotor = (self.armature[0] / self.ratio[0] ** 2, self.armature[1])
-            put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
-        elif self.armature is not None:
-            inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
-            by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", "no ratio found: the load inertia includes it")
-        put("load.inertia", "kg·m^2", "inertia", inertia)
-        return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
+        losses = "load.track.loss" if moving else "load.loss"
+        others = ("weight", "angle") if moving else ("mass", "radius")
+        found = {key: pair for key, pair in self.found.items() if pair is not None and key not in others}
+        by_name: dict[str, StatedNumber] = {}
+        if "armature" in found:
+            armature, source = found.pop("armature")
+            inertia, source_inertia = found["inertia"]
+            if "ratio" in found:
+                found["armature"] = armature / found["ratio"][0] ** 2, f"{source} / ratio²"
+            else:
+                found["inertia"] = inertia + armature, f"{source_inertia}, and armature"
+                source = "no ratio found: the load inertia includes it"
+                by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", source)
+        for key, (name, unit, width) in LINES.items():
+            if key in found:
+                value, source = found[key]
+                by_name[name] = StatedNumber(value, unit, f"{self.file}, {source}", width)
+        return {name.replace("load.loss", losses): number for name, number in {**by_name, **self.drive}.items()}
 
 
 def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict[str, StatedNumber]:
@@ -358,21 +336,33 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         (_ratio_or_none(torque, drop), "stall torque / stall current"),
     ]
     stated_constants = [(value, source) for value, source in constants if value is not None]
-    _reject_contradictions((known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
     constant = stated_constants[0][0]
+    spread = [_largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
+    groups = (known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A")
+    faults = [
+        f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
+        f"{100 * apart:.0f} % apart"
+        for (pairs, name, unit), apart in zip(groups, spread, strict=True)
+        if apart > APART
+    ]
+    if faults:
+        raise BadConfiguration(
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %, at the motor's "
+            "shaft and one voltage"
+        )
 
     def line(value: float, unit: str, source: str, width: float) -> StatedNumber:
         return StatedNumber(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
 
-    spread = [100 * _largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
+    width = max(WIDTH_RESISTANCE, 100 * spread[0]), max(WIDTH_CONSTANT, 100 * spread[1])
     return {
-        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], max(WIDTH_RESISTANCE, spread[0])),
-        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], max(WIDTH_CONSTANT, spread[1])),
+        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], width[0]),
+        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], width[1]),
         "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
         "motor.friction_viscous": StatedNumber(
             0.0,
             "N·m·s",
-            "Coulomb and viscous friction are not separated, ± as if half were viscous",
+            "not separated from Coulomb friction, ± as if half were viscous",
             f"{0.5 * constant**2 * idle / back_emf:.2g}",
         ),
     }
@@ -416,17 +406,3 @@ def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
 def _largest_difference(pairs: list[tuple[float, str]]) -> float:
     values = [value for value, _ in pairs]
     return max(values) / min(values) - 1
-
-
-def _reject_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
-    faults = [
-        f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
-        f"{100 * _largest_difference(pairs):.0f} % apart"
-        for pairs, name, unit in groups
-        if _largest_difference(pairs) > APART
-    ]
-    if faults:
-        raise BadConfiguration(
-            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * APART:.0f} %; give "
-            "data of the motor shaft at one voltage"
-        )

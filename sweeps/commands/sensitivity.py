@@ -9,7 +9,6 @@ import numpy as np
 from calibration.data import Json
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.described import report_in_words
 from calibration.sensitivity import uncertain_inputs
@@ -17,7 +16,6 @@ from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import METHODS, OperatingPoints
 from calibration.sensitivity.study import Study
-from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import COULOMB_PER_MAH, PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.quantities import RPM
@@ -74,22 +72,24 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     robot = showing_turns(file.robot, freed)
     outputs = chosen_outputs(config.outputs, robot, bool(freed))
     runs = _operating_points(config, robot, ranges)
-    inputs = _uncertain_inputs(config, file, runs, ranges)
+    if config.posterior and config.parameters:
+        raise BadConfiguration("--posterior: cannot be combined with --parameters; give one of them")
+    if config.posterior:
+        inputs = uncertain_inputs.inputs_from_posterior(file.robot, posterior_beside_robot(file), ranges)
+    else:
+        present = tuple(dict.fromkeys(map(str, runs["configuration"])))
+        names = config.parameters or uncertain_inputs.default_input_names(
+            file.robot, present, config.battery, config.model, bool(freed)
+        )
+        inputs = uncertain_inputs.inputs_from_priors(file.robot, names, ranges)
     conditions = runs.conditions(robot)
     turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turn_columns), config)
     study = Study(
-        robot,
-        inputs,
-        OperatingPoints.of(runs),
-        outputs,
-        config.model,
-        config.options,
-        report_in_words(print_message),
-        battery=float(config.battery),
-        discharge=config.discharge_mAh * COULOMB_PER_MAH,
-        adhesion=np.asarray(conditions.adhesion),
-    )
+        robot, inputs, OperatingPoints.of(runs), outputs, config.model, config.options,
+        report_in_words(print_message), battery=float(config.battery),
+        discharge=config.discharge_mAh * COULOMB_PER_MAH, adhesion=np.asarray(conditions.adhesion),
+    )  # fmt: skip
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
         result = analyse_sensitivity(study, config.method, config.evaluations, config.seed)
         folder.write_json("result.json", result.to_json())
@@ -130,7 +130,7 @@ def _operating_points(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: has no effect on a battery, whose charge sets it")
+        raise BadConfiguration("--vary voltage: has no effect on a battery")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
@@ -150,17 +150,3 @@ def _operating_points(
     return grid_conditions(
         grid.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
     )
-
-
-def _uncertain_inputs(
-    config: configuration.Sensitivity, file: RobotFile, runs: Runs, ranges: dict[str, tuple[float, float]]
-) -> UncertainInputs:
-    robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
-    if config.posterior:
-        if config.parameters:
-            raise BadConfiguration("--posterior: cannot be combined with --parameters; give one of them")
-        return uncertain_inputs.inputs_from_posterior(robot, posterior_beside_robot(file), ranges)
-    names = config.parameters or uncertain_inputs.default_input_names(
-        robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
-    )
-    return uncertain_inputs.inputs_from_priors(robot, names, ranges)

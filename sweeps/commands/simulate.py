@@ -26,7 +26,6 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress_bar
 from sweeps.inputs import given_runs, load_robot, posterior_beside_robot
 from sweeps.pages import words
 from sweeps.points import run, scale
@@ -76,9 +75,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
         if posterior is not None and config.posterior is not None:
-            draws = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            table |= draws.columns
-            remarks += run.interval_remarks(draws)
+            table |= run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            remarks += run.interval_remarks(table, config.posterior)
         if postures is not None:
             folder.write_table("posture.csv", postures.table)
             further["notes"] += turn_words.tipping_remarks(postures)
@@ -108,18 +106,15 @@ def _simulate_table(
         return run.evaluate_runs(robot, runs, config, folder), None
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
-    with progress_bar(len(runs), quiet=not fidelity.facts.slow) as advance:
-        counter = scale.share_counter(advance, len(runs))
-        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, counter))
-        counter(1.0)
+    with scale.share_progress(len(runs), quiet=not fidelity.facts.slow) as told:
+        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
     assert batch.history is not None  # the fidelity was asked for it
     folder.write_table(
         "history.csv", capabilities.drop_inapplicable_columns(robot, history_table(robot, batch.history, runs))
     )
-    if batch.history.reactions is not None:
+    loads = batch.history.reactions
+    if loads is not None:
         # loads inside one side's running gear over time [N], one row per sample
-        loads = batch.history.reactions
-        assert loads is not None  # the fidelity resolves them
         table = {
             "run_id": np.repeat(run.run_names(runs), batch.history.time.shape[-1]),
             "time_s": np.ravel(batch.history.time),
@@ -128,8 +123,7 @@ def _simulate_table(
             "rear_N": np.ravel(loads.support[..., 1]),
             "centrifugal_tension_N": np.ravel(loads.centrifugal),
         }
-        for name in ("grouser", "tension"):
-            values = getattr(loads, name)
+        for name, values in {"grouser": loads.grouser, "tension": loads.tension}.items():
             table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
         folder.write_table("reactions.csv", table)
     return {**run.condition_table(robot, runs), **end_columns_of_histories(robot, batch)}, batch
@@ -144,32 +138,27 @@ def end_columns_of_histories(robot: Robot, batch: RunBatch) -> Columns:
     history, status = batch.history, np.asarray(batch.result.status)
     assert history is not None  # the fidelity was asked for it
     columns = run.ending_columns(robot, batch)
-    current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
-    finite = np.isfinite(current)
+    signals, time = history.signals, np.asarray(history.time)
+    finite = np.isfinite(np.asarray(signals.total_current))
     last_sample = np.where(finite.any(-1), finite.shape[-1] - 1 - np.argmax(finite[..., ::-1], -1), 0)
     rows = np.arange(len(last_sample))
-    motors = float(robot.sides) * np.asarray(history.signals.current)
-    limit = float(robot.sides) * float(robot.driver.current_limit)
-    columns[PEAK] = np.maximum(
-        _peaks_of_runs(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0
-    )
-    columns["displacement_m"], columns["time_end_s"] = (
-        np.array(history.distance)[rows, last_sample],
-        time[rows, last_sample],
-    )
+    motors, sides = jnp.abs(robot.sides * signals.current), jnp.asarray(float(robot.sides))
+    peaks = _peaks_of_runs(jnp.asarray(time), motors, sides * float(robot.driver.current_limit))
+    columns[PEAK] = np.maximum(peaks, 0.0)
+    columns["displacement_m"] = np.array(history.distance)[rows, last_sample]
+    columns["time_end_s"] = time[rows, last_sample]
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
-        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last_sample], history.signals)
-        at_last = outputs.output_columns(
-            jax.device_get(result_of_signals(robot, signals, jnp.asarray(status))), robot.channels
-        )
-        for name, values in at_last.items():
-            columns[name] = np.where(empty & finite.any(-1), values, columns[name])
-        after = time[rows, np.minimum(last_sample + 1, finite.shape[-1] - 1)] - time[rows, last_sample]
+        emptied = empty & finite.any(-1)
+        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last_sample], signals)
+        result = jax.device_get(result_of_signals(robot, signals, jnp.asarray(status)))
+        for name, values in outputs.output_columns(result, robot.channels).items():
+            columns[name] = np.where(emptied, values, columns[name])
+        after = time[rows, np.minimum(last_sample + 1, finite.shape[-1] - 1)] - columns["time_end_s"]
         draws = np.asarray(robot.battery.current(signals.total_current))
         time_left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
-        time_left = np.where(empty & finite.any(-1), np.clip(np.nan_to_num(time_left), 0.0, after), 0.0)
-        columns["time_end_s"] = columns["time_end_s"] + time_left
+        time_left = np.where(emptied, np.clip(np.nan_to_num(time_left), 0.0, after), 0.0)
+        columns["time_end_s"] += time_left
         columns["displacement_m"] = np.nan_to_num(
             columns["displacement_m"] + time_left * np.nan_to_num(signals.speed)
         )

@@ -13,6 +13,7 @@ from calibration.sizing import sheet
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size_robot as search
 from calibration.sizing.part_options import packaged_motors
+from calibration.sizing.sheet import RequirementOutcome
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import print_message, step_reporter
@@ -20,7 +21,7 @@ from sweeps.inputs import load_robot
 from sweeps.pages import words
 from sweeps.report import check_report
 from sweeps.report.check_report import SizeResult, describe_design
-from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Size, beside: configuration.VerbosePart) -> int:
@@ -46,13 +47,16 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
                 robot, requirements, objectives, motors=config.motors, seed=config.seed, tell=report_in_words(heard)
             )
             best = robot if sizing.best is None else sizing.best.robot
-            outcomes = (
-                ()
-                if sizing.best is None
-                else sheet.check_requirements(best, requirements, changes=False, tell=report_in_words(heard))
-            )
+            outcomes: tuple[RequirementOutcome, ...] = ()
+            if sizing.best is not None:
+                outcomes = sheet.check_requirements(best, requirements, changes=False, tell=report_in_words(heard))
         result = SizeResult(requirements, robot, sizing, objectives, outcomes)
-        _write_folder(folder, config, result)
+        folder.write_text("requirements.toml", requirements.text)
+        note = f"the robot that was changed, {config.robot}: no design meets the requirements"
+        if sizing.best is not None:
+            note = f"sized for {requirements.source} from {config.robot}: {describe_design(sizing.best)}"
+        robot_file.write_robot(best, folder.results() / "robot.toml", note=note)
+        folder.write_json("result.json", result.to_json())
         document = print_report(
             check_report.size_document(result, capabilities.displayed_name(file)),
             dataclasses.replace(file, robot=best),
@@ -61,13 +65,3 @@ def execute(config: configuration.Size, beside: configuration.VerbosePart) -> in
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.every_run_solved(Counter(o.status for o in outcomes))
         return finish_run_folder(folder, config, manifest, solved=solved, page=document)
-
-
-def _write_folder(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
-    best = found.sizing.best
-    folder.write_text("requirements.toml", found.asked.text)
-    note = f"the robot that was changed, {config.robot}: no design meets the requirements"
-    if best is not None:
-        note = f"sized for {found.asked.source} from {config.robot}: {describe_design(best)}"
-    robot_file.write_robot(found.robot if best is None else best.robot, folder.results() / "robot.toml", note=note)
-    folder.write_json("result.json", found.to_json())

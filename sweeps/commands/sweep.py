@@ -5,20 +5,20 @@ from __future__ import annotations
 import dataclasses
 import errno
 import math
-import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import filesize
 
 from calibration.data import Json, profiles
 from calibration.data.input_errors import BadConfiguration, InputError
 from calibration.data.robot_file import RobotFile
+from calibration.data.writing import replacing
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import channels, quantities
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.signals import FLAGS, STATUSES
@@ -81,9 +81,8 @@ def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> 
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
         if posterior is not None and config.posterior is not None:
-            draws = run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
-            notes = run.interval_ranges(table, draws)
-            table |= draws.columns
+            table |= run.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            notes = run.interval_ranges(table, robot.channels, config.posterior)
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
         document = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
         return run.write_run_folder(folder, config, result, document)
@@ -139,11 +138,11 @@ def dry_run(job: scale.Job, layout: StoreLayout, path: Path) -> None:
     seconds = min(spent[1:]) / compiled.size
     design = job.plan.design
     dimensions = " x ".join(f"{n} {name}" for n, name in zip(design.shape, design.dimensions, strict=True))
-    free = _free_bytes(path)
+    folder, free = _disk_of(path)
     rows = {
         "points": f"{design.points:,} ({dimensions})",
         "chunks": f"{len(blocks):,} of {blocks.points:,} points on {compiled.mesh.size} x {scale.device_kind()}",
-        "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing_parent(path)}",
+        "store": f"{filesize.decimal(layout.size)} (uncompressed); free {filesize.decimal(free)} in {folder}",
         "time": f"about {duration_text(seconds * blocks.points * len(blocks))} once compiled, "
         f"{1 / seconds:,.0f} points/s (timed here on {compiled.size:,} points). Compiling "
         f"{duration_text(max(spent[0] - spent[1], 0.0))}",
@@ -152,15 +151,10 @@ def dry_run(job: scale.Job, layout: StoreLayout, path: Path) -> None:
     _reject_without_space(layout.size, 1.0, path)
 
 
-def _existing_parent(path: Path) -> Path:
-    path = path.absolute().parent
-    while not path.exists():
-        path = path.parent
-    return path
-
-
-def _free_bytes(path: Path) -> int:
-    return shutil.disk_usage(_existing_parent(path)).free
+def _disk_of(path: Path) -> tuple[Path, int]:
+    """Existing folder that will contain a path, and the free space there [bytes]."""
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    return folder, shutil.disk_usage(folder).free
 
 
 def _reject_without_space(size: int, share: float, path: Path) -> None:
@@ -170,21 +164,12 @@ def _reject_without_space(size: int, share: float, path: Path) -> None:
         size: size of the whole store [bytes].
         share: share that is not yet written.
     """
-    needed, free = math.ceil(size * share) + MARGIN, _free_bytes(path)
+    needed, (folder, free) = math.ceil(size * share) + MARGIN, _disk_of(path)
     if needed > free:
         raise BadConfiguration(
-            f"--out: results need {bytes_text(needed)} (uncompressed); {_existing_parent(path)} has "
-            f'{bytes_text(free)} free; choose another disk, fewer points or outputs, or storage = "float32"'
+            f"--out: results need {filesize.decimal(needed)} (uncompressed); {folder} has "
+            f'{filesize.decimal(free)} free; choose another disk, fewer points or outputs, or storage = "float32"'
         )
-
-
-def bytes_text(size: float) -> str:
-    """Number of bytes as text."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            return f"{size:.3g} {unit}" if size < 1e6 else f"{size:,.0f} {unit}"
-        size /= 1000
-    raise AssertionError
 
 
 def duration_text(seconds: float) -> str:
@@ -227,14 +212,10 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions) ->
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         count = len(store.done())
-        raise DiskFull(
+        raise InputError(
             f"{store.partial}: {error.strerror} after {count} of {len(job.blocks)} chunks. Free some space, and "
             "the same command resumes"
         ) from error
-
-
-class DiskFull(InputError):
-    """The disk filled up during a sweep. The sweep can be resumed."""
 
 
 def finish_sweep(
@@ -265,15 +246,12 @@ def finish_sweep(
     done = store.done()
     if not store.finished:
         print_output(
-            f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, or the "
-            "command without --shard, completes the sweep"
+            f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, or no "
+            "--shard, completes the sweep"
         )
         return DONE
-    if options.export:
-        pass
-
-        for kind in options.export:
-            print_message(str(export_runs(kind, store.path, store.layout)))
+    for kind in options.export:
+        print_message(str(export_runs(kind, store.path, store.layout)))
     counts = points_by_status(done.values())
     if not is_complete:
         print_table(endings_table(counts, "points", job.task.model))
@@ -326,13 +304,23 @@ def export_runs(kind: str, folder: Path, layout: StoreLayout) -> Path:
 
     One row for each point, in order. Numbers that are not finite become empty cells.
     """
-    path = folder / f"runs.{kind}"
-    temporary = path.with_name(path.name + ".writing")
-    try:
-        _WRITERS[kind](temporary, chunk_tables(folder / STORE, layout))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    path, writer = folder / f"runs.{kind}", None
+    with replacing(path) as temporary:
+        for part in chunk_tables(folder / STORE, layout):
+            if kind == "csv":
+                fields = [f.with_type(pa.string()) if pa.types.is_dictionary(f.type) else f for f in part.schema]
+                part = part.cast(pa.schema(fields))
+            if writer is None and kind == "csv":
+                quoting = csv.WriteOptions(quoting_style="needed")
+                writer = csv.CSVWriter(temporary, part.schema, write_options=quoting)
+            elif writer is None:
+                writer = parquet.ParquetWriter(temporary, part.schema)
+            writer.write_table(part)
+        assert writer is not None  # a sweep has at least one chunk
+        writer.close()
     return path
 
 
@@ -342,66 +330,24 @@ def chunk_tables(store: Path, layout: StoreLayout) -> Iterator[Any]:
     import zarr
 
     group = zarr.open_group(store, mode="r")
-    design, blocks = layout.design, layout.blocks
     columns = {row.name: row.column for row in outputs.output_table(channels.EVERY)}
-    for chunk in range(len(blocks)):
-        box = blocks.box(chunk)
-        shape = tuple(b.stop - b.start for b in box)
-        tables: dict[str, Any] = {}
-        for k, (name, values) in enumerate(design.axes.items()):
-            along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
-            flat = np.broadcast_to(along, shape).ravel()
-            words = layout.labels.get(name)
+    exceeded = [";".join(f for k, f in enumerate(FLAGS) if bits >> k & 1) for bits in range(1 << len(FLAGS))]
+
+    def in_words(numbers: np.ndarray, words: Sequence[str]) -> Any:
+        return pa.DictionaryArray.from_arrays(numbers.astype(np.int32), list(words))
+
+    for box in map(layout.blocks.box, range(len(layout.blocks))):
+        table: dict[str, Any] = {}
+        for name, values in zip(layout.design.names, layout.design.values_in_slices(box).T, strict=True):
             column, unit = COLUMNS.get(name, (name, 1.0))
-            tables[column] = (
-                pa.array(flat / unit)
-                if words is None
-                else pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(words))
-            )
-        for name in design.samples.names if design.samples is not None else ():
-            sampled: Any = group[name]
-            column, unit = COLUMNS.get(name, (name, 1.0))
-            tables[column] = pa.array(np.broadcast_to(sampled[box[-1]], shape).ravel() / unit)
-        for name, (dtype, _) in layout.variables.items():
+            labels = layout.labels.get(name)
+            table[column] = pa.array(values / unit) if labels is None else in_words(values, labels)
+        for name, (dtype, attributes) in layout.variables.items():
             array: Any = group[name]
             flat = array[box].ravel()
-            if name == STATUS:
-                tables[STATUS] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(STATUSES))
-            elif np.dtype(dtype).kind != "f":
-                names = [";".join(f for k, f in enumerate(FLAGS) if bits >> k & 1) for bits in range(1 << len(FLAGS))]
-                tables[name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
+            if np.dtype(dtype).kind == "f":
+                table[columns.get(name, name)] = pa.array(flat, from_pandas=True)
             else:
-                tables[columns.get(name, name)] = pa.array(flat, from_pandas=True)
-        yield pa.table(tables)
-
-
-def _csv(path: Path, parts: Iterator[Any]) -> None:
-    import pyarrow as pa
-    from pyarrow import csv
-
-    writer = None
-    for part in parts:
-        words = [pa.types.is_dictionary(f.type) for f in part.schema]
-        part = part.cast(
-            pa.schema([f.with_type(pa.string()) if w else f for f, w in zip(part.schema, words, strict=True)])
-        )
-        if writer is None:
-            writer = csv.CSVWriter(path, part.schema, write_options=csv.WriteOptions(quoting_style="needed"))
-        writer.write_table(part)
-    if writer is not None:
-        writer.close()
-
-
-def _parquet(path: Path, parts: Iterator[Any]) -> None:
-    from pyarrow import parquet
-
-    writer = None
-    for part in parts:
-        if writer is None:
-            writer = parquet.ParquetWriter(path, part.schema)
-        writer.write_table(part)
-    if writer is not None:
-        writer.close()
-
-
-_WRITERS = {"csv": _csv, "parquet": _parquet}
+                words = exceeded if "flag_masks" in attributes else attributes["flag_meanings"].split()
+                table[name] = in_words(flat, words)
+        yield pa.table(table)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import numpy as np
@@ -21,7 +20,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.console import progress_bar, report_stage
+from sweeps.console import report_stage
 from sweeps.inputs import load_robot, one_run
 from sweeps.points import run, scale
 from sweeps.report import runs_report, turn_words
@@ -42,12 +41,14 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     """
     if beside.runs is not None:
         raise BadConfiguration(
-            "--runs: got a file in addition to --left, --right or --heading; put duty_left and duty_right into the "
-            "file, or omit --runs"
+            "--runs: cannot be combined with --left, --right or --heading; put duty_left and duty_right into the file"
         )
     file, beside_columns = load_robot(config), beside.stated
     robot = file.robot
-    check_can_turn(robot, beside_columns.get("configuration") or robot.configurations.names[0])
+    name = beside_columns.get("configuration") or robot.configurations.names[0]
+    capabilities.check_can_turn(robot, (name,), "--left, --right, --heading")
+    if robot.rig.imposed != "voltage":
+        raise BadConfiguration("--left, --right: the robot's file imposes no voltage")
     runs = one_run(robot, {**beside_columns, **turn_columns(config, beside_columns)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, beside, runs) as folder:
@@ -68,19 +69,15 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             fidelity = fidelities.get_fidelity(config.model)
             assert fidelity.histories is not None  # of `drive` and `track`
             slow = fidelity.facts.slow
-            with (
-                report_stage(1, 2, "the turn over time", slow),
-                progress_bar(1, quiet=not slow) as advance,
-            ):
-                report_share = scale.share_counter(advance, 1)
-                first_run = jax.device_get(fidelity.histories(robot, conditions, config.options, report_share))
-                report_share(1.0)
+            with report_stage(1, 2, "the turn over time", slow), scale.share_progress(quiet=not slow) as told:
+                first_run = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
             turns, history = None, first_run.history
             assert history is not None
             folder.write_table("history.csv", history_table(history, readings))
         columns = {name: np.asarray(values) for name, values in first_run.columns.items()}
         table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first_run), **columns}
-        turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
+        numbers = {q.column: float(table[q.column][0]) for q in quantities.TABLE["turn"]}
+        turn = {name: x if np.isfinite(x) else None for name, x in numbers.items()}
         with report_stage(2, 2, "posture"):
             postures = turn_words.posture_of_runs(robot, runs, conditions)
         notes = []
@@ -88,31 +85,16 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             folder.write_table("posture.csv", postures.table)
             notes.append(turn_words.posture_sentences(postures))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
-        document = runs_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
+        end = None
+        if history is not None:
+            yaw = np.degrees(np.asarray(history.reading["yaw"])[0])
+            end = {
+                "time_s": float(history.time[0, -1]),
+                "displacement_m": float(history.distance[0, -1]),
+                "turned_deg": float(yaw[-1] - yaw[0]),
+            }
+        document = runs_report.turn_document(file, config.model, table, end, history, turns, notes)
         return run.write_run_folder(folder, config, result, print_report(document, file))
-
-
-def _end_of_run(history: History | None) -> dict[str, float] | None:
-    """Time, distance from the start and angle turned at the end of a run over time."""
-    if history is None:
-        return None
-    yaw = np.asarray(history.reading["yaw"])[0]
-    return {
-        "time_s": float(history.time[0, -1]),
-        "displacement_m": float(history.distance[0, -1]),
-        "turned_deg": float(np.degrees(yaw[-1] - yaw[0])),
-    }
-
-
-def check_can_turn(robot: Robot, named: str) -> None:
-    """Rejects a robot that cannot turn in this configuration.
-
-    Raises:
-        BadConfiguration: it cannot turn. The message has the reason.
-    """
-    capabilities.check_can_turn(robot, (named,), "--left, --right, --heading")
-    if robot.rig.imposed != "voltage":
-        raise BadConfiguration("--left, --right: the robot's file imposes no voltage")
 
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
@@ -125,7 +107,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     larger_voltage, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
     if supply is not None and supply < larger_voltage:
         raise BadConfiguration(
-            f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, the voltage of --left and --right"
+            f"--voltage: got {supply:g}; expected at least {larger_voltage:g} V, as --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
     source, duties = contradictions.supply_and_shares(volts, None if supply is None else np.asarray(supply))
@@ -134,15 +116,14 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
 
 def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:
     """Settled turns in one batch: the requested one, and turns at other duties of the slower side."""
-    left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
-    outer, shares = max(left, right, key=abs), len(SHARES)
-    other_duties = outer * SHARES
-    slower = abs(left) <= abs(right)
-    duty_left = np.concatenate([[left], other_duties if slower else np.full(shares, outer)])
-    duty_right = np.concatenate([[right], np.full(shares, outer) if slower else other_duties])
-    rows = jax.tree.map(lambda x: np.repeat(np.asarray(x), shares + 1), asked)
-    rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
-    rows = jax.tree.map(jax.numpy.asarray, rows)
+    duties = [float(np.asarray(getattr(asked, name))[0]) for name in SIDES]
+    slower, outer = int(np.argmin(np.abs(duties))), max(duties, key=abs)
+    rows = jax.tree.map(lambda x: jax.numpy.repeat(jax.numpy.asarray(x), len(SHARES) + 1), asked)
+    varied = {
+        name: jax.numpy.asarray([duties[k], *(outer * SHARES if k == slower else [outer] * len(SHARES))])
+        for k, name in enumerate(SIDES)
+    }
+    rows = dataclasses.replace(rows, **varied)
     return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
 
 
@@ -159,7 +140,3 @@ def history_table(history: History, shown: tuple[Channel, ...]) -> Columns:
     """Table of a turn over time, with a row for each sample."""
     read = {c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown if c.over_time}
     return {"time_s": np.ravel(history.time), **read, "displacement_m": np.ravel(history.distance)}
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None

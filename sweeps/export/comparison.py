@@ -209,21 +209,20 @@ def share_kept(
     1 minus the rms change of the format's error by the effect, over the rms change of current and speed. NaN if the
     effect changes nothing.
     """
-    errors = [
-        _scaled_residuals(exact)
-        - _scaled_residuals(_law_at(model, refit_parameters(model, situation, exact), situation))
+    refitted = [
+        _current_and_speed(_law_at(model, refit_parameters(model, situation, exact), situation))
         for model, exact in ((law, native), (bare, native_bare))
     ]
-    change = (_scaled_residuals(native) - _scaled_residuals(native_bare)) / (
-        sizes := np.sqrt(np.mean(_scaled_residuals(native) ** 2, 0))
-    )
+    exact, exact_bare = map(_current_and_speed, (native, native_bare))
+    errors, sizes = [exact - refitted[0], exact_bare - refitted[1]], np.sqrt(np.mean(exact**2, 0))
+    change = (exact - exact_bare) / sizes
     size = float(np.sqrt(np.mean(change**2)))
     if size < 1e-9:
         return float("nan")
     return 1 - float(np.sqrt(np.mean(((errors[0] - errors[1]) / sizes) ** 2))) / size
 
 
-def _scaled_residuals(found: JointResult) -> np.ndarray:
+def _current_and_speed(found: JointResult) -> np.ndarray:
     return np.stack([found.current, found.speed], -1)
 
 
@@ -275,8 +274,7 @@ class ComparisonRuns:
     @property
     def inside(self) -> JointResult:
         """The joint's own model."""
-        ratio = float(self.joint.robot.gearbox.ratio)
-        return JointResult(np.asarray(self.signals.current), np.asarray(self.signals.speed_motor) / ratio)
+        return _joint_result(self.joint, self.signals)
 
     @property
     def way(self) -> np.ndarray:
@@ -291,8 +289,8 @@ class ComparisonRuns:
     def solve_without_effects(self, names: Names) -> JointResult:
         """The joint's own model with amplitudes of some of its effects at 0."""
         _, signals = _solve_runs(_with_absent_effects(self.joint, names), self.conditions)
-        ratio = float(self.joint.robot.gearbox.ratio)
-        return JointResult(np.asarray(signals.current)[self.kept], np.asarray(signals.speed_motor)[self.kept] / ratio)
+        solved = _joint_result(self.joint, signals)
+        return JointResult(solved.current[self.kept], solved.speed[self.kept])
 
     def readings(self, found: JointResult) -> np.ndarray:
         """Readings of the instruments for an exported drive [SI], shape (runs, channels).
@@ -313,8 +311,19 @@ class ComparisonRuns:
             speed_theoretical=speed * radius,
             speed=speed * radius,
         )
-        sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(signals)
-        return np.stack([np.asarray(sensor_readings[c.name]) for c in channels_of(self.joint)], -1)
+        return _readings_of_signals(self.joint, signals)
+
+
+def _joint_result(joint: DriveJoint, signals: Signals) -> JointResult:
+    return JointResult(
+        np.asarray(signals.current), np.asarray(signals.speed_motor) / float(joint.robot.gearbox.ratio)
+    )
+
+
+def _readings_of_signals(joint: DriveJoint, signals: Signals) -> np.ndarray:
+    """Readings of the joint's instruments [SI], shape (runs, channels)."""
+    readings = jax.vmap(lambda s: balances.sensor(joint.file.robot, s))(signals)
+    return np.stack([np.asarray(readings[c.name]) for c in channels_of(joint)], -1)
 
 
 def _with_absent_effects(joint: DriveJoint, names: Names = ()) -> Robot:
@@ -355,25 +364,23 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     conditions = runs.conditions(robot)
     moves, solution = _solve_runs(robot, conditions)
     turns, signals = _solve_runs(_with_absent_effects(joint), conditions) if joint.outside else (moves, solution)
-    channels = channels_of(joint)
-    sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(solution)
-    native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
+    native = _readings_of_signals(joint, solution)
     is_moving = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
     if not is_moving.any():
         raise BadData(f"{source}: the model settles in none of these runs")
     signals = jax.tree.map(lambda x: x[is_moving] if np.shape(x) else x, signals)
     moving_runs = runs.where(is_moving)
-    radius = float(joint.load.radius)
     drive_signals = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
-    command = robot.driver.voltage(*map(jnp.asarray, drive_signals))
-    measured = np.full((len(moving_runs), len(channels)), np.nan)
+    command = np.asarray(robot.driver.voltage(*map(jnp.asarray, drive_signals)))
+    measured = np.full_like(native[is_moving], np.nan)
     if data is not None:
         by_name = {c.name: moving_runs.measured()[:, k] for k, c in enumerate(moving_runs.channels)}
-        measured = np.stack([by_name.get(c.name, x) for c, x in zip(channels, measured.T, strict=True)], -1)
+        for k, c in enumerate(channels_of(joint)):
+            measured[:, k] = by_name.get(c.name, np.nan)
+    torque = float(joint.load.radius) * np.asarray(signals.demand)
     return ComparisonRuns(
-        joint, source, moving_runs, conditions, is_moving, signals, native[is_moving], measured, np.asarray(command),
-        radius * np.asarray(signals.demand),
-    )  # fmt: skip
+        joint, source, moving_runs, conditions, is_moving, signals, native[is_moving], measured, command, torque
+    )
 
 
 def export_grid(joint: DriveJoint) -> Runs:
@@ -414,7 +421,7 @@ def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
-        raise BadData(f"{runs.source}: its runs drive the sides differently; expected straight travel")
+        raise BadData(f"{runs.source}: expected straight travel, not turns")
     if levers := [name for name in runs.axes if name.startswith("lever")]:
         raise BadData(f"{runs.source}, {levers[0]}: an export is one drive; expected runs without lever columns")
     if runs.sampled:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -64,31 +63,6 @@ def symmetric_axis(largest: float) -> np.ndarray:
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
 
 
-def steady_state_map(
-    module: ModuleType, params: Json, speed: np.ndarray, torque: np.ndarray, guess: float
-) -> SteadyMap:
-    """Steady states at each speed [rad/s] and torque [N·m] of the joint. `guess`: resistance for the first step."""
-    speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
-    params = {name: jnp.asarray(value, float) for name, value in params.items()}
-
-    @jax.jit
-    def solved(params: Any) -> Json:
-        def lacking(voltage: Any) -> Any:
-            return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
-
-        def again(voltage: Any, _: None) -> tuple[Any, None]:
-            residual, rise = value_and_slope(lacking, voltage)
-            return voltage - residual / jnp.where(rise > 1e-12, rise, 1e-12), None
-
-        constant, ratio = params["motor.torque_constant"], params["gearbox.ratio"]
-        start = constant * ratio * speeds + guess * torques / (constant * ratio)
-        voltage = jax.lax.scan(again, start, None, STEPS)[0]
-        return jax_actuator.settled_actuator(module, params, voltage, speeds)[1] | {"left": lacking(voltage)}
-
-    solution = {name: np.asarray(x).reshape(len(speed), len(torque)) for name, x in solved(params).items()}
-    return SteadyMap(speed, torque, {name: solution[name] for name in COLUMNS})
-
-
 class TableLaw(eqx.Module):
     """The tables, with linear interpolation between points. Attributes: as in `comparison.FormatLaw`."""
 
@@ -122,16 +96,28 @@ def map_of_drive(
 ) -> SteadyMap:
     """Steady states of a drive, over the range of the runs and slightly beyond."""
     module = module_from_source(jax_source(situation.joint, constants))
-    params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
-    reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
-    largest_torque = max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND
-    return steady_state_map(
-        module,
-        params,
-        symmetric_axis(reach),
-        symmetric_axis(largest_torque),
-        float(situation.joint.robot.motor.resistance),
-    )
+    given = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
+    speed = symmetric_axis(float(np.max(np.abs(situation.inside.speed))) * BEYOND)
+    torque = symmetric_axis(max(float(np.max(np.abs(situation.load))), 1e-6) * BEYOND)
+    speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
+
+    @jax.jit
+    def solved(params: Any) -> Json:
+        def lacking(voltage: Any) -> Any:
+            return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
+
+        def again(voltage: Any, _: None) -> tuple[Any, None]:
+            residual, rise = value_and_slope(lacking, voltage)
+            return voltage - residual / jnp.where(rise > 1e-12, rise, 1e-12), None
+
+        turns = params["motor.torque_constant"] * params["gearbox.ratio"]
+        start = turns * speeds + float(situation.joint.robot.motor.resistance) * torques / turns
+        voltage = jax.lax.scan(again, start, None, STEPS)[0]
+        return jax_actuator.settled_actuator(module, params, voltage, speeds)[1]
+
+    solution = solved({name: jnp.asarray(value, float) for name, value in given.items()})
+    values = {name: np.asarray(solution[name]).reshape(len(speed), len(torque)) for name in COLUMNS}
+    return SteadyMap(speed, torque, values)
 
 
 def table_law_function(situation: ComparisonRuns, constants: Sequence[LawConstant]) -> Any:
@@ -160,7 +146,7 @@ def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list
             changed.append(EffectFate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
         elif fate.name == mujoco.PLAY:
             play, twist = float(joint.load.backlash), float(joint.load.twist(1.0))
-            how = f"tables have no state, so  {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
+            how = f"tables have no state, so {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
             changed.append(EffectFate(fate.name, DROPPED, how))
         elif fate.name == mujoco.CONTROLLER:
             changed.append(EffectFate(fate.name, DROPPED, "the tables give its voltage"))

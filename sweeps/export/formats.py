@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,16 +23,17 @@ from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco
-from sweeps.export.comparison import ComparisonRuns, EffectFate, ExportComparison, JointResult, situation_of_joint
+from sweeps.export.comparison import ComparisonRuns, ExportComparison, situation_of_joint
 from sweeps.export.joint import DriveJoint, joint_of_robot
-from sweeps.export.law_source import LawConstant, law_constants, posterior_next_to
+from sweeps.export.law_source import LawConstant, law_constants
+from sweeps.inputs import posterior_beside_robot
 
 #: Names of formats and their uses.
 FORMATS = {
     "mujoco": "MJCF with <dcmotor>, and a runnable scene",
     "jax": "an actuator function in JAX, as source and as a serialised program",
     "onnx": "an ONNX model of one time step, for Isaac Lab, Unity or C++",
-    "mjlab": "an actuator configuration for law_source, in PyTorch",
+    "mjlab": "an actuator configuration of mjlab, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
     "randomization": "samples from the posterior, for MuJoCo and the actuator",
 }
@@ -95,16 +97,23 @@ def export_format(
     if to in ("mujoco", "randomization"):
         mujoco.mujoco_module()
     drive = joint_of_robot(file, configuration)
-    posterior = posterior_next_to(drive) if posterior is None else posterior
+    source = Path(file.source)
+    if posterior is None and source.suffix == ".toml" and source.with_name(FILE).is_file():
+        posterior = posterior_beside_robot(file)
     runs = situation_of_joint(drive.steady, data)
     constants = law_constants(drive, runs.signals, posterior)
-    make = {
-        "mujoco": _export_mujoco, "randomization": _export_mujoco, "table": _export_tables,
-        "jax": _export_actuator, "onnx": _export_actuator,
-        "mjlab": _export_actuator,
-    }[to]  # fmt: skip
-    empty_export = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
-    return make(empty_export, runs, at, draws, seed)
+    checks: Mapping[str, float] = {}
+    if to in ("mujoco", "randomization"):
+        files, compared, checks = _export_mujoco(drive, constants, runs, at)
+        if to == "randomization":
+            normal = float(np.mean(np.asarray(runs.signals.normal)))
+            values = draw_parameters(drive, posterior, constants, compared.refitted, normal, draws, seed)
+            files = randomization_files(values)
+    elif to == "table":
+        files, compared = _export_tables(drive, constants, runs)
+    else:
+        files, compared, checks = _export_actuator(to, drive, constants, runs)
+    return Export(to, drive, constants, posterior, files, compared, checks)
 
 
 def notes_for_file_head(runs: ComparisonRuns) -> list[str]:
@@ -123,8 +132,11 @@ def middle_run(command: np.ndarray, load: np.ndarray) -> tuple[float, float]:
     return float(command[row]), float(load[row])
 
 
-def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
-    drive = begun.joint
+#: Files of an export, its comparison with the native model, and results of checks.
+Written = tuple[Mapping[str, str | bytes], ExportComparison, Mapping[str, float]]
+
+
+def _export_mujoco(drive: DriveJoint, constants: Sequence[LawConstant], runs: ComparisonRuns, at: str) -> Written:
     normal = float(np.mean(np.asarray(runs.signals.normal)))
     compared = comparison.compare_format(
         runs,
@@ -134,43 +146,35 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
         mujoco.approximated_terms,
     )
     motor, name = mujoco.mjcf_motor(drive, compared.refitted), f"{drive.name}_drive"
-    notes = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
+    notes = mujoco.attribute_notes(constants, compared.translated, compared.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
-    middle = middle_run(runs.command, runs.load)
     follows_angle = drive.robot.rig.imposed == "goal_angle"
+    command, load = (GOAL * motor.ratio, 0.0) if follows_angle else middle_run(runs.command, runs.load)
 
     def texts_of(drive: DriveJoint) -> dict[str, str]:
         return {
             "drive.xml": mujoco.mjcf_fragment(drive, motor, notes, notes_for_file_head(runs), name, at, volts),
-            "scene.xml": mujoco.mjcf_scene(
-                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows_angle else middle)
-            ),
+            "scene.xml": mujoco.mjcf_scene(drive, mass, name, at, command, load),
         }
 
     texts = texts_of(drive)
     checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
     if follows_angle or (drive.loose and drive.controller is None):
-        command = GOAL if follows_angle else volts
         times = np.linspace(0.0, START, 26)
-        controller = drive.controller
-        conditions = (
-            Conditions(voltage=command)
-            if controller is None
-            else Conditions(voltage=controller.supply_voltage, goal=command)
-        )
-        run = drive_batch(
-            drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
-        )
-        native = np.asarray(run.signals.angle)[0]
-        mujoco_angles = mujoco.angles_in_mujoco(texts, command * (motor.ratio if follows_angle else 1.0), times)
-        share = 100 * float(np.sqrt(np.mean((mujoco_angles - native) ** 2)) / np.sqrt(np.mean(native**2)))
-        checks |= {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
-    files: Mapping[str, str | bytes] = texts
-    if begun.format == "randomization":
-        values = draw_parameters(drive, begun.posterior, begun.constants, compared.refitted, normal, draws, seed)
-        files = randomization_files(values)
-    return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
+        conditions = Conditions(voltage=volts)
+        if drive.controller is not None:
+            conditions = Conditions(voltage=drive.controller.supply_voltage, goal=GOAL)
+        conditions = jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions)
+        native = np.asarray(drive_batch(drive.robot, conditions, jnp.asarray(times)).signals.angle)[0]
+        angles = mujoco.angles_in_mujoco(texts, command if follows_angle else volts, times)
+        checks[f"angle over {START:g} s from rest, MuJoCo C against native [%]"] = _rms_percent(angles, native)
+    return texts, compared, checks
+
+
+def _rms_percent(values: np.ndarray, reference: np.ndarray) -> float:
+    """Rms of a difference over the rms of the reference [%]."""
+    return 100 * float(np.sqrt(np.mean((values - reference) ** 2)) / np.sqrt(np.mean(reference**2)))
 
 
 def _check_in_mujoco(
@@ -179,55 +183,38 @@ def _check_in_mujoco(
     """Largest differences of MuJoCo C from the format's law, and errors of both on the same runs [%]."""
     rows = np.unique(np.linspace(0, len(runs.command) - 1, min(CHECKED, len(runs.command))).astype(int))
     mujoco_results = mujoco.settle_in_mujoco(texts, motor, runs, found.exported, rows.tolist())
-    law = JointResult(found.exported.current[rows], found.exported.speed[rows])
-    native = JointResult(runs.inside.current[rows], runs.inside.speed[rows])
-
-    def apart(a: np.ndarray, b: np.ndarray) -> float:
-        return 100 * float(np.sqrt(np.mean((a - b) ** 2)) / np.sqrt(np.mean(b**2)))
-
-    return {
-        "runs settled in MuJoCo C": float(len(rows)),
-        "current, law against native [%]": apart(law.current, native.current),
-        "current, MuJoCo C against native [%]": apart(mujoco_results.current, native.current),
-        "speed, law against native [%]": apart(law.speed, native.speed),
-        "speed, MuJoCo C against native [%]": apart(mujoco_results.speed, native.speed),
-    }
+    checks = {"runs settled in MuJoCo C": float(len(rows))}
+    for name in ("current", "speed"):
+        native, law, settled = (vars(x)[name] for x in (runs.inside, found.exported, mujoco_results))
+        checks[f"{name}, law against native [%]"] = _rms_percent(law[rows], native[rows])
+        checks[f"{name}, MuJoCo C against native [%]"] = _rms_percent(settled, native[rows])
+    return checks
 
 
-def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
-    drive, constants, notes = begun.joint, begun.constants, notes_for_file_head(runs)
-    law = jax_actuator.actuator_law_function(runs, constants)
-    effect_names = {e.name: "a function of the law" for e in drive.inside}
-    checks: dict[str, float] = {}
-    if begun.format == "jax":
+def _export_actuator(to: str, drive: DriveJoint, constants: Sequence[LawConstant], runs: ComparisonRuns) -> Written:
+    notes, checks = notes_for_file_head(runs), dict[str, float]()
+    if to == "jax":
         files = jax_actuator.jax_files(drive, constants, notes)
-    elif begun.format == "mjlab":
+    elif to == "mjlab":
         files = law_source.mjlab_files(drive, constants, notes)
     else:
         files = jax_actuator.onnx_files(drive, constants)
-        model: Any = files["actuator.onnx"]
-        checks["ONNX against JAX, largest of 10,000 states [relative]"] = jax_actuator.difference_from_jax(
-            drive, constants, model
-        )
-    compared = comparison.compare_format(
-        runs, law, jax_actuator.fates_in_actuator(drive), effect_names, mujoco.approximated_terms
-    )
-    return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
+        difference = jax_actuator.difference_from_jax(drive, constants, files["actuator.onnx"])
+        checks["ONNX against JAX, largest of 10,000 states [relative]"] = difference
+    law, fates = jax_actuator.actuator_law_function(runs, constants), jax_actuator.fates_in_actuator(drive)
+    effect_names = {e.name: "a function of the law" for e in drive.inside}
+    return files, comparison.compare_format(runs, law, fates, effect_names, mujoco.approximated_terms), checks
 
 
-def _export_tables(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
-    drive, constants = begun.joint, begun.constants
-    law = feed_forward.table_law_function(runs, constants)
+def _export_tables(
+    drive: DriveJoint, constants: Sequence[LawConstant], runs: ComparisonRuns
+) -> tuple[Mapping[str, str | bytes], ExportComparison]:
     settled = "its settled value, since a table has no state"
     effect_names = {e.name: "the tables" if e.memory_size is None else settled for e in drive.inside}
-    fates: list[EffectFate] = feed_forward.fates_in_tables(drive, constants)
+    law, fates = feed_forward.table_law_function(runs, constants), feed_forward.fates_in_tables(drive, constants)
     compared = comparison.compare_format(runs, law, fates, effect_names, mujoco.approximated_terms)
-    files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_for_file_head(runs))
-    return dataclasses.replace(begun, files=files, comparison=compared)
-
-
-#: Smallest and largest number of draws, typical numbers of environments in training.
-MOST = 1_000_000
+    table = feed_forward.map_of_drive(runs, constants)
+    return feed_forward.table_files(drive, table, notes_for_file_head(runs)), compared
 
 
 def draw_parameters(

@@ -216,7 +216,7 @@ def onnx_files(joint: DriveJoint, constants: Sequence[LawConstant]) -> dict[str,
     return {"actuator.onnx": model.SerializeToString()}
 
 
-def difference_from_jax(joint: DriveJoint, constants: Sequence[LawConstant], model: bytes) -> float:
+def difference_from_jax(joint: DriveJoint, constants: Sequence[LawConstant], model: Any) -> float:
     """Largest difference of the model's outputs from JAX's over random states, relative to each output's rms."""
     runtime = _import_library("onnxruntime")
     step, inputs, _ = step_function(joint, constants)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -201,13 +202,11 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     stated_word(name, robot.configurations, "--configuration", wrong)
     if robot.unlike:
         raise BadConfiguration(
-            f"{file.name}: {', '.join(robot.unlike)} makes the sides differ, but an export is one drive; export "
-            "a file for each side, without this effect"
+            f"{file.name}: {', '.join(robot.unlike)} makes the sides differ; export a file for each side "
+            "without this effect"
         )
     if robot.controller is not None and not robot.controller.supply_voltage:
-        raise BadConfiguration(
-            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it; add it [V]"
-        )
+        raise BadConfiguration(f"{file.name}, controller.supply_voltage: missing; add it [V]")
     if robot.rig.imposed != "voltage" and robot.controller is None:
         imposed_words = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(
@@ -230,6 +229,10 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
     return dataclasses.replace(joint, parts=tuple(_trace_parts(joint)))
 
 
+#: Function of a robot with the joint's effects and its signals.
+LawFunction = Callable[[Robot, Signals], Any]
+
+
 class _ExpressionTracer:
     """Traces functions of a robot and its signals into expressions of their names."""
 
@@ -248,7 +251,7 @@ class _ExpressionTracer:
             *(f"surroundings.{n}" for n in self.around),
         ]
 
-    def __call__(self, function: Callable[[Robot, Signals], Any], what: str, balance: str, by: str = "") -> Symbol:
+    def __call__(self, function: LawFunction, what: str, balance: str, by: str = "") -> Symbol:
         """Expression of a function of robot and signals, or of its derivative with respect to the variable `by`."""
         self.at_wheel = balance != "gearbox"
 
@@ -292,7 +295,6 @@ class _ExpressionTracer:
 
 def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
     """Equations of the base, then those of the effects, each in the order of its balance."""
-    trace = _ExpressionTracer(joint)
     bare = lambda robot: dataclasses.replace(robot, effects=())  # noqa: E731
 
     speed_at_rest = float(joint.load.speed_still) / float(joint.load.radius)
@@ -301,31 +303,43 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
         if joint.robot.has_ground
         else "M_t = M_0 sign ω + K ω"
     )
-    base: Sequence[tuple[str, str, str, str, str, str, Callable[[Robot, Signals], Any]]] = (
-        ("direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
-         f"smooth sign of the speed, within ω_0 = {speed_at_rest:.3g} rad/s of rest", "",
-         lambda r, s: contact.smooth_sign(s.speed_wheel, speed_at_rest)),
-        ("back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces", "",
-         lambda r, s: r.motor.voltage_back(s.speed_motor)),
-        ("winding", "electrical", "V", "U_R = R_rot I", "voltage across the winding", "current",
-         lambda r, s: r.motor.voltage_winding(s.current)),
-        ("inductance", "inductance", "H", "L_d", "inductance of the winding", "",
-         lambda r, s: r.motor.inductance),
-        ("motor_torque", "torque", "N·m", "M = C_m I", "torque that the current makes", "",
-         lambda r, s: r.motor.torque_electromagnetic(s.current)),
-        ("motor_friction", "motor", "N·m", "M_f = M_df0 sign ω + K_fd ω", "friction of the motor, at its shaft", "",
-         lambda r, s: r.motor.torque_loss(s.speed_motor, s.direction)),
-        ("gear_idle", "idle", "N·m", "M_i = M_rf0 sign ω + K_fr ω", "idle friction of the gearbox, at its input",
-         "", lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction)),
-        ("gear_efficiency", "efficiency", "-", "η_rm where power flows to the wheel, 1/η_b where it flows back",
-         "transmitted share of torque, `load`: torque at its input", "",
-         lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction)),
-        ("output_friction", "track", "N·m", friction,
-         "friction between the gearbox and the wheel's rim, at the wheel", "pull",
-         lambda r, s: balances.track(bare(r), r.chassis(0), s).torque_track_loss),
+    part = functools.partial(_trace_part, _ExpressionTracer(joint))
+    yield part(
+        "direction", "way", "-", "x (3 - x²) / 2, x = ω/ω_0 within ±1",
+        f"smooth sign of the speed, within ω_0 = {speed_at_rest:.3g} rad/s of rest",
+        lambda r, s: contact.smooth_sign(s.speed_wheel, speed_at_rest),
     )  # fmt: skip
-    for name, balance, unit, equation, meaning, derivative_variable, function in base:
-        yield _trace_part(trace, name, balance, unit, equation, meaning, derivative_variable, function)
+    yield part(
+        "back_emf", "back", "V", "E = C_m ω_m", "voltage that the turning motor induces",
+        lambda r, s: r.motor.voltage_back(s.speed_motor),
+    )  # fmt: skip
+    yield part(
+        "winding", "electrical", "V", "U_R = R_rot I", "voltage across the winding",
+        lambda r, s: r.motor.voltage_winding(s.current), "current",
+    )  # fmt: skip
+    yield part("inductance", "inductance", "H", "L_d", "inductance of the winding", lambda r, s: r.motor.inductance)
+    yield part(
+        "motor_torque", "torque", "N·m", "M = C_m I", "torque that the current makes",
+        lambda r, s: r.motor.torque_electromagnetic(s.current),
+    )  # fmt: skip
+    yield part(
+        "motor_friction", "motor", "N·m", "M_f = M_df0 sign ω + K_fd ω", "friction of the motor, at its shaft",
+        lambda r, s: r.motor.torque_loss(s.speed_motor, s.direction),
+    )  # fmt: skip
+    yield part(
+        "gear_idle", "idle", "N·m", "M_i = M_rf0 sign ω + K_fr ω", "idle friction of the gearbox, at its input",
+        lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction),
+    )  # fmt: skip
+    yield part(
+        "gear_efficiency", "efficiency", "-", "η_rm where power flows to the wheel, 1/η_b where it flows back",
+        "transmitted share of torque, `load`: torque at its input",
+        lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction),
+    )  # fmt: skip
+    yield part(
+        "output_friction", "track", "N·m", friction,
+        "friction between the gearbox and the wheel's rim, at the wheel",
+        lambda r, s: balances.track(bare(r), r.chassis(0), s).torque_track_loss, "pull",
+    )  # fmt: skip
     variable = {"supply": "current", "electrical": "current", "gearbox": "load", "track": "pull"}
     for effect in joint.inside:
         alone = lambda r, e=effect: tuple(x for x in r.effects if x.name == e.name)  # noqa: E731
@@ -337,15 +351,15 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
             rate = lambda r, s, alone=alone: alone(r)[0].rate(r, s)  # noqa: E731
         equation, *further = (inspect.getdoc(type(effect).plain or type(effect)) or effect.name).split("\n\n")
         meaning = further[0] if further and not further[0].startswith("Source") else ""
-        yield _trace_part(
-            trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], " ".join(equation.split()),
-            " ".join(meaning.split()), variable.get(effect.balance, ""), value, rate, effect.name,
+        yield part(
+            effect.name, effect.balance, balances.BALANCES[effect.balance][0], " ".join(equation.split()),
+            " ".join(meaning.split()), value, variable.get(effect.balance, ""), rate, effect.name,
         )  # fmt: skip
 
 
 def _trace_part(
-    trace: _ExpressionTracer, name: str, balance: str, unit: str, equation: str, meaning: str, by: str,
-    function: Callable[[Robot, Signals], Any], rate: Callable[[Robot, Signals], Any] | None = None, effect: str = "",
+    trace: _ExpressionTracer, name: str, balance: str, unit: str, equation: str, meaning: str,
+    function: LawFunction, by: str = "", rate: LawFunction | None = None, effect: str = "",
 ) -> Part:  # fmt: skip
     value = trace(function, name, balance)
     depends = by in names_in(value)

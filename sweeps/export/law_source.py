@@ -9,21 +9,18 @@ import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import jinja2
 import numpy as np
 
-from calibration.data import posterior_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.posterior_file import Posterior
 from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model import quantities
 from mmrjax.model.balances import TORQUE_STEPS
-from mmrjax.model.params import Parameter
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_in
@@ -44,21 +41,6 @@ DRAWS, ENDS = 4000, (0.025, 0.975)
 OF_POSTERIOR, OF_PRIOR = "95 % interval", "from the prior (± two sds): no posterior available"
 
 
-def posterior_next_to(joint: DriveJoint) -> Posterior | None:
-    """Posterior next to the robot's file. None if there is no such file.
-
-    Raises:
-        BadData: it cannot be read, or belongs to another robot.
-    """
-    source = Path(joint.file.source)
-    path = source.with_name(posterior_file.FILE)
-    if source.suffix != ".toml" or not path.is_file():
-        return None
-    posterior = posterior_file.read_posterior(path)
-    posterior.check(joint.file.robot, str(path))
-    return posterior
-
-
 def law_constants(joint: DriveJoint, signals: Signals, posterior: Posterior | None) -> tuple[LawConstant, ...]:
     """Numbers of the law: parameters of the robot, and means of the joint's surroundings over the runs.
 
@@ -69,41 +51,33 @@ def law_constants(joint: DriveJoint, signals: Signals, posterior: Posterior | No
     if posterior is not None:
         quantiles = np.quantile(posterior.draw(DRAWS, 0), ENDS, axis=0)
         ends = {n: (float(a), float(b)) for n, a, b in zip(posterior.names, *quantiles, strict=True)}
+    priors = {n: (mean, sd) for n, mean, sd in joint.file.robot.rig.priors}
     for name, parameter in joint.parameters().items():
-        low, high, kind = _interval_of(joint, name, parameter, ends, posterior is not None)
-        spec = parameter.spec
-        source = f"fitted; prior: {spec.source}" if kind == OF_POSTERIOR else spec.source
-        value = float(parameter.value)
-        constants.append(LawConstant(name, value, spec.unit, spec.meaning, source, low, high, kind))
+        spec, value = parameter.spec, float(parameter.value)
+        interval: tuple[float | None, float | None, str] = (None, None, "")
+        sd = priors[name][1] if name in priors else spec.prior_sd(value)
+        if name in ends:
+            interval = *ends[name], OF_POSTERIOR
+        elif sd:
+            kind = OF_PRIOR if posterior is None else "from the prior (± two sds): not fitted"
+            interval = max(value - 2 * sd, spec.bounds[0]), min(value + 2 * sd, spec.bounds[1]), kind
+        source = f"fitted; prior: {spec.source}" if name in ends else spec.source
+        constants.append(LawConstant(name, value, spec.unit, spec.meaning, source, *interval))
     for name in joint.surroundings():
         word = name.removeprefix("surroundings.")
         over_runs = np.asarray(getattr(signals, word), float)
         mean = float(np.nanmean(over_runs)) if np.isfinite(over_runs).any() else 0.0
-        condition = quantities.CONDITIONS.get(word)
         unit = {"normal": "N", "mass": "kg", "slope": "rad", "payload": "kg"}.get(word, "SI")
-        meaning = {"normal": "normal load of one side"}.get(
-            word, condition.label if condition else word.replace("_", " ")
-        )
+        meaning = word.replace("_", " ")
+        if word == "normal":
+            meaning = "normal load of one side"
+        elif word in quantities.CONDITIONS:
+            meaning = quantities.CONDITIONS[word].label
         constants.append(LawConstant(name, mean, unit, meaning, "mean over the compared runs"))
     if joint.controller is not None:
         volts = joint.controller.supply_voltage
         constants.append(LawConstant(SUPPLY, volts, "V", "supply of the driver", "given by the user of the actuator"))
     return tuple(constants)
-
-
-def _interval_of(
-    joint: DriveJoint, name: str, parameter: Parameter, ends: dict[str, tuple[float, float]], fitted: bool
-) -> tuple[float | None, float | None, str]:
-    if name in ends:
-        return *ends[name], OF_POSTERIOR
-    priors = {n: (mean, sd) for n, mean, sd in joint.file.robot.rig.priors}
-    value = float(parameter.value)
-    sd = priors[name][1] if name in priors else parameter.spec.prior_sd(value)
-    if not sd:
-        return None, None, ""
-    kind = "from the prior (± two sds): not fitted" if fitted else OF_PRIOR
-    low, high = parameter.spec.bounds
-    return max(value - 2 * sd, low), min(value + 2 * sd, high), kind
 
 
 #: Name of the constant with a controller's supply voltage.

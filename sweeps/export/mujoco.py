@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 import textwrap
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,7 +19,9 @@ from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
 from mmrjax.errors import printable
+from mmrjax.model import params
 from mmrjax.model.chassis import inertia_reduced
+from mmrjax.model.driver import Controller
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, ComparisonRuns, EffectFate, JointResult
 from sweeps.export.joint import DriveJoint
@@ -89,17 +92,10 @@ class MujocoLaw(eqx.Module):
         return values_by_name[SHARE] * current, speed
 
 
-def _effect_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Parameters of each effect inside, by its name, with some amplitudes replaced."""
-    numbers: dict[str, dict[str, float]] = {}
-    for effect in joint.inside:
-        own_fields = {
-            f.name: float(getattr(effect, f.name)) for f in dataclasses.fields(effect) if "spec" in f.metadata
-        }
-        numbers[effect.name] = own_fields | (
-            {"amplitude": amplitudes[effect.name]} if effect.name in amplitudes else {}
-        )
-    return numbers
+def _law_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> defaultdict[str, float]:
+    """Parameters by dotted name [SI], with some amplitudes replaced. Those of effects that are missing are 0."""
+    changed = {f"effects.{name}.amplitude": amplitude for name, amplitude in amplitudes.items()}
+    return defaultdict(float, params.values_by_name(joint.robot) | changed)
 
 
 def mujoco_law_function(normal: float) -> Any:
@@ -113,49 +109,34 @@ def translate_law(joint: DriveJoint, normal: float, amplitudes: Mapping[str, flo
     Losses in proportion to the load take a share 1 - η of the torque. `<dcmotor>` has one motor constant for torque
     and voltage, so the current that it shows is I' = η I, and its resistance is R / η.
     """
-    robot, load = joint.robot, joint.load
-    motor, gear = robot.motor, robot.gearbox
-    ratio, share = float(gear.ratio), float(gear.efficiency_load)
-    numbers_by_effect = _effect_numbers(joint, amplitudes or {})
-    number = lambda name, key="amplitude": numbers_by_effect.get(name, {}).get(key, 0.0)  # noqa: E731
-    resistance = float(motor.resistance) + number("series_resistance") + float(robot.sides) * number("supply_sag")
-    at_output = ratio * share
-    dry = at_output * float(motor.friction_coulomb + gear.friction_coulomb)
-    damping = at_output * ratio * float(motor.friction_viscous + gear.friction_viscous)
+    robot, load, v = joint.robot, joint.load, _law_numbers(joint, amplitudes or {})
+    ratio, share = v["gearbox.ratio"], v["gearbox.efficiency_load"]
+    leads = v["effects.series_resistance.amplitude"] + float(robot.sides) * v["effects.supply_sag.amplitude"]
+    dry = ratio * share * (v["motor.friction_coulomb"] + v["gearbox.friction_coulomb"])
+    damping = ratio**2 * share * (v["motor.friction_viscous"] + v["gearbox.friction_viscous"])
+    losses = load.track if robot.has_ground else load
+    dry += float(losses.loss_coulomb)
+    damping += float(losses.loss_viscous)
     if robot.has_ground:
-        dry += float(load.track.loss_coulomb) + float(load.track.force_guide(normal, 1.0)) * float(load.radius)
-        damping += float(load.track.loss_viscous)
-    else:
-        dry += float(load.loss_coulomb)
-        damping += float(load.loss_viscous)
-    names = [RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE]
-    start = [resistance / share, float(motor.torque_constant), dry, damping, 1 / share]
-    if excess := stribeck_friction(joint, numbers_by_effect):
-        names += [EXCESS, FADE]
-        start += [max(excess[0], 0.0), excess[1]]
-    if "thermal_drift" in numbers_by_effect:
-        names.append(HEAT)
-        start.append(max(number("thermal_drift") * number("thermal_drift", "resistance_thermal"), 0.0) / share)
-    numbers = (start, ratio, float(motor.temperature_coefficient))
-    return MujocoLaw(tuple(names), *(jnp.asarray(x, float) for x in numbers))
-
-
-def stribeck_friction(joint: DriveJoint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
-    """Excess friction at low speed [N·m] and its fading speed [rad/s], at the joint. None without such effects."""
-    gear = joint.robot.gearbox
-    ratio, share = float(gear.ratio), float(gear.efficiency_load)
-    bristles = [
-        (
-            fields["amplitude"] * (ratio * share if at_motor else 1.0),
-            fields["speed_fade"] / (ratio if by_motor else 1.0),
-        )
-        for name, fields in known.items()
-        if name in STRIBECK
-        for at_motor, by_motor in (STRIBECK[name],)
-    ]
-    if not bristles:
-        return None
-    return sum(a for a, _ in bristles), max(v for _, v in bristles)
+        dry += float(losses.force_guide(normal, 1.0)) * float(load.radius)
+    values = {
+        RESISTANCE: (v["motor.resistance"] + leads) / share,
+        CONSTANT: v["motor.torque_constant"],
+        FRICTION: dry,
+        DAMPING: damping,
+        SHARE: 1 / share,
+    }
+    # friction at low speed, at the joint
+    falling = [e.name for e in joint.inside if e.name in STRIBECK]
+    if falling:
+        excess = [v[f"effects.{n}.amplitude"] * (ratio * share if STRIBECK[n][0] else 1.0) for n in falling]
+        fades = [v[f"effects.{n}.speed_fade"] / (ratio if STRIBECK[n][1] else 1.0) for n in falling]
+        values |= {EXCESS: max(sum(excess), 0.0), FADE: max(fades)}
+    if any(e.name == "thermal_drift" for e in joint.inside):
+        heat = v["effects.thermal_drift.amplitude"] * v["effects.thermal_drift.resistance_thermal"]
+        values[HEAT] = max(heat, 0.0) / share
+    numbers = (list(values.values()), ratio, v["motor.temperature_coefficient"])
+    return MujocoLaw(tuple(values), *(jnp.asarray(x, float) for x in numbers))
 
 
 def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
@@ -172,7 +153,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
             EffectFate(
                 "gearbox losses proportional to the load", APPROXIMATED,
                 "resistance / η and current = act / η: exact while power flows to the load. While it flows "
-                "back, the joint is braked less than in reality",
+                "back, the joint is braked too little",
             )
         )  # fmt: skip
     if robot.has_ground:
@@ -184,31 +165,27 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
             EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if joint.loose:
-        how = "a joint for the motor's side, and a tendon with a range or a stiffness"
+        how = "a joint for the motor's side, and a tendon"
         fates.append(EffectFate(PLAY, HELD, how))
-    if controller := joint.controller:
-        fates.append(_controller_fate(joint, float(controller.lag), float(controller.ki), controller.rate))
+    if joint.controller is not None:
+        fates.append(_controller_fate(joint, joint.controller))
     if joint.limit is not None:
         fates.append(EffectFate("current limit of the driver", HELD, "saturation"))
     return [*fates, *fates_outside_joint(joint)]
 
 
-def _controller_fate(joint: DriveJoint, lag: float, ki: float, rate: float) -> EffectFate:
+def _controller_fate(joint: DriveJoint, controller: Controller) -> EffectFate:
     """Fate of a controller in `<dcmotor>`, which follows the motor's angle without lag, with a limited integral."""
-    imposed = joint.robot.rig.imposed
+    imposed, lag = joint.robot.rig.imposed, float(controller.lag)
     if imposed != "goal_angle":
-        how = (
-            f"<dcmotor> has no {imposed.replace('_', ' ')} control with these gains: take them from LAW.md and "
-            "command voltages"
-        )
-        return EffectFate(CONTROLLER, DROPPED, how)
+        how = f"<dcmotor> has no {imposed.replace('_', ' ')} control with these gains: take them from LAW.md and "
+        return EffectFate(CONTROLLER, DROPPED, f"{how}command voltages")
     limitations = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
-    limitations += [f"it acts at each step, not at {rate:g} Hz"] * (rate > 0)
-    limitations += ["its integral stops at a value, not at the duty's limit"] * (ki > 0)
+    limitations += [f"it acts at each step, not at {controller.rate:g} Hz"] * (controller.rate > 0)
+    limitations += ["its integral stops at a value, not at the duty's limit"] * (float(controller.ki) > 0)
     limitations += ["it measures the angle on the motor's side of the backlash"] * joint.loose
-    return EffectFate(
-        CONTROLLER, APPROXIMATED if limitations else HELD, "; ".join(["gains and limit of voltage", *limitations])
-    )
+    how = "; ".join(["gains and limit of voltage", *limitations])
+    return EffectFate(CONTROLLER, APPROXIMATED if limitations else HELD, how)
 
 
 def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
@@ -216,9 +193,9 @@ def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     place_by_effect = {
         "sensor": "an instrument error, not part of the drive",
         "supply": "the battery; reduce the command's voltage accordingly",
-        "mass": "the mass of the robot. Set it in the model",
+        "mass": "set the mass in the model",
     }
-    other = "a property of the ground. Set it in the model"
+    other = "set the ground in the model"
     return [EffectFate(e.name, DROPPED, place_by_effect.get(e.balance, other)) for e in joint.outside]
 
 
@@ -257,33 +234,29 @@ class MjcfMotor:
 
 def mjcf_motor(joint: DriveJoint, values: Mapping[str, float]) -> MjcfMotor:
     """Numbers of the MJCF for refitted parameters."""
-    robot, numbers = joint.robot, _effect_numbers(joint, {})
-    gear, share = robot.gearbox, float(robot.gearbox.efficiency_load)
-    ratio = float(gear.ratio)
-    number = lambda name, key="amplitude": numbers.get(name, {}).get(key, 0.0)  # noqa: E731
-    inductance = (float(robot.motor.inductance) + number("armature_inductance")) * values[SHARE]
-    inertia = float(inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, 0.0))
+    robot, v = joint.robot, _law_numbers(joint, {})
+    ratio, share = v["gearbox.ratio"], v["gearbox.efficiency_load"]
+    inductance = (v["motor.inductance"] + v["effects.armature_inductance.amplitude"]) * values[SHARE]
+    inertia = float(inertia_reduced(robot.motor.inertia, ratio, share, 0.0))
     thermal: tuple[float, ...] = ()
     if values.get(HEAT):
-        capacity = number("thermal_drift", "time_constant") / values[HEAT]
-        thermal = (values[HEAT], capacity, 0.0, float(robot.motor.temperature_coefficient), 25.0, 25.0)
+        capacity = v["effects.thermal_drift.time_constant"] / values[HEAT]
+        thermal = (values[HEAT], capacity, 0.0, v["motor.temperature_coefficient"], 25.0, 25.0)
     lugre: tuple[float, ...] = ()
-    bristle = max(number("presliding"), 0.0)
+    bristle = max(v["effects.presliding.amplitude"], 0.0)
     excess = values.get(EXCESS, 0.0)
     if bristle or excess:
         # All dry friction goes through the bristle if it falls with speed, because its steady curve must end above 0.
         coulomb = max(values[FRICTION], LEAST_SHARE * excess) if excess else min(bristle, values[FRICTION])
-        turn = number("presliding", "angle_breakaway") or YIELD
+        turn = v["effects.presliding.angle_breakaway"] or YIELD
         stiffness = (coulomb + excess) / turn
         fade = values.get(FADE, 1.0)
         lugre = (stiffness / ratio**2, 0.0, coulomb / ratio, (coulomb + excess) / ratio, fade * ratio)
-    cogging = (
-        (-number("cogging") * share, number("cogging", "ripples"), number("cogging", "phase"))
-        if number("cogging")
-        else ()
-    )
+    cogging: tuple[float, ...] = ()
+    if amplitude := v["effects.cogging.amplitude"]:
+        cogging = (-amplitude * share, v["effects.cogging.ripples"], v["effects.cogging.phase"])
     limit = None if joint.limit is None else values[CONSTANT] * joint.limit / values[SHARE]
-    added = number("rotating_inertia")
+    added = v["effects.rotating_inertia.amplitude"]
     return MjcfMotor(values, ratio, inductance, inertia + added, added, thermal, lugre, cogging, limit)
 
 
@@ -296,19 +269,12 @@ def _controller_gains(joint: DriveJoint, found: MjcfMotor) -> tuple[float, ...]:
     if controller is None or joint.robot.rig.imposed != "goal_angle":
         return ()
     constant = found.values[CONSTANT]
-    volts, kp, ki, kd = (
-        controller.supply_voltage * float(g) / found.ratio for g in (1.0, controller.kp, controller.ki, controller.kd)
-    )
-    torque = constant / found.values[RESISTANCE]
-    integral_limit = float(controller.limit) * found.ratio / float(controller.ki) if ki else 0.0
+    torque, volts = constant / found.values[RESISTANCE], controller.supply_voltage / found.ratio
+    kp, ki, kd, limit = (float(x) for x in (controller.kp, controller.ki, controller.kd, controller.limit))
     return (
-        kp * torque,
-        ki * torque,
-        (kd + constant) * torque,
-        0.0,
-        integral_limit,
-        volts * found.ratio * float(controller.limit),
-    )
+        volts * kp * torque, volts * ki * torque, (volts * kd + constant) * torque,
+        0.0, limit * found.ratio / ki if ki else 0.0, controller.supply_voltage * limit,
+    )  # fmt: skip
 
 
 def _numbers_text(*numbers: float) -> str:
@@ -400,45 +366,29 @@ def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: floa
         mass: mass of the vehicle [kg].
         command, load: command and load of the key frame `run` [V or rad], [N·m].
     """
-    moved_load = joint.load
+    body, head, arm = joint.load, "The rig's shaft", 0.05
+    inertia, centre, own_mass = float(body.inertia), (0.0, 0.0, 0.0), 1.0
+    own_inertia = inertia
     if joint.robot.has_ground:
-        radius = float(moved_load.radius)
-        inertia = float(moved_load.inertia) + mass / float(joint.robot.sides) * radius**2
-        head = f"One side of the robot: its wheel, carrying 1/{float(joint.robot.sides):g} of {mass:.4g} kg"
-        weight, arm, angle = 0.0, radius, 0.0
-    else:
-        inertia, weight, angle = (
-            float(moved_load.inertia),
-            float(moved_load.torque_gravity),
-            float(moved_load.angle_zero),
-        )
-        head, arm = "The rig's shaft", 0.05
+        arm, sides = float(body.radius), float(joint.robot.sides)
+        own_inertia += mass / sides * arm**2
+        head = f"One side of the robot: its wheel, carrying 1/{sides:g} of {mass:.4g} kg"
+    elif (weight := float(body.torque_gravity)) > 0:
+        # the mass on its lever has half of the inertia
+        gravity, angle = 9.81, float(body.angle_zero)  # MuJoCo's default
+        lever = inertia * gravity / (2 * weight)
+        own_mass = weight / (gravity * lever)
+        own_inertia = inertia - own_mass * lever**2
+        centre = lever * math.sin(angle), 0.0, -lever * math.cos(angle)
     return filled_template(
-        "scene.xml", at=at, name=name, timestep="0.0005" if joint.loose else "0.001",
-        head=_comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  "),
-        body=_body_text(inertia, weight, angle), arm=_numbers_text(arm), run=_numbers_text(command, load),
+        "scene.xml", at=at, name=name, timestep="0.0005" if joint.loose else "0.001", text=_numbers_text,
+        head=_comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  "), centre=centre,
+        mass=own_mass, inertia=own_inertia, arm=arm, run=_numbers_text(command, load),
     )  # fmt: skip
 
 
-def _body_text(inertia: float, weight: float, angle: float) -> str:
-    """Text of a body with an inertia about its joint [kg·m²], and the centre of mass of an arm that hangs at `angle`
-    [rad].
-    """
-    if weight <= 0:
-        return f'      <inertial pos="0 0 0" mass="1" diaginertia="{_numbers_text(inertia, inertia, inertia)}"/>\n'
-    gravity = 9.81  # MuJoCo's default
-    arm = inertia * gravity / (2 * weight)  # the mass on its arm has half of the inertia
-    mass = weight / (gravity * arm)
-    rest = inertia - mass * arm**2
-    position_text = _numbers_text(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
-    return (
-        f'      <inertial pos="{position_text}" mass="{_numbers_text(mass)}" '
-        f'diaginertia="{_numbers_text(rest, rest, rest)}"/>\n'
-    )
-
-
 def attribute_notes(
-    joint: DriveJoint, constants: Sequence[LawConstant], translated: Mapping[str, float], values: Mapping[str, float]
+    constants: Sequence[LawConstant], translated: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, str]:
     """Origin of each attribute in words, with intervals of the parameters from which it is computed."""
     by_name = {c.name: c for c in constants}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,10 +13,10 @@ from calibration.data import Columns, Json, Names, runs
 from calibration.inference import simulation_errors
 from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import History
+from mmrjax.fidelities.steady import results_of_rows, steady_batch
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
-from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
 from sweeps.pages.history_figures import StartRun
@@ -52,18 +53,13 @@ def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditio
 
 def operating_points(robot: Robot, asked: Conditions) -> Columns:
     """Steady operating points of a batch, in the columns of `runs.csv`."""
-    import jax
-
-    from mmrjax.fidelities.steady import steady_batch
-
     rows = asked.shape[0]
     parts = []
     for first in range(0, rows, _CHUNK):
         index = np.minimum(np.arange(first, first + _CHUNK), rows - 1)
-        part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))
-        parts.append(jax.tree.map(np.asarray, part))
+        parts.append(jax.device_get(steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))))
     answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
-    return {**outputs.output_columns(answer, robot.channels), "total_mass_kg": np.asarray(answer.mass)}
+    return {**outputs.output_columns(answer, robot.channels), "total_mass_kg": answer.mass}
 
 
 def channels_of_paper() -> tuple[Channel, ...]:
@@ -98,9 +94,12 @@ class PaperRows:
     weighed: Columns
     ratio: dict[str, float]
 
-    def adhesion(self) -> np.ndarray:
-        """Ratio of the raised adhesion for each row."""
-        return np.array([self.ratio[c] for c in self.conditions["configuration"]])
+    @property
+    def errors(self) -> Columns:
+        """Errors (35) against the bench [%] of the three variants and of the paper's simulation, as `measured`."""
+        variants = {"plain": self.plain, "raised": self.raised, "weighed": self.weighed}
+        simulated = {name: stack_channels(table) for name, table in variants.items()} | {"paper": self.paper}
+        return {name: simulation_errors.relative_error(x, self.measured) for name, x in simulated.items()}
 
 
 def simulate_measured_rows(robot: Robot) -> PaperRows | None:
@@ -150,41 +149,7 @@ def raised_adhesion_words(robot: Robot, ratio: dict[str, float]) -> str:
     return "; ".join(parts)
 
 
-def channel_percent_errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
-    """Errors (35) of the paper's channels [%], shape (rows, channels), NaN for missing numbers."""
-    return simulation_errors.relative_error(stack_channels(simulated), measured)
-
-
 # --- components ---------------------------------------------------------------------------------------
-
-
-def gear_efficiency(robot: Robot, speed_rpm: float, torque_input: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Output torque [N·m] and efficiency [-], eq. (19), over input torque [N·m] at one motor speed."""
-    gear, speed, torque = robot.gearbox, speed_rpm * RPM, jnp.asarray(torque_input)
-    transmitted = torque - gear.torque_idle(speed, 1.0)
-    return np.asarray(gear.torque_output(transmitted, 1.0)), np.asarray(gear.efficiency(torque, speed))
-
-
-def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.ndarray:
-    """Voltage of one cell [V] over its load current I_b [A] (12), after a discharge [mAh]."""
-    from mmrjax.model.paper_tables import COULOMB_PER_MAH
-
-    battery = robot.battery
-    total = battery.voltage(jnp.asarray(current) - battery.current_other, discharge_mah * COULOMB_PER_MAH)
-    return np.asarray(total) / battery.cells
-
-
-def cell_no_load(robot: Robot, discharge_mah: np.ndarray) -> np.ndarray:
-    """No-load voltage of one cell [V], eq. (13), over discharge [mAh]."""
-    from mmrjax.model.paper_tables import COULOMB_PER_MAH
-
-    discharge = jnp.asarray(discharge_mah * COULOMB_PER_MAH)
-    return np.asarray(robot.battery.voltage_no_load(discharge)) * np.ones_like(discharge_mah)
-
-
-def motor_friction(robot: Robot, speed_rpm: np.ndarray) -> np.ndarray:
-    """Friction torque of the motor M_df [mN·m], eq. (14), over shaft speed [rpm]."""
-    return 1e3 * np.asarray(robot.motor.torque_loss(jnp.asarray(speed_rpm * RPM), 1.0)) * np.ones_like(speed_rpm)
 
 
 def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> np.ndarray:
@@ -294,30 +259,16 @@ def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
     return found
 
 
-def supply_errors(robot: Robot, ratio: float, rows_of: PaperRows, battery: bool) -> dict[int, np.ndarray]:
-    """Errors (35) over the five slopes of 6T2A in modes 1 and 2 of Fig. 29: mode → shape (5, 3).
-
-    On battery there is only mode 2: a full battery of 8 cells gives about the 33 V of the bench.
-    """
-    answer = {}
-    for mode, voltage in ((1, 15.0), (2, 33.0)):
-        table = rows_of.conditions
-        pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)
-        if battery and mode == 1:
-            continue
-        picked = table.where(pick)
-        conditions = batch_conditions(
-            robot,
-            picked["configuration"],
-            voltage=voltage,
-            payload=picked["payload_kg"],
-            slope_deg=picked["slope_deg"],
-            total_mass=picked["total_mass_kg"],
-            adhesion=ratio,
-            battery=float(battery),
-        )
-        answer[mode] = channel_percent_errors(operating_points(robot, conditions), rows_of.measured[pick])
-    return answer
+def supply_errors(robot: Robot, rows: PaperRows, voltage: float, battery: bool) -> np.ndarray:
+    """Errors (35) over the five slopes of 6T2A at a voltage of Fig. 29, with raised adhesion, shape (5, 3)."""
+    pick = (rows.conditions["configuration"] == TRACKED) & (rows.conditions["supply_voltage_V"] == voltage)
+    table = rows.conditions.where(pick)
+    conditions = batch_conditions(
+        robot, table["configuration"], voltage=voltage, payload=table["payload_kg"],
+        slope_deg=table["slope_deg"], total_mass=table["total_mass_kg"], adhesion=rows.ratio[TRACKED],
+        battery=float(battery),
+    )  # fmt: skip
+    return simulation_errors.relative_error(stack_channels(operating_points(robot, conditions)), rows.measured[pick])
 
 
 #: Uses of the supply's power, from the motor to the ground, with their names in the figure.
@@ -330,21 +281,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     Returns:
         Points, and item → power. `other` is the power of effects beyond the paper's terms.
     """
-    import equinox as eqx
-
-    from mmrjax.model import balances
-    from mmrjax.model.signals import State
-
-    points = operating_points(robot, asked)
-    wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(asked.configuration).radius)
-    current = points["power_supply_W"] / points["voltage_V"] / robot.sides
-    state = State(
-        jnp.asarray(current),
-        wheel * robot.gearbox.ratio,
-        points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
-        asked.discharge,
-    )
-    signals, _ = eqx.filter_jit(balances.settled_signals)(robot, asked, state)
+    points, (_, signals) = operating_points(robot, asked), results_of_rows(robot, asked)
     sides = robot.sides
     parts = {
         "winding": sides * signals.voltage_drop * signals.current,
@@ -372,10 +309,8 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> list[tuple[Any, ...]]:
     kind, voltage, payload, slope = (np.array(v) for v in zip(*cases, strict=True))
 
     def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
-        conditions = batch_conditions(
-            robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion
-        )
-        return energy_split(robot, conditions)
+        given = {"voltage": voltage, "payload": payload, "slope_deg": slope, "adhesion": adhesion}
+        return energy_split(robot, batch_conditions(robot, kind, **given))
 
     is_sliding = at(np.ones(len(cases)))[0]["status"] == "slides"
     points, power = at(np.where(is_sliding, [ratio[k] for k in kind], 1.0))
@@ -402,11 +337,7 @@ def paper_rows_table(rows: PaperRows) -> Columns:
 
 def bench_error_summary(rows: PaperRows) -> dict[str, Json]:
     """Errors (35) of every channel against the bench: of three robot variants and of the paper's simulation."""
-    ways = {
-        name: channel_percent_errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")
-    }
-    ways["paper"] = simulation_errors.relative_error(rows.paper, rows.measured)
     return {
-        way: {c.name: simulation_errors.error_summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
-        for way, values in ways.items()
+        name: {c.name: simulation_errors.error_summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
+        for name, values in rows.errors.items()
     }

@@ -24,9 +24,8 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
-    add_corner_note,
-    label_line_end,
     new_figure,
+    outer_legend,
 )
 from sweeps.pages.words import displayed_robot_name
 from sweeps.paper import data
@@ -235,19 +234,16 @@ def _paper_rows_table(rows: data.PaperRows) -> Block:
 def _variants(name: str, rows: dict[str, data.PaperRows]) -> Columns:
     """Errors of the rows by variant, with the names in the table of errors."""
     own_rows, shown = rows[name], words.displayed_robot_name(name)
-    error = data.channel_percent_errors
+    errors = own_rows.errors
     answer = {
-        f"{shown}: own adhesion, mass as printed": error(own_rows.plain, own_rows.measured),
-        f"{shown}: adhesion raised, mass as printed": error(own_rows.raised, own_rows.measured),
-        f"{shown}: adhesion raised, the robot's own mass": error(own_rows.weighed, own_rows.measured),
+        f"{shown}: own adhesion, mass as printed": errors["plain"],
+        f"{shown}: adhesion raised, mass as printed": errors["raised"],
+        f"{shown}: adhesion raised, the robot's own mass": errors["weighed"],
     }
     if name != "nominal":
         pick = np.isin(rows["nominal"].conditions["configuration"], list(own_rows.ratio))
-        nominal = rows["nominal"]
-        answer["nominal (PM): adhesion raised, its own mass"] = error(nominal.weighed, nominal.measured)[pick]
-    return answer | {
-        "the paper's own simulation": simulation_errors.relative_error(own_rows.paper, own_rows.measured)
-    }
+        answer["nominal (PM): adhesion raised, its own mass"] = rows["nominal"].errors["weighed"][pick]
+    return answer | {"the paper's own simulation": errors["paper"]}
 
 
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
@@ -262,83 +258,53 @@ def current_over_slope(robot: Robot, rows: data.PaperRows, certainty: Sequence[S
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
     fig, grid = new_figure(1, len(rows.ratio), 4.4, sharey=True)
+    fits = {(kind, mode): f": R² {weighed:.3f} ({straight:.3f})" for kind, mode, straight, *_, weighed in certainty}
     for axes, kind in zip(grid[0], rows.ratio, strict=True):
-        for mode in data.MODES:
+        for mode, (volts, payload) in data.MODES.items():
             colour, marker = _MODES[mode]
             own, raised = lines[kind, mode]
             axes.plot(slopes, raised, "--", color=colour, lw=1.3)
-            axes.plot(slopes, own, color=colour)
-            stop = np.nonzero(np.isfinite(own))[0]
-            if stop.size and stop[-1] < len(slopes) - 1:
-                axes.plot(slopes[stop[-1]], own[stop[-1]], "x", color=colour, ms=7, mew=2)
-            label_line_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold", offset=(5 + 9 * (mode % 2), 0))
+            axes.plot(slopes, own, color=colour, label=f"{volts:g} V, {payload:g} kg{fits.get((kind, mode), '')}")
             pick = data.rows_of_mode(rows, kind, mode)
-            if pick.any():
-                table = rows.conditions["slope_deg"][pick]
-                axes.plot(table, rows.measured[pick, 0], marker, color=colour, ms=6.5, mec=INK, mew=0.8)
-        axes.set(xlabel="slope [°]", xticks=[0, 5, 10, 15, 20], xlim=(-0.5, 20.9))
+            points = rows.conditions["slope_deg"][pick], rows.measured[pick, 0]
+            axes.plot(*points, marker, color=colour, ms=6.5, mec=INK, mew=0.8)
+        axes.set(xlabel="slope [°]", xlim=(-0.5, 20.9), ylim=(0, None))
         axes.set_title(kind)
-        texts = [
-            f"mode {mode}: R² {weighed:.3f} (straight fit {straight:.3f})"
-            for name, mode, straight, *_, weighed in certainty
-            if name == kind
-        ]
-        add_corner_note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
-    grid[0, 0].set_ylim(0, 1.2 * grid[0, 0].dataLim.y1 if np.isfinite(grid[0, 0].dataLim.y1) else 1.0)
+        axes.legend()
     grid[0, 0].set_ylabel("total current [A]")
-    modes = "     ".join(f"{m}: {u:g} V, {p:g} kg" for m, (u, p) in data.MODES.items())
     fig.supxlabel(
-        f"loading modes   {modes}\nsolid: own adhesion, × where the robot begins to slide, dashed: adhesion raised",
-        fontsize=9,
+        "solid: own adhesion, until the robot slides. Dashed: adhesion raised. Markers: measured", fontsize=9
     )
     return fig
 
 
 def model_errors(robots: dict[str, Robot], rows: dict[str, data.PaperRows]) -> Figure:
     """Fig. 29: errors (35) in current and speed over slope, 6T2A, modes 1 and 2, adhesion raised."""
-    fig, grid = new_figure(2, 2, 6.2, sharex=True)
-    slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
-    for name, robot in robots.items():
-        ratio = rows[name].ratio[TRACKED]
-        colour = MODEL.get(name, PURPLE)
-        for battery in (False, True):
-            if battery and name == "sm1":
-                continue  # SM-1 and SM-2 share the constant battery; the paper draws one
-            for mode, error in data.supply_errors(robot, ratio, rows[name], battery).items():
-                for row, channel in ((0, 0), (1, 2)):
-                    axes = grid[row, mode - 1]
-                    axes.plot(slopes, error[:, channel], ":" if battery else "-", color=colour, marker="o", ms=4)
-    from matplotlib.lines import Line2D
+    fig, grid = new_figure(2, 2, 6.2, sharex=True, sharey="row")
+    slopes, first = np.array([0.0, 5.0, 10.0, 15.0, 20.0]), next(iter(rows.values()))
+    of_track = first.conditions["configuration"] == TRACKED
 
-    handles = [
-        Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=displayed_robot_name(n)) for n in robots
-    ]
-    handles.append(Line2D([], [], color=INK, ls=":", marker="o", ms=4, label="on a full battery (mode 2)"))
-    paper = simulation_errors.relative_error(next(iter(rows.values())).paper, next(iter(rows.values())).measured)
-    table = next(iter(rows.values())).conditions
-    for mode, voltage in ((1, 15.0), (2, 33.0)):
-        pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)
-        for row, channel in ((0, 0), (1, 2)):
-            grid[row, mode - 1].plot(slopes, paper[pick, channel], "-", color=INK, marker="d", ms=5, lw=1)
-    handles.append(Line2D([], [], color=INK, marker="d", ms=5, lw=1, label="the paper's own simulation"))
-    for row, label in ((0, "error in current [%]"), (1, "error in speed [%]")):
-        for mode in (1, 2):
-            axes = grid[row, mode - 1]
-            axes.axhspan(-7, 7, color="#eef3ee", zorder=0)
-            axes.axhline(0, color="#666666", lw=0.9)
-            axes.set_xticks(slopes)
-        low = min(a.get_ylim()[0] for a in grid[row])
-        high = max(a.get_ylim()[1] for a in grid[row])
-        for axes in grid[row]:
-            axes.set_ylim(low, high)
-        grid[row, 0].set_ylabel(label)
-    grid[0, 0].set_title("mode 1: 15 V, 0 kg")
-    grid[0, 1].set_title("mode 2: 33 V, 8 kg")
-    add_corner_note(
-        grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744"
-    )
-    for axes in grid[1]:
-        axes.set_xlabel("slope [°]")
-    labels = [str(h.get_label()) for h in handles]
-    fig.legend(handles=handles, loc="outside lower center", ncols=len(labels))
+    def draw(column: np.ndarray, errors: np.ndarray, style: str, **look: Any) -> None:
+        for axes, channel in zip(column, (0, 2), strict=True):
+            axes.plot(slopes, errors[:, channel], style, ms=4, **look)
+
+    for k, column, (volts, payload) in zip((1, 2), grid.T, (data.MODES[1], data.MODES[4]), strict=True):
+        for name, robot in robots.items():
+            look: Json = {"color": MODEL.get(name, PURPLE), "marker": "o"}
+            errors = data.supply_errors(robot, rows[name], volts, battery=False)
+            draw(column, errors, "-", label=displayed_robot_name(name), **look)
+            # A full battery of 8 cells gives the 33 V of mode 2. SM-1 and SM-2 share one constant battery.
+            if k == 2 and name != "sm1":
+                draw(column, data.supply_errors(robot, rows[name], volts, battery=True), ":", **look)
+        pick = of_track & (first.conditions["supply_voltage_V"] == volts)
+        label = "the paper's own simulation"
+        draw(column, first.errors["paper"][pick], "-", color=INK, marker="d", lw=1, label=label)
+        column[0].set_title(f"mode {k}: {volts:g} V, {payload:g} kg")
+        column[1].set_xlabel("slope [°]")
+    for axes in grid.flat:
+        axes.axhspan(-7, 7, color="#eef3ee", zorder=0)
+        axes.axhline(0, color="#666666", lw=0.9)
+    grid[0, 0].set_ylabel("error in current [%]")
+    grid[1, 0].set_ylabel("error in speed [%]")
+    outer_legend(grid[0, 0], "lower center")
     return fig

@@ -26,7 +26,6 @@ from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import SURFACES
-from mmrjax.model.rig import IMPOSED
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.config_campaign import Campaign
@@ -35,9 +34,7 @@ from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, Sam
 from sweeps.points.tasks import task_of_configuration
 
 CONFIGURATION, SURFACE = "configuration", "surface"
-#: Condition of each imposed quantity (`rig.IMPOSED`). Conditions that act only on vehicles, and only on loads on a
-#: shaft.
-AXIS = {name: name for name in IMPOSED}
+#: Conditions that act only on vehicles, and only on loads on a shaft.
 ON_GROUND, ON_SHAFT = ("slope_deg", "payload", "total_mass", "adhesion"), ("load_torque",)
 #: Most values of one axis, which are kept in memory, unlike samples.
 LONGEST = 10_000_000
@@ -80,10 +77,8 @@ class SweepPlan:
 
     def fixed(self) -> Conditions:
         """Conditions that do not vary, of shape ()."""
-        from mmrjax.model.conditions import Conditions
-
-        configuration_index = int(self.conditions.get(CONFIGURATION, 0))
-        return Conditions(configuration_index, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
+        given = {name: value for name, value in self.conditions.items() if name != CONFIGURATION}
+        return Conditions(int(self.conditions.get(CONFIGURATION, 0)), **given)
 
 
 def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
@@ -96,14 +91,12 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
         BadConfiguration: a name is unknown or stated twice, an axis has no values, a range is reversed, a value is
             out of bounds, or similar.
     """
-    data: list[str] = []
     task = task_of_configuration(config, robot)
-    extra = task.axes
     axes = {
-        name: _axis_values(name, axis_text, robot, f"{where}, axes.{name}", extra)
-        for name, axis_text in config.axes.items()
+        name: _axis_values(name, stated, robot, f"{where}, axes.{name}", task.axes)
+        for name, stated in config.axes.items()
     }
-    samples = _sampled_design(config.samples, robot, f"{where}, samples", data)
+    samples, data = _sampled_design(config.samples, robot, f"{where}, samples")
     if not axes and samples is None:
         raise BadConfiguration(f"{where}: no [axes] or [samples]; vary at least one quantity")
     design = Design(axes, samples)
@@ -112,30 +105,28 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
             raise BadConfiguration(f"{where}, {name}: given twice; give it once, under conditions, axes or samples")
-    if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
-        raise BadConfiguration(
-            f"{where}: voltage has no effect on a battery, whose charge sets it; remove one of the two"
-        )
-    _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
+    names, on_battery = {*fixed, *design.names}, fixed.get("battery", 0.0) > 0.5
+    if on_battery and "voltage" in names:
+        raise BadConfiguration(f"{where}: voltage has no effect on a battery; remove one of the two")
+    _check_acting_conditions(names, robot, where, surface)
     configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
     configuration_names = [robot.configurations.names[int(k)] for k in configuration_indices]
-    capabilities.check_turning(robot, {*fixed, *design.names}, configuration_names, where)
-    if levers := sorted({*fixed, *design.names} & {*LEVERS}):
-        for name in configuration_names:
-            if why := reason_without_levers(robot, name):
-                raise BadConfiguration(f"{where}, {levers[0]}: {why}")
-    own_axis = AXIS[robot.rig.imposed]
-    if not robot.rig.inherits and own_axis not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
+    capabilities.check_turning(robot, names, configuration_names, where)
+    for name in configuration_names if not names.isdisjoint(LEVERS) else ():
+        if why := reason_without_levers(robot, name):
+            raise BadConfiguration(f"{where}, {min(names & {*LEVERS})}: {why}")
+    own_axis = robot.rig.imposed
+    if not robot.rig.inherits and own_axis not in names and not on_battery:
         level = capabilities.imposed_default(robot, f"{where}, conditions.{own_axis}")
         fixed[own_axis] = level * OF_IMPOSED[own_axis][1]
-    if surface is not None and "adhesion" in {*fixed, *design.names}:
+    if surface is not None and "adhesion" in names:
         raise BadConfiguration(
             f"{where}, conditions.surface: got {surface} in addition to adhesion; give one of the two"
         )
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
-    plan = SweepPlan(design, dict(extra), fixed, surface, tuple(data))
-    varied = {**extra, **plan.varied(robot).axes}
+    plan = SweepPlan(design, dict(task.axes), fixed, surface, data)
+    varied = {**task.axes, **plan.varied(robot).axes}
     return dataclasses.replace(plan, axes={name: varied[name] for name in design.names})
 
 
@@ -149,11 +140,13 @@ def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface:
     for name in sorted(names & idle):
         raise BadConfiguration(
             f"{where}, {name}: the robot's file imposes the {robot.rig.imposed.replace('_', ' ')}; vary "
-            f"{AXIS[robot.rig.imposed]} instead"
+            f"{robot.rig.imposed} instead"
         )
-    ground = {*names, *([SURFACE] if surface is not None else [])} & {*ON_GROUND, SURFACE}
-    shaft = [f"{where}, {name}" for name in ON_SHAFT if name in names]
-    capabilities.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
+    named = {*names, *([SURFACE] if surface is not None else [])}
+    ground, shaft = (
+        [f"{where}, {name}" for name in sorted(named & {*those})] for those in ((*ON_GROUND, SURFACE), ON_SHAFT)
+    )
+    capabilities.check_acting(robot, ground, shaft)
     if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
             f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations "
@@ -174,10 +167,9 @@ def _axis_value(name: str, value: Any, where: str) -> float:
 
 def _check_within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
     low, high = axis.bounds
-    for value in values:
-        if not low <= value <= high:
-            unit = "" if axis.unit in ("", "-") else f" {axis.unit}"
-            raise BadConfiguration(f"{where}: got {value:g}; expected {low:g} to {high:g}{unit} ({axis.meaning})")
+    for value in values[~((values >= low) & (values <= high))][:1]:
+        unit = "" if axis.unit in ("", "-") else f" {axis.unit}"
+        raise BadConfiguration(f"{where}: got {value:g}; expected {low:g} to {high:g}{unit} ({axis.meaning})")
 
 
 def _configuration(name: Any, robot: Robot, where: str) -> float:
@@ -190,10 +182,9 @@ def _configuration(name: Any, robot: Robot, where: str) -> float:
 
 def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, Axis]) -> np.ndarray:
     axis = extra[name] if name in extra else _known_axis(name, robot, where)
+    several = stated if isinstance(stated, list) else [stated]
     if name == CONFIGURATION:
-        names = (
-            list(robot.configurations.names) if stated == "all" else stated if isinstance(stated, list) else [stated]
-        )
+        names = robot.configurations.names if stated == "all" else several
         values = np.array([_configuration(n, robot, where) for n in names])
     elif isinstance(stated, dict):
         _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
@@ -212,7 +203,7 @@ def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mappin
     elif isinstance(stated, str):
         values = np.array(parse_axis(where, stated))
     else:
-        values = np.array([_axis_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
+        values = np.array([_axis_value(name, v, where) for v in several])
     if not len(values):
         raise BadConfiguration(f"{where}: got no values; expected at least one")
     if len(values) > LONGEST:
@@ -260,9 +251,10 @@ def _fixed_conditions(stated: Json, robot: Robot, where: str) -> tuple[dict[str,
 _SAMPLES = ("design", "number", "seed", "over", "posterior")
 
 
-def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples | None:
+def _sampled_design(stated: Json, robot: Robot, where: str) -> tuple[Samples | None, Names]:
+    """Sampled design, if any, and its input files."""
     if not stated:
-        return None
+        return None, ()
     _check_keys(stated, _SAMPLES, ("design", "number"), where)
     design = stated_word(stated["design"], DESIGNS, f"{where}.design", f"got {stated['design']!r}")
     number = stated_count(stated["number"], f"{where}.number", 1, 2**52)
@@ -271,7 +263,7 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     if not isinstance(overrides, dict):
         raise BadConfiguration(f"{where}.over: got {overrides!r}; expected a table of names and distributions")
     marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in overrides.items()}
-    joint = None
+    joint, data = None, Names()
     if "posterior" in stated:
         from calibration.data import posterior_file
 
@@ -282,12 +274,12 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
         path = path / posterior_file.FILE if path.is_dir() else path
         joint = posterior_file.read_posterior(path)
         joint.check(robot, place)
-        data.append(str(path))
+        data = (str(path),)
     if not marginals and joint is None:
         raise BadConfiguration(
             f"{where}: nothing to sample; give a table `over` of names and distributions, or `posterior`"
         )
-    return Samples(design, number, seed, marginals, joint)
+    return Samples(design, number, seed, marginals, joint), data
 
 
 #: Keys of each distribution.
@@ -334,14 +326,17 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
 
 
 def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:
-    from scipy import special
+    from scipy.special import ndtr, ndtri
 
+    positive = {"loguniform": "low", "lognormal": "median"}.get(kind)
+    if positive and numbers[positive] <= 0:
+        raise BadConfiguration(
+            f"{where}.{positive}: got {numbers[positive]:g}; expected a number above 0 with {kind}"
+        )
     if kind in ("uniform", "loguniform"):
         low, high = numbers["low"], numbers["high"]
         if kind == "uniform":
             return lambda u: low + (high - low) * u
-        if low <= 0:
-            raise BadConfiguration(f"{where}.low: got {low:g}; expected a number above 0 with loguniform")
         return lambda u: low * np.exp(u * math.log(high / low))
     if kind == "triangular":
         low, mode, high = numbers["low"], numbers["mode"], numbers["high"]
@@ -352,12 +347,9 @@ def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float],
             high - np.sqrt((1 - u) * (high - low) * (high - mode)),
         )
     # normal in the value or its logarithm, truncated at the bounds
+    centre, sd = numbers.values()
     if kind == "normal":
-        mean, sd = numbers["mean"], numbers["sd"]
-        lower, upper = (special.ndtr((b - mean) / sd) for b in bounds)
-        return lambda u: np.clip(mean + sd * special.ndtri(lower + (upper - lower) * u), *bounds)
-    median, sd = numbers["median"], numbers["sd_log"]
-    if median <= 0:
-        raise BadConfiguration(f"{where}.median: got {median:g}; expected more than 0")
-    lower, upper = (special.ndtr(math.log(b / median) / sd) if b > 0 else 0.0 for b in bounds)
-    return lambda u: np.clip(median * np.exp(sd * special.ndtri(lower + (upper - lower) * u)), *bounds)
+        lower, upper = (ndtr((b - centre) / sd) for b in bounds)
+        return lambda u: np.clip(centre + sd * ndtri(lower + (upper - lower) * u), *bounds)
+    lower, upper = (ndtr(math.log(b / centre) / sd) if b > 0 else 0.0 for b in bounds)
+    return lambda u: np.clip(centre * np.exp(sd * ndtri(lower + (upper - lower) * u)), *bounds)

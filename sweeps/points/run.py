@@ -158,25 +158,15 @@ def job_of_run_table(robot: Robot, runs: Runs, config: FidelityPart, samples: Dr
     return Job(robot, task, plan, output_names, "float64", blocks)
 
 
-def evaluate_runs(
-    robot: Robot,
-    runs: Runs,
-    config: FidelityPart,
-    folder: RunFolder | None,
-    advance: Callable[[float], None] | None = None,
-) -> Columns:
-    """Simulates every run and returns the table of conditions and results.
+def evaluate_runs(robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder | None) -> Columns:
+    """Simulates every run and returns the table of conditions and results. Long simulations show a progress bar.
 
     Chunks in the folder, from an interrupted run with the same configuration, are not simulated again.
-
-    Args:
-        advance: callback with the number of runs since its last call, including shares of chunks in progress. None: a
-            progress bar on stderr for long simulations.
     """
     job = job_of_run_table(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
-    with progress_bar(len(runs), quiet=not slow or advance is not None) as shown:
-        chunks = compute_chunks(job, folder, "chunk", advance or shown)
+    with progress_bar(len(runs), quiet=not slow) as advance:
+        chunks = compute_chunks(job, folder, "chunk", advance)
     columns = {row.column: chunks[row.name] for row in outputs.output_table(robot.channels)}
     further = {name: chunks[name] for name in fidelities.get_fidelity(config.model).columns}
     return {
@@ -263,28 +253,9 @@ QUANTILES = (0.025, 0.975)
 SEED = 0
 
 
-@dataclasses.dataclass(frozen=True)
-class Intervals:
-    """Intervals of every run from draws of a posterior.
-
-    Attributes:
-        columns: columns from `simulate_draws`, arrays of shape (runs,).
-        draws: number of draws.
-        channels: channels of the robot.
-    """
-
-    columns: Columns
-    draws: int
-    channels: tuple[Channel, ...]
-
-    def sd(self, column: str) -> np.ndarray:
-        """Standard deviation of a column of the runs."""
-        return self.columns[column + SD]
-
-
 def simulate_draws(
     robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPart, draws: int, folder: RunFolder | None = None
-) -> Intervals:
+) -> Columns:
     """Simulates every run with robots drawn from the posterior: a sweep of the runs combined with the draws.
 
     The result is the uncertainty of the model's prediction, without the noise of readings. Each draw is one robot for
@@ -307,7 +278,7 @@ def simulate_draws(
         chunks = compute_chunks(
             job, folder, "draws", lambda points: advance(points / len(runs)), summary if draws_fit_chunk else dict
         )
-    return Intervals(chunks if draws_fit_chunk else summary(chunks), draws, robot.channels)
+    return chunks if draws_fit_chunk else summary(chunks)
 
 
 def _summary(columns: Columns, counts: np.ndarray) -> Columns:
@@ -326,29 +297,29 @@ def _summary(columns: Columns, counts: np.ndarray) -> Columns:
     return {**by_column, SHARE: counts.mean(1)}
 
 
-def interval_ranges(table: Columns, found: Intervals) -> list[str]:
+def interval_ranges(table: Columns, channels: tuple[Channel, ...], draws: int) -> list[str]:
     """Range of every channel over the runs, each end with its sd, and the number of draws that do not converge."""
-    first_column = found.channels[0].column
-    finite = np.isfinite(found.sd(first_column)) & np.isfinite(table[first_column])
+    first_column = channels[0].column
+    rows = np.flatnonzero(np.isfinite(table[first_column + SD]) & np.isfinite(table[first_column]))
     ranges = []
-    for c in found.channels if finite.any() else ():
-        value, sd, rows = table[c.column], found.sd(c.column), np.flatnonzero(finite)
+    for c in channels if len(rows) else ():
+        value, sd = table[c.column], table[c.column + SD]
         least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
         ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
         ranges.append(f"{c.label}: {' to '.join(ends)} {c.unit}")
-    first_remark, *more_remarks = interval_remarks(found, "the table")
+    first_remark, *more_remarks = interval_remarks(table, draws, "the table")
     return [*[first_remark] * bool(ranges), *ranges, *more_remarks]
 
 
-def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
+def interval_remarks(table: Columns, draws: int, place: str = "runs.csv") -> list[str]:
     """Number of drawn robots and, if some do not converge, their number and that of the runs."""
-    is_incomplete = found.columns[SHARE] < 1
-    remarks = [f"± one sd over {found.draws} robots drawn from the posterior. 95 % intervals are in {place}"]
+    is_incomplete = table[SHARE] < 1
+    remarks = [f"± one sd over {draws} robots drawn from the posterior. 95 % intervals are in {place}"]
     if is_incomplete.any():
-        share = 100 * (1 - found.columns[SHARE].min())
+        share = 100 * (1 - table[SHARE].min())
         remarks.append(
-            f"in {int(is_incomplete.sum())} of {len(is_incomplete)} runs some draws fail (up to {share:.0f} %). "
-            "Intervals use the others"
+            f"in {int(is_incomplete.sum())} of {len(is_incomplete)} runs some draws fail (up to {share:.0f} %) "
+            "and are left out"
         )
     return remarks
 

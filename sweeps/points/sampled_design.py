@@ -212,11 +212,7 @@ class Blocks:
 
     def place(self, number: int) -> tuple[int, ...]:
         """Position of a chunk along each axis."""
-        place = []
-        for count in reversed(self.counts):
-            number, k = divmod(number, count)
-            place.append(k)
-        return tuple(reversed(place))
+        return tuple(map(int, np.unravel_index(number, self.counts)))
 
     def box(self, number: int) -> tuple[slice, ...]:
         """Range of a chunk along each axis."""

@@ -31,6 +31,7 @@ from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
 from mmrjax.model.robot import Robot
+from sweeps.console import progress_bar
 from sweeps.points.axes import SweepPlan
 from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import VERDICT, Task
@@ -241,7 +242,8 @@ class Piece:
 
 
 Advance = Callable[[float], None]
-#: Stores a chunk by its number: values of its points by variable, and its samples from `drawn_samples`.
+#: Stores a chunk by its number: values of its points by variable, and values of its samples, one row for each
+#: name, None if another chunk writes them.
 Keep = Callable[[int, Columns, np.ndarray | None], Any]
 
 
@@ -272,6 +274,15 @@ def _start_chunk(compiled: Compiled, chunk: int, points: concurrent.futures.Futu
     return piece
 
 
+@contextlib.contextmanager
+def share_progress(count: int = 1, quiet: bool = False) -> Iterator[Callable[[float], None]]:
+    """Progress bar of `count` runs in one batch. Yields a function to call with the share that is done."""
+    with progress_bar(count, quiet) as advance:
+        told = share_counter(advance, count)
+        yield told
+        told(1.0)
+
+
 def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
     """Callback for the share of `count` runs that is done so far, which passes the increase to `advance`."""
     so_far = 0.0
@@ -287,16 +298,6 @@ def share_counter(advance: Advance, count: int) -> Callable[[float], None]:
 def fetch_values(arrays: Json, count: int) -> Columns:
     """First `count` values of each array, fetched from the device."""
     return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
-
-
-def drawn_samples(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
-    """Sample values along a chunk, one row for each name. None if another chunk writes them."""
-    design, samples = job.plan.design, job.plan.design.samples
-    if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
-        return None
-    sample_range = job.blocks.box(piece.chunk)[-1]
-    # samples vary fastest
-    return piece.values[: sample_range.stop - sample_range.start, len(design.axes) :].T
 
 
 def write_chunks(keep: Keep, compiled: Compiled, chunks: Iterable[int], advance: Advance) -> None:
@@ -321,7 +322,12 @@ def write_chunks(keep: Keep, compiled: Compiled, chunks: Iterable[int], advance:
         host_values = fetch_values(piece.arrays, count)
         if stop.is_set() and not is_ready:  # interrupted during its computation
             return
-        keep(piece.chunk, host_values, drawn_samples(compiled.job, piece))
+        design, blocks, drawn = compiled.job.plan.design, compiled.job.blocks, None
+        if design.samples is not None and not any(blocks.place(piece.chunk)[:-1]):
+            # samples vary fastest; other chunks along their dimension repeat them
+            along = blocks.box(piece.chunk)[-1]
+            drawn = piece.values[: along.stop - along.start, len(design.axes) :].T
+        keep(piece.chunk, host_values, drawn)
         advance(count - piece.told)
 
     def keep_writing() -> None:

@@ -24,16 +24,17 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+from pydantic import BaseModel
 
 from calibration.data import Columns, Json, Names
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_files import file_bytes
 from calibration.data.writing import naming_file
 from mmrjax.compile.programs import source_hash
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
-from sweeps.config import Part
 from sweeps.console import print_message
 from sweeps.points.sampled_design import SAMPLE, Blocks, Design
 from sweeps.store import (
@@ -58,7 +59,7 @@ FURTHER = ("scipy", "zarr")
 Identity = dict[str, dict[str, str]]
 
 
-def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> Identity:
+def job_identity(config: BaseModel, robot: Robot, files: Iterable[str], device: str) -> Identity:
     """Identity of a job in sections: configuration, data, code, versions, device.
 
     Args:
@@ -73,7 +74,7 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
     configuration |= {f"robot {p.name}": repr(float(p.value)) for p in params.walk_parameters(robot)}
     return {
         "configuration": configuration,
-        "data": {file: _hash(file) for file in files},
+        "data": {file: sha256_hex(file_bytes(Path(file), file, BadConfiguration)) for file in files},
         "code": {"source": source_hash()},
         "versions": {"python": platform.python_version(), **installed_versions((*PACKAGES, *FURTHER))},
         "device": {"device": device},
@@ -82,13 +83,6 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in packages}
-
-
-def _hash(file: str) -> str:
-    try:
-        return sha256_hex(Path(file).read_bytes())
-    except OSError as error:
-        raise BadConfiguration(f"{file}: cannot be read ({error.strerror})") from error
 
 
 def _flat(content: Json, prefix: str) -> dict[str, str]:
@@ -291,7 +285,7 @@ class SweepStore(Folder):
         differ = self._differs(folder)
         if differ == IDENTITY:
             raise BadData(
-                f"--out: {folder / 'identity.json'} is damaged; choose another path, or use --force to start again"
+                f"--out: {folder / 'identity.json'} is damaged; choose another path, or --force to start again"
             )
         if differ:
             raise BadConfiguration(
@@ -356,7 +350,7 @@ class SweepStore(Folder):
             records = self._records().get(damaged_chunk, [])
             damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
-            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to start again")
+            raise BadData(f"--out: {damaged} is damaged; choose another path, or --force to start again")
 
     # --- chunks -----------------------------------------------------------------------------------
 
@@ -448,18 +442,19 @@ class SweepStore(Folder):
         layout, files = self.layout, self._files(chunk)
         box = layout.blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
-        checks = {}
+        checks, ranges = dict[str, int](), dict[str, tuple[float, float]]()
         for name, (dtype, _) in layout.variables.items():
-            values = np.asarray(arrays[name], dtype).reshape(shape)
-            checks[name] = self._chunk(files[name], values, layout.blocks.size, fill_value(dtype))
+            values = np.asarray(arrays[name], dtype)
+            checks[name] = self._chunk(files[name], values.reshape(shape), layout.blocks.size, fill_value(dtype))
+            extremes = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))  # without NaN
+            if values.dtype.kind == "f" and np.isfinite(extremes).all():
+                ranges[name] = extremes
         samples = layout.design.samples
         if samples is not None and drawn is not None:
             for name, values in zip(samples.names, drawn, strict=True):
                 checks[name] = self._chunk(files[name], values, layout.blocks.size[-1:], math.nan)
-        ranges = {
-            name: r for name, (dtype, _) in layout.variables.items() if (r := _range(arrays[name], dtype)) is not None
-        }
-        record = Done(chunk, _counts(arrays[STATUS]), ranges, checks)
+        counts = np.bincount(np.asarray(arrays[STATUS], np.intp), minlength=len(STATUSES))
+        record = Done(chunk, tuple(counts.tolist()), ranges, checks)
         assert self._journal is not None
         self._journal.write(_line(record))
         self._journal.flush()
@@ -475,8 +470,11 @@ class SweepStore(Folder):
             values = full
         path = self.partial / STORE / file
         path.parent.mkdir(parents=True, exist_ok=True)
-        values = np.ascontiguousarray(values)
-        content = values.tobytes() if self.layout.compression == "none" else _compressed(values.data)
+        content = values.tobytes()
+        if self.layout.compression == "zstd":
+            from numcodecs.zstd import Zstd
+
+            content = bytes(Zstd(**ZSTD).encode(content))
         write_file(path, content, self._aside)
         return zlib.crc32(content)
 
@@ -548,12 +546,6 @@ def write_file(path: Path, content: Any, aside: Path) -> None:
         raise
 
 
-def _compressed(content: Any) -> bytes:
-    from numcodecs.zstd import Zstd
-
-    return bytes(Zstd(level=ZSTD["level"], checksum=ZSTD["checksum"]).encode(np.frombuffer(content, np.uint8)))
-
-
 ZSTD: Json = {"level": 1, "checksum": False}
 
 
@@ -599,19 +591,6 @@ def fill_value(dtype: str) -> Any:
     return math.nan if np.dtype(dtype).kind == "f" else ABSENT
 
 
-def _counts(status: np.ndarray) -> tuple[int, ...]:
-    return tuple(np.bincount(np.asarray(status, np.intp), minlength=len(STATUSES)).tolist())
-
-
-def _range(values: np.ndarray, dtype: str) -> tuple[float, float] | None:
-    if np.dtype(dtype).kind != "f":
-        return None
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="All-NaN")
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    return (low, high) if math.isfinite(low) and math.isfinite(high) else None
-
-
 def _line(record: Done) -> str:
     body = json.dumps(dataclasses.astuple(record), separators=(",", ":"))
     return f"{zlib.crc32(body.encode()):08x} {body}\n"
@@ -622,8 +601,5 @@ def _record(line: str) -> Done | None:
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None
-    try:
-        chunk, statuses, ranges, checks = json.loads(body)
-        return Done(int(chunk), tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, dict(checks))
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return None
+    chunk, statuses, ranges, checks = json.loads(body)
+    return Done(chunk, tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, checks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -68,11 +68,6 @@ class Comparison:
             first, second = 100 * residual.share_of_measured(readings_of_both[rows], measured[rows, None])
             answer[channel.name] = int(rows.sum()), float(first), float(second)
         return answer
-
-
-def add_second_robot(table: Columns, channels: Sequence[Channel], simulated: Columns) -> Columns:
-    """Adds the readings of a second robot to a table of `compare_readings`."""
-    return table | {f"against_{c.column}": simulated[c.column] for c in channels}
 
 
 def compare_readings(measured: Runs, simulated: Columns, robot: Robot | None = None) -> tuple[Columns, Summary]:

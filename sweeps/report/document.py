@@ -173,6 +173,12 @@ class Table:
         return stream.getvalue()
 
 
+def table_from_cells(name: str, cells: Iterable[tuple[Column, Iterable[Any]]], **fields: Any) -> Table:
+    """Table from its columns, each with its cells."""
+    heads, values = zip(*cells, strict=True)
+    return Table(name, heads, list(zip(*values, strict=True)), **fields)
+
+
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """A figure of the page.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -20,8 +20,8 @@ from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.optimizers import Numbers, Optimum, linearise, observe_robot, search_rollouts
+from calibration.inference.problem import Observation, Problem
 from mmrjax.effects import Effect
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -124,13 +124,13 @@ class Observer(eqx.Module):
         """
 
     @classmethod
-    @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
         """Rejects runs whose initial state the model cannot reproduce. Returns remarks on the length of the others.
 
         Raises:
             BadData: a run does not begin in an initial state of the model.
         """
+        return []
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
@@ -138,7 +138,6 @@ class Observer(eqx.Module):
         return robot
 
     @classmethod
-    @abc.abstractmethod
     def check_settled(cls, runs: Runs) -> None:
         """Rejects data other than settled runs with one row each.
 
@@ -166,9 +165,9 @@ class Observer(eqx.Module):
         """True if data of this kind, with an external supply, can reveal an effect."""
 
     @classmethod
-    @abc.abstractmethod
     def free(cls) -> tuple[Names, Names]:
         """Names of further parameters that such data determine: of the drive, and of each chassis."""
+        return (), ()
 
     # --- of robots
 
@@ -214,9 +213,9 @@ class Observer(eqx.Module):
         return self.long or not self.reads
 
     @property
-    @abc.abstractmethod
     def starts_from_steady(self) -> bool:
         """True if a search may start at the optimum of the same problem with `steady`."""
+        return self.long and not self.axis
 
     @abc.abstractmethod
     def unreachable(self, status: np.ndarray) -> np.ndarray:
@@ -231,9 +230,9 @@ class Observer(eqx.Module):
         """Warnings about the readings of a calibrated robot, as sentences."""
         return []
 
-    @abc.abstractmethod
     def number_of_included_runs(self, included: np.ndarray) -> int:
         """Number of runs with at least one included row."""
+        return int(included.sum())
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
         """Expected χ² of noise alone. For settled runs it is one for each reading, because rows are independent.
@@ -247,10 +246,10 @@ class Observer(eqx.Module):
     # --- of fits
 
     @abc.abstractmethod
-    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Residuals, Jacobian and sensitivities to effects at z."""
 
-    def at_fit(self, problem: Problem, z: Numbers) -> Observer:
+    def at_fit(self, problem: Problem, z: Numbers) -> Self:
         """Observer with facts about its runs that a fit has determined."""
         return self
 
@@ -265,18 +264,23 @@ class Observer(eqx.Module):
         """
         return keys
 
-    @abc.abstractmethod
     def fit_replicate(
-        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
+        self, problem: Problem, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
         """Linearization of one bootstrap replicate: a table that is drawn from the fit of the base and refitted.
 
+        A table of noise alone, refitted by one linear step, unless the kind of data needs more.
+
         Args:
             problem: problem of the base.
-            data: data of the table.
             linear: linearization of the fit.
-            drawn: one element of `draw_replicates`.
+            drawn: one element of `draws`.
         """
+        data, jacobian = problem.data, linear.jacobian
+        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
+        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
+        residual = noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise)
+        return dataclasses.replace(linear, residual=residual)
 
     def starts(
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
@@ -301,7 +305,7 @@ class Observer(eqx.Module):
         """Number of scanned values of a coordinate, a multiple of `scans.CLOSER`."""
         raise NotImplementedError
 
-    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+    def scan(self, problem: Problem, z: Array, k: int, values: Array) -> tuple[Array, Array]:
         """Objective at each of `values` of coordinate k, shape (values,), and all coordinates there, shape (values,
         coordinates).
 
@@ -313,7 +317,6 @@ class Observer(eqx.Module):
         """Number of searches of a problem that run together on a core, see `searches_refilled`."""
         raise NotImplementedError
 
-    @abc.abstractmethod
     def search(
         self,
         problem: Problem,
@@ -334,6 +337,16 @@ class Observer(eqx.Module):
             most: largest number of steps. None: that of the policy.
         """
 
+        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+            parts = []
+            for at, member in zip(z, members, strict=True):
+                member_problem = problem.with_data(weight=jnp.asarray(weights[member]))
+                parts.append(self.at(member_problem, at, None if active is None else active[member]))
+            return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
+
+        steps = self.policy.steps if most is None else most
+        return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
+
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         """Simulated observation in each row at z.
 
@@ -347,7 +360,7 @@ class Observer(eqx.Module):
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, their Jacobian and the observation at z. Arguments as in `observation_at`."""
-        return linearise(with_effects(problem, active), jnp.asarray(z), problem.data)
+        return linearise(with_effects(problem, active), jnp.asarray(z))
 
     @abc.abstractmethod
     def bases(self, columns: Columns, included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
@@ -367,14 +380,6 @@ class Observer(eqx.Module):
             included: True for included rows of the table.
             before, after: diagnoses without and with the proposal.
         """
-
-
-def linear_replicate(data: Data, linear: Linearization, key: Array) -> Linearization:
-    """Linearization of a table of noise alone, refitted by one linear step. `key`: random key as numbers."""
-    jacobian = linear.jacobian
-    counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
-    noise = counts * jax.random.normal(jax.random.wrap_key_data(key), counts.shape)
-    return linear.with_residual(noise - jacobian @ solve(jacobian.T @ jacobian, jacobian.T @ noise))
 
 
 def with_effects(problem: Problem, active: Numbers | None) -> Problem:

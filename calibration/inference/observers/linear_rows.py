@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.observers.base import Observer, SearchPolicy, linear_replicate, with_effects
-from calibration.inference.observers.time_histories import Histories, HistoriesLinearization
-from calibration.inference.optimizers import Numbers, Optimum, search_rollouts
+from calibration.inference.linearization import ScoredEffect
+from calibration.inference.observers.base import Observer, SearchPolicy, with_effects
+from calibration.inference.observers.time_histories import Histories
+from calibration.inference.optimizers import Numbers
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.compile.compiling import SELDOM, compiled
-from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
 
@@ -39,12 +38,12 @@ class LinearRows(Observer):
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=16, steps=30, searches=1, one_by_one=False)
     rows_tell: ClassVar[bool] = False
 
-    linear: eqx.AbstractVar[Any]
-    origin: eqx.AbstractVar[Float[Array, " parameters"]]
-    start: eqx.AbstractVar[Float[Array, " parameters"]]
-    width: eqx.AbstractVar[float]
-    effect: eqx.AbstractVar[Int[Array, " instances"]]
-    grid: eqx.AbstractVar[Float[Array, "three instances"]]
+    linear: Any = eqx.field(kw_only=True)
+    origin: Float[Array, " parameters"] = eqx.field(kw_only=True)
+    start: Float[Array, " parameters"] = eqx.field(kw_only=True)
+    width: float = eqx.field(kw_only=True, static=True)
+    effect: Int[Array, " instances"] = eqx.field(kw_only=True)
+    grid: Float[Array, "three instances"] = eqx.field(kw_only=True)
 
     def errors(self, coordinates: Any, z: Array) -> Array:
         """Predictions minus readings at coordinates z, shape (readings,)."""
@@ -61,7 +60,8 @@ class LinearRows(Observer):
         own = self.effect == jnp.asarray(coordinates.active)[:, None]
         return errors + self.width * linear.signatures @ jnp.sum(amplitude[:, None] * own * share, 0)
 
-    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Any:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Any:
+        data = problem.data
         evaluated, linear = jax.device_get((_evaluated(self, problem.coordinates, data, z), self.linear))
         linear = linear.rescaled(np.asarray(data.weight) / np.asarray(data.sd))
         return dataclasses.replace(linear, residual=evaluated[0], jacobian=evaluated[1])
@@ -74,8 +74,9 @@ class LinearRows(Observer):
     def over_time(self) -> bool:
         return True
 
-    def operating_points(self, robot: Robot) -> None:
-        return None
+    # Also for windows, which inherit from settled runs.
+    operating_points, at_fit = Observer.operating_points, Observer.at_fit
+    draws, fit_replicate, search = Observer.draws, Observer.fit_replicate, Observer.search
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.zeros(np.shape(status), bool)
@@ -85,57 +86,12 @@ class LinearRows(Observer):
     ) -> np.ndarray:
         return np.asarray(self.start)[None]
 
-    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
-        return keys
-
-    def fit_replicate(
-        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
-    ) -> Linearization:
-        return linear_replicate(data, linear, drawn)
-
-    def search(
-        self,
-        problem: Problem,
-        starts: Numbers,
-        weights: Numbers,
-        active: Numbers | None = None,
-        *,
-        rivals: bool = False,
-        most: int | None = None,
-    ) -> tuple[Optimum, Observation]:
-        def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
-            parts = []
-            for at, member in zip(z, members, strict=True):
-                data = dataclasses.replace(problem.data, weight=jnp.asarray(weights[member]))
-                member_problem = dataclasses.replace(problem, data=data)
-                parts.append(self.at(member_problem, at, None if active is None else active[member]))
-            return jax.tree.map(lambda *x: np.stack(x), *jax.device_get(parts))
-
-        steps = self.policy.steps if most is None else most
-        return search_rollouts(evaluate, starts, problem.data, weights, steps, self.policy.batch)
-
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         return _evaluated(self, with_effects(problem, active).coordinates, problem.data, jnp.asarray(z))
 
 
 class LinearHistories(LinearRows, Histories):
-    """Observer of time histories whose readings are linear about the fit of their base.
-
-    Attributes:
-        linear: linearization of the simulated readings, see `LinearRows`.
-    """
-
-    policy: ClassVar[SearchPolicy] = LinearRows.policy
-
-    linear: HistoriesLinearization = eqx.field(kw_only=True)
-    origin: Float[Array, " parameters"] = eqx.field(kw_only=True)
-    start: Float[Array, " parameters"] = eqx.field(kw_only=True)
-    width: float = eqx.field(kw_only=True, static=True)
-    effect: Int[Array, " instances"] = eqx.field(kw_only=True)
-    grid: Float[Array, "three instances"] = eqx.field(kw_only=True)
-
-    def at_fit(self, problem: Problem, z: Numbers) -> LinearHistories:
-        return self
+    """Observer of time histories whose readings are linear about the fit of their base."""
 
 
 def grid_of_effects(effects: tuple[ScoredEffect, ...]) -> tuple[Array, Array]:
@@ -158,7 +114,7 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
         width: prior sd of amplitudes, relative to those of their fields.
     """
     data, observe, z = problem.data, problem.observe, np.asarray(z)
-    linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), data, effects))
+    linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), effects))
     scale = np.asarray(data.weight / data.sd)
     raw = jax.tree.map(jnp.asarray, linear.rescaled(np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)))
     fields = {f.name: getattr(observe, f.name) for f in dataclasses.fields(observe) if f.name != "known"}
@@ -171,7 +127,8 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
     return dataclasses.replace(problem, observe=rows)
 
 
-def _evaluate(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
+@functools.partial(compiled, options=SELDOM)
+def _evaluated(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tuple[Array, Array, Observation]:
     """Residuals of rows, penalties and priors, their Jacobian, and the observation."""
 
     def both(z: Array) -> tuple[Array, Array]:
@@ -186,6 +143,3 @@ def _evaluate(observe: LinearRows, coordinates: Any, data: Data, z: Array) -> tu
     reading = errors.reshape(data.weight.shape) + data.measured
     seen = Observation(reading, penalties, status, jnp.zeros_like(status))
     return r, jnp.concatenate(jacobian), seen
-
-
-_evaluated = functools.partial(compiled, options=SELDOM)(_evaluate)

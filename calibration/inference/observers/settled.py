@@ -22,8 +22,14 @@ from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationErrors
 from calibration.inference.fit_notes import Remark
-from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
-from calibration.inference.noise import Noise
+from calibration.inference.linearization import (
+    Linearization,
+    ScoredEffect,
+    balance_probe,
+    finite_or_zero,
+    with_probes,
+)
+from calibration.inference.noise import Noise, rows_of_same_conditions
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import (
     Numbers,
@@ -33,8 +39,7 @@ from calibration.inference.optimizers import (
     search_refilling,
     zero_inactive_residuals,
 )
-from calibration.inference.problem import Data, Observation, Problem
-from calibration.inference.repeats import rows_of_same_conditions
+from calibration.inference.problem import Observation, Problem
 from calibration.inference.simulation_errors import root_mean_square
 from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -155,7 +160,7 @@ class SettledRuns(Observer):
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         """Rejects a table of one condition with readings that differ. Notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
-        least, remarks = cls.least(runs), list[Remark]()
+        least, conflicts = cls.least(runs), list[tuple[int, int, int, str]]()
         shared = np.array([source == "series" for source in noise.source])
         usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
@@ -166,46 +171,33 @@ class SettledRuns(Observer):
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
             allowed = np.where(shared, np.minimum(allowed, CONTRADICTION * np.sqrt(2) * usual * mean), allowed)
-            for cell in np.argwhere(distance > allowed)[:1]:
-                (one, other, k), cell = cell.tolist(), tuple(cell)
-                first_row, second_row, column = int(rows[one]), int(rows[other]), runs.channels[k].column
-                in_sds = not (noise.estimated[k] or shared[k])
-                deviation = f"{distance[cell] / sd[cell]:.0f} sd" if in_sds else f"{distance[cell] / mean[cell]:.0%}"
-                values = float(runs[column][first_row]), float(runs[column][second_row])
-                without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
-                torque = [c for c in (LOAD,) if c != column and runs.has(c)]
-                cells = {**runs.extras, **runs.columns}
-                other_columns = tuple(c for c in (*without, *torque) if cells[c][first_row] != cells[c][second_row])
-                near = runs.layout.nearest(other_columns[0], runs.columns) if other_columns else ""
-                remarks.append(
-                    Remark(
-                        "repeats",
-                        source=runs.source,
-                        rows=(first_row + 1, second_row + 1),
-                        column=column,
-                        values=values,
-                        apart=deviation,
-                        unused=other_columns,
-                        near=near,
-                    )
-                )
-        if remarks and len(alike) == 1:
-            raise BadData(f"{describe(remarks[0])}; no condition varies")
-        whole_table = runs.whole
-        thinned = (
-            []
-            if whole_table is runs
-            else [Remark("thinned_table", source=runs.source, rows=len(whole_table), kept=len(runs))]
-        )
-        return [*thinned, *(Remark(x.code, **x.values, more=len(remarks) - 1) for x in remarks[:1])]
-
-    @classmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        return []
-
-    @classmethod
-    def check_settled(cls, runs: Runs) -> None:
-        return
+            for one, other, k in np.argwhere(distance > allowed)[:1].tolist():
+                cell, as_share = (one, other, k), noise.estimated[k] or shared[k]
+                apart = f"{distance[cell] / mean[cell]:.0%}" if as_share else f"{distance[cell] / sd[cell]:.0f} sd"
+                conflicts.append((int(rows[one]), int(rows[other]), k, apart))
+        remarks: list[Remark | str] = []
+        if runs.whole is not runs:
+            remarks.append(Remark("thinned_table", source=runs.source, rows=len(runs.whole), kept=len(runs)))
+        for first, second, k, apart in conflicts[:1]:
+            column, cells = runs.channels[k].column, {**runs.extras, **runs.columns}
+            others = [c for c, x in runs.extras.items() if x.dtype.kind == "f"]
+            others += [c for c in (LOAD,) if c != column and runs.has(c)]
+            others = [c for c in others if cells[c][first] != cells[c][second]]
+            remark = Remark(
+                "repeats",
+                source=runs.source,
+                rows=(first + 1, second + 1),
+                column=column,
+                values=(float(runs[column][first]), float(runs[column][second])),
+                apart=apart,
+                unused=tuple(others),
+                near=runs.layout.nearest(others[0], runs.columns) if others else "",
+                more=len(conflicts) - 1,
+            )
+            if len(alike) == 1:
+                raise BadData(f"{describe(remark)}; no condition varies")
+            remarks.append(remark)
+        return remarks
 
     @classmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
@@ -219,10 +211,6 @@ class SettledRuns(Observer):
     @classmethod
     def shows(cls, effect: type[Effect]) -> bool:
         return not (effect.needs_battery or effect.transient or effect.settles_to)
-
-    @classmethod
-    def free(cls) -> tuple[Names, Names]:
-        return (), ()
 
     def __call__(self, robot: Robot) -> Observation:
         return self._simulated_readings(robot, fidelities.get_fidelity(self.fidelity).settled(robot, self.conditions))
@@ -254,37 +242,28 @@ class SettledRuns(Observer):
     def long(self) -> bool:
         return fidelities.fidelity_facts(self.fidelity).rollout
 
-    @property
-    def starts_from_steady(self) -> bool:
-        return self.long
-
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.isin(status, (SLIDES, FAILED, TIPS))
-
-    def number_of_included_runs(self, included: np.ndarray) -> int:
-        return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
         return fidelities.get_fidelity(self.fidelity).cautions(robot, self.conditions)
 
-    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
+    def linearise(self, problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Linearization as in the protocol.
 
         A signature is the sensitivity of the readings to a defect of the effect's balance, times the effect's term.
         This is exact, because an effect enters one balance and is linear in its amplitude.
         """
-        kind = self.linearization
+        kind, data = self.linearization, problem.data
         probes = tuple(balance_probe(b) for b in kind.probed)
         robot, size, channel_names = problem.robot(z), z.size, channels.channel_names(problem.channels)
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
-            robot = problem.robot(x[:size])
-            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
-            return dataclasses.replace(robot, effects=(*robot.effects, *put))
+            return with_probes(problem.robot(x[:size]), probes, delta)
 
         z_and_probes = jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
-        r, slopes, _, signals = problem.linearised(probed, z_and_probes, data)
+        r, slopes, _, signals = problem.linearised(probed, z_and_probes)
         r, slopes = zero_inactive_residuals(r, slopes, adhesion_penalty_slice(data))
         jacobian = jnp.concatenate([slopes, jnp.eye(size, z_and_probes.size)])
         residual = jnp.concatenate([r, z - data.centre])
@@ -336,14 +315,12 @@ class SettledRuns(Observer):
     def fit_replicate(
         self,
         problem: Problem,
-        data: Data,
         effects: tuple[ScoredEffect, ...],
         linear: Linearization,
         drawn: tuple[Array, Array, Array],
     ) -> Linearization:
         measured, centre, refit = drawn
-        noisy = dataclasses.replace(data, measured=measured, centre=centre)
-        return self.linearise(problem, refit, noisy, effects)
+        return self.linearise(problem.with_data(measured=measured, centre=centre), refit, effects)
 
     def search(
         self,
@@ -377,8 +354,7 @@ class SettledRuns(Observer):
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
         columns = {**_unmeasured(self, robot, columns), **columns}
         ways = dict.fromkeys(WAYS, np.asarray(_run_directions(self, robot)))
-        base_arguments = columns, weight, robot, None, ways
-        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
+        return bases_room.families_of_table(columns, weight, ways, bases_room.CurveScope.of(robot, columns))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> EquationErrors:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.

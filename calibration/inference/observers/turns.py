@@ -22,7 +22,7 @@ from calibration.inference.observers.base import SearchPolicy
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, side_shares
 from calibration.inference.observers.time_histories import Histories
 from calibration.inference.optimizers import solve_rows_at
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import IN_TURNS, VARIABLES_ROUND, WAYS
@@ -135,13 +135,12 @@ class SettledTurns(SettledRuns):
     def fit_replicate(
         self,
         problem: Problem,
-        data: Data,
         effects: tuple[ScoredEffect, ...],
         linear: Linearization,
         drawn: tuple[Any, ...],
     ) -> Linearization:
         rooted = dataclasses.replace(problem, roots=drawn[-1])
-        return super().fit_replicate(rooted, data, effects, linear, drawn[:-1])
+        return super().fit_replicate(rooted, effects, linear, drawn[:-1])
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
@@ -159,11 +158,5 @@ class SettledTurns(SettledRuns):
         weight = np.tile(included.astype(float), 2)
         lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], *VARIABLES_ROUND)  # what is imposed
-        base_arguments = (
-            points,
-            weight,
-            robot,
-            bases_room.CurveScope(lacking, axes),
-            {way: signal_values[way] for way in WAYS},
-        )
-        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
+        scope = dataclasses.replace(bases_room.CurveScope.of(robot, points), balances=lacking, axes=axes)
+        return bases_room.families_of_table(points, weight, {way: signal_values[way] for way in WAYS}, scope)

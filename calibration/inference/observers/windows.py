@@ -26,7 +26,7 @@ from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.linear_rows import LinearRows, grid_of_effects
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.problem import Problem, data_from_readings
-from calibration.inference.shown_states import RunWindows
+from calibration.inference.shown_states import RunWindows, join_windows
 from calibration.inference.weak_form import (
     WeakFormFit,
     covariance_factor,
@@ -145,7 +145,6 @@ class Windows(LinearRows, SettledRuns):
     """Observer of the windows of a log.
 
     Attributes:
-        linear: linearization of the equations, see `LinearRows`.
         table: columns of the log at its points.
     """
 
@@ -154,12 +153,6 @@ class Windows(LinearRows, SettledRuns):
     blocks: ClassVar[Names] = ("slope", "voltage", "run", "part")
     reads: ClassVar[bool] = False
 
-    linear: WindowsLinearization
-    origin: Float[Array, " parameters"]
-    start: Float[Array, " parameters"]
-    width: float = eqx.field(static=True)
-    effect: Int[Array, " instances"]
-    grid: Float[Array, "three instances"]
     table: dict[str, Array]
 
     def detail(self, bases: Bases, included: np.ndarray, before: Any, after: Any) -> Any:
@@ -170,8 +163,8 @@ class Windows(LinearRows, SettledRuns):
         ways = {name: np.sign(linear.variable(name)) for name in WAYS}
         table = {bases_room.VARIABLES[v]: linear.variable(v) for v in UNSHOWN}
         table |= {name: np.asarray(x) for name, x in self.table.items()}
-        arguments = table, linear.at_points(included).astype(float), robot, None, ways
-        return (*bases_room.curve_families(*arguments), *bases_room.window_families(*arguments))
+        weight, scope = linear.at_points(included).astype(float), bases_room.CurveScope.of(robot, table)
+        return bases_room.families_of_table(table, weight, ways, scope)
 
 
 def problem_of_windows(
@@ -188,7 +181,9 @@ def problem_of_windows(
     """
     plan, terms, count = fit.plan, fit.smooth, len(problem.channels)
     places = (*([plan.current] * plan.electrical), *([plan.motion] * plan.mechanical), *plan.others)
-    windows, run = _stacked(fit.cut)
+    run = np.repeat([w.run for w in fit.cut], [len(w.rows) for w in fit.cut])
+    run = np.pad(run, (0, -len(run) % TOGETHER), constant_values=-1)
+    windows = join_windows(fit.cut, int(np.sum(run < 0)))
     slope = np.stack(derivative_weights(plan, windows, len(places)))
     parts = [windows.part(k) for k in np.split(np.arange(len(run)), len(run) // TOGETHER)]
     sd, size = np.asarray(fit.rows.sd), len(fit.z)
@@ -232,8 +227,9 @@ def problem_of_windows(
     index, grid = grid_of_effects(effects)
     conditions = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[middle]), fit.rows.conditions)
     observe = Windows(
-        conditions, "drive", linear, jnp.asarray(fit.origin), jnp.asarray(fit.z), width, index, grid, table
-    )
+        conditions, "drive", table, linear=linear, origin=jnp.asarray(fit.origin), start=jnp.asarray(fit.z),
+        width=width, effect=index, grid=grid,
+    )  # fmt: skip
     return Problem(problem.base, problem.coordinates, observe, data), np.asarray(fit.rows.first)[middle]
 
 
@@ -275,19 +271,3 @@ def _unexplained(
         variance_of_sums([white[run[counts] == k, e] for k in np.unique(run[counts])]) for e in range(len(places))
     ]
     return np.sqrt(slow) * disturbance_intensities(defect * np.sqrt(free), variance, per_intensity)
-
-
-def _stacked(cut: list[RunWindows]) -> tuple[RunWindows, np.ndarray]:
-    """Windows of all runs, padded to one length and a multiple of `TOGETHER`, and the run of each."""
-    longest, total = max(w.rows.shape[1] for w in cut), sum(len(w.rows) for w in cut)
-    more = -total % TOGETHER
-
-    def joined(name: str) -> np.ndarray:
-        x = [getattr(w, name) for w in cut]
-        x = [np.pad(a, ((0, 0), (0, longest - a.shape[1])), mode="edge") for a in x]
-        if name not in ("rows", "steps"):
-            x = [a * (np.arange(longest) < getattr(w, name).shape[1]) for a, w in zip(x, cut, strict=True)]
-        return np.concatenate([*x, np.full((more, longest), float(name == "steps")).astype(x[0].dtype)])
-
-    run = np.concatenate([*(np.full(len(w.rows), w.run) for w in cut), np.full(more, -1)])
-    return RunWindows(-1, *(joined(n) for n in ("rows", "weight", "slope", "bend", "steps"))), run
