@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -340,4 +340,4 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
         raise BadData(f"{place}: jumps by {float(f'{step[jump]:.4g}'):g} {unit} from the sample before, {why}")
     if not note:
         return runs
-    return dataclasses.replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))
+    return replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))

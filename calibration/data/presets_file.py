@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ KEYS_OF_NUMBER = ("about", "usual")
 SEPARATOR = ","
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class PresetColumn:
     """A column of this program, and the column of a logger's file from which it is read.
 
@@ -67,7 +67,7 @@ class PresetColumn:
     zero: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Preset:
     """Meaning of the columns of a logger's files.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from calibration.data import Json, Mapped, Names
@@ -335,7 +335,7 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
         if name not in parameters:
             raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; give the number without it")
     priors = tuple((name, float(p.value), sds[name]) for name, p in parameters.items() if name in sds)
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
+    return replace(robot, rig=replace(robot.rig, priors=priors))
 
 
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:

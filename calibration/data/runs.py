@@ -6,9 +6,9 @@ meaning, checks the values and returns `Runs`.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -128,7 +128,7 @@ def runs_of_arrays(
     """
     name, layout = arrays.name, Layout.of(robot)
     if mapped is not None:
-        layout = dataclasses.replace(layout, mapped=mapped)
+        layout = replace(layout, mapped=mapped)
     if not arrays.header:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
@@ -159,7 +159,7 @@ def runs_of_arrays(
     instruments = inferred_facts.infer_instruments(layout.instruments, columns)
     unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in instruments})
-    layout = dataclasses.replace(layout, instruments=(*instruments, *unsigned))
+    layout = replace(layout, instruments=(*instruments, *unsigned))
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
