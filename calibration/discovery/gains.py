@@ -50,9 +50,9 @@ def best_hold_out_gain(
     fits.setdefault((pair[0].key, pair[1].key), pair)
     gains = []
     for having, without in fits.values():
-        scores = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
-        readings = (simulated_reading(space, c) for c in (without, having))
-        gains.append((having, _gain_over_changed(*scores, _changed_readings(space, runs, *readings))))
+        score, before = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
+        changed = _changed_readings(space, runs, *(simulated_reading(space, c) for c in (without, having)))
+        gains.append((having, _gain_over_changed(score, before, changed)))
     having, gain = max(gains, key=lambda one: one[1].mean / max(one[1].se, 1e-12))
     return tuple(n for n in having.effects if space.library[n].family() == family), gain
 
