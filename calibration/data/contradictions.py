@@ -62,8 +62,7 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
     for side, row in np.argwhere(np.abs(volts) > np.abs(supply) * (1 + ROUNDED))[:1].tolist():
         raise BadData(
             f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
-            f"expected no more than {SUPPLY}, or remove that column: the larger of the two side voltages is then "
-            "the supply voltage"
+            f"expected no more than {SUPPLY}, or remove that column"
         )
     origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
     columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}

@@ -497,6 +497,7 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
     needed = {*rig_file.required_parameters(robot.rig, params.values_by_name(robot))}
     needed |= {*nothing.rig.unknown} - {*robot.rig.unknown}
     needed |= frozenset() if inherits else robot.rig.stated
+    sds = {(name, mean): sd for name, mean, sd in robot.rig.priors}
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
         name, spec, value = parameter.name, parameter.spec, float(parameter.value)
@@ -510,7 +511,9 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         origin = ""
         if inherits and was is not None:
             origin = f"; {spec.source}" if value == was else f"; nominal {was:g}: {spec.source}"
-        text = rig_file.value_text(name, value, robot.rig)
+        text, sd = repr(value), sds.get((name, value))  # unless the prior's centre was changed
+        if sd is not None:
+            text = f'"{value!r} ± {sd!r}"'
         yield table, f"{key} = {text}  # [{spec.unit}] {spec.meaning}{origin}"
 
 

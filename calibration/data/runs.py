@@ -78,7 +78,7 @@ def read_runs(
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
     preset = presets_file.NONE
     if isinstance(columns, Mapping):
-        preset = presets_file.preset_of_table(columns)
+        preset = presets_file.parse_preset({"columns": dict(columns)}, "the stated table", {})
     elif columns is not None:
         preset = presets_file.find_preset(columns)
     if isinstance(source, str | Path) and str(source) in PACKAGED:
@@ -281,10 +281,7 @@ def _reject_readings(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Lay
         why = " together with --battery, whose charge sets the voltage; leave the cell empty or remove the column"
     else:
         is_given &= column_numbers(raw) != 0
-        why = (
-            "; the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or describe "
-            "the load as a vehicle"
-        )
+        why = "; the load is a shaft, on which it does not act. Remove the column, or describe a vehicle"
         if layout.has_ground:
             why = f"; {NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
     for row in np.flatnonzero(is_given)[:1].tolist():

@@ -296,7 +296,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
                 raise time_goes_back(runs, *rows[k : k + 2])
             raise BadData(
                 f"{runs.place(rows[k + 1])}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
-                "own time, with more digits if available, or remove one of them"
+                "own time, or remove one of them"
             )
     if max(map(len, rows_by_run)) < FEWEST:
         raise BadData(
@@ -831,14 +831,11 @@ def _nothing_settled_message(found: Settled) -> str:
     imposed = found.runs.layout.imposed_column
     message_of_reason = {
         "idle": (
-            f"{imposed} is about zero, so nothing drives the motors. Log driven rows, or name the column of the "
-            "command under [columns]"
+            f"{imposed} is about zero, so nothing drives the motors. Log driven rows, or name the command "
+            "under [columns]"
         ),
         "rest": "no level shows motion above the noise. Use larger commands",
-        "stuck": (
-            f"{longest.channel} shows one number for a long time: saturated or frozen. Repair the instrument or "
-            "change its range"
-        ),
+        "stuck": (f"{longest.channel} shows one number for a long time. Repair the instrument or change its range"),
         "glitches": f"{longest.channel} has many outlying readings. Repair the instrument, or log its mean",
         "undriven": "the driver brakes or coasts in every row. Log driven rows",
     }

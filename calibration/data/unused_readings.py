@@ -50,7 +50,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             continue
         computed = (
             f"{runs.source}, {torque}: equals {line[1]:.4g} times {current} in every row, to the last digit, so it "
-            "was computed, not measured, and does not show torque constant, friction or efficiency"
+            "was computed, not measured"
         )
         if torque == TORQUE:
             columns.pop(torque)
@@ -61,7 +61,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
             columns[torque] = _load_for_current(runs, robot, shown[current], columns.pop(current))
             notes.append(
                 f"{computed}. It is left out. The load follows from {current} and the robot's file, so this "
-                "current is no reading either. Only voltages and speeds are used"
+                "current is no reading either"
             )
     return replace(runs, columns=columns, notes=tuple(notes))
 
