@@ -28,7 +28,7 @@ from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, filled_template
 
 #: First version with `<dcmotor>`.
-FIRST = (3, 7, 0)
+FIRST, FIRST_TEXT = (3, 7, 0), "3.7"
 #: Effects for which the format has a term, and the term.
 TERMS = {
     "series_resistance": "resistance",
@@ -317,7 +317,7 @@ def mjcf_fragment(
     gains = _controller_gains(joint, found)
     head = [
         f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; "
-        f"MuJoCo {_version_text()} "
+        f"MuJoCo {FIRST_TEXT} "
         f"or later.",
         f'In the model: <include file="drive.xml"/> before <worldbody>, and class="{name}" on the joint "{at}".',
         f"Command: goal angle of the motor [rad], {found.ratio:.6g} times that of the joint; MuJoCo 3.17 or later."
@@ -350,10 +350,6 @@ def mjcf_fragment(
         about_joint=_comment_lines([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    "),
         sides=sides, attributes=attributes, gains=gains, limit=found.limit, impedance=IMPEDANCE, **play,
     )  # fmt: skip
-
-
-def _version_text() -> str:
-    return ".".join(map(str, FIRST[:2]))
 
 
 def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: float, load: float) -> str:
@@ -436,11 +432,18 @@ def mujoco_module() -> Any:
     if tuple(int(x) for x in found.__version__.split(".")[:3]) < FIRST:
         raise BadConfiguration(
             f"--to mujoco: got MuJoCo {found.__version__}, which has no <dcmotor>; "
-            f"expected {_version_text()} or later: "
+            f"expected {FIRST_TEXT} or later: "
             "pip install -U mujoco"
         )
     found.set_mju_user_warning(lambda text: None)  # otherwise MuJoCo writes a file in the working folder
     return found
+
+
+def _scene(files: Mapping[str, str]) -> tuple[Any, Any, Any]:
+    """MuJoCo's module, the model of a scene with its fragment, and its data."""
+    library = mujoco_module()
+    model = library.MjModel.from_xml_string(files["scene.xml"], {name: text.encode() for name, text in files.items()})
+    return library, model, library.MjData(model)
 
 
 def angles_in_mujoco(
@@ -451,10 +454,8 @@ def angles_in_mujoco(
     Args:
         timestep: time step [s]. None: that of the scene.
     """
-    assets = {name: text.encode() for name, text in files.items()}
-    mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
+    mujoco, model, data = _scene(files)
     model.opt.timestep = timestep or model.opt.timestep
-    data = mujoco.MjData(model)
     data.ctrl[0] = command
     angles = np.zeros(len(times))
     for k, time in enumerate(times):
@@ -473,11 +474,8 @@ def settle_in_mujoco(
         expected: values from the steady law, near which each run begins.
         rows: indices of the runs.
     """
-    # model of a scene and its included fragment, in memory
-    assets = {name: text.encode() for name, text in files.items()}
-    mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
+    mujoco, model, data = _scene(files)
     model.opt.gravity[:] = 0  # an arm's weight is part of the stated load
-    data = mujoco.MjData(model)
     current, speed = np.empty(len(rows)), np.empty(len(rows))
     period = model.opt.timestep
     total = float(np.sum(model.dof_armature) + np.sum(model.body_inertia[:, 1]))
