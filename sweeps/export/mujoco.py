@@ -6,7 +6,6 @@ import dataclasses
 import math
 import re
 import textwrap
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -92,10 +91,19 @@ class MujocoLaw(eqx.Module):
         return values_by_name[SHARE] * current, speed
 
 
-def _law_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> defaultdict[str, float]:
-    """Parameters by dotted name [SI], with some amplitudes replaced. Those of effects that are missing are 0."""
+class _LawNumbers(dict[str, float]):
+    """Parameters by dotted name [SI]. Those of effects that a joint lacks are 0."""
+
+    def __missing__(self, name: str) -> float:
+        if name.startswith("effects."):
+            return 0.0
+        raise KeyError(name)
+
+
+def _law_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> _LawNumbers:
+    """Parameters of a joint, with some amplitudes replaced."""
     changed = {f"effects.{name}.amplitude": amplitude for name, amplitude in amplitudes.items()}
-    return defaultdict(float, params.values_by_name(joint.robot) | changed)
+    return _LawNumbers(params.values_by_name(joint.robot) | changed)
 
 
 def mujoco_law_function(normal: float) -> Any:
@@ -135,7 +143,7 @@ def translate_law(joint: DriveJoint, normal: float, amplitudes: Mapping[str, flo
     if any(e.name == "thermal_drift" for e in joint.inside):
         heat = v["effects.thermal_drift.amplitude"] * v["effects.thermal_drift.resistance_thermal"]
         values[HEAT] = max(heat, 0.0) / share
-    numbers = (list(values.values()), ratio, v["motor.temperature_coefficient"])
+    numbers = (list(values.values()), ratio, float(robot.motor.temperature_coefficient))
     return MujocoLaw(tuple(values), *(jnp.asarray(x, float) for x in numbers))
 
 
@@ -241,7 +249,7 @@ def mjcf_motor(joint: DriveJoint, values: Mapping[str, float]) -> MjcfMotor:
     thermal: tuple[float, ...] = ()
     if values.get(HEAT):
         capacity = v["effects.thermal_drift.time_constant"] / values[HEAT]
-        thermal = (values[HEAT], capacity, 0.0, v["motor.temperature_coefficient"], 25.0, 25.0)
+        thermal = (values[HEAT], capacity, 0.0, float(robot.motor.temperature_coefficient), 25.0, 25.0)
     lugre: tuple[float, ...] = ()
     bristle = max(v["effects.presliding.amplitude"], 0.0)
     excess = values.get(EXCESS, 0.0)
