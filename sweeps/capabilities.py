@@ -182,7 +182,7 @@ def imposed_default(robot: Robot, option: str) -> float:
     Raises:
         BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).uses_paper_conditions:
+    if Layout.of(robot).complete:
         return VOLTAGE
     limit = _stated_limit(robot, option, IMPOSED_WORDS[robot.rig.imposed].one)
     return limit if robot.rig.imposed == "voltage" else _digits(limit)
@@ -215,7 +215,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
     Raises:
         BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).uses_paper_conditions:
+    if Layout.of(robot).complete:
         return VOLTAGES_V
     about = IMPOSED_WORDS[robot.rig.imposed]
     limit = _stated_limit(robot, option, about.several)

@@ -611,7 +611,7 @@ def test_rigs_that_cannot_be_exported_are_refused(rig, old, new, message):
 
 
 @pytest.mark.parametrize("more, values, configuration, message", [
-    (",duty_left,duty_right", f"{WHEELS},24,11.5,0,0,3,1,0.5", WHEELS, "differently"),
+    (",duty_left,duty_right", f"{WHEELS},24,11.5,0,0,3,1,0.5", WHEELS, "not turns"),
     (",lever_front_deg,lever_rear_deg", f"{TRACKS},24,13,0,0,3,30,-10", TRACKS, "levers"),
     ("", f"{TRACKS},24,13,0,0,3", WHEELS, f"no run of {WHEELS}"),
 ])  # fmt: skip
