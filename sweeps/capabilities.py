@@ -37,6 +37,11 @@ OF_TRAVEL = (
 RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
 
 
+def states_running_gear(robot: Robot) -> bool:
+    """True if the robot's file or its base gives a parameter of the running gear."""
+    return any(p.name.startswith("running_gear.") and robot.knows([p.name]) for p in params.walk_parameters(robot))
+
+
 def has_battery(robot: Robot) -> bool:
     """True if the robot has its own battery."""
     if robot.rig.inherits:
@@ -177,7 +182,7 @@ def imposed_default(robot: Robot, option: str) -> float:
     Raises:
         BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).uses_paper_conditions:
+    if Layout.of(robot).complete:
         return VOLTAGE
     limit = _stated_limit(robot, option, IMPOSED_WORDS[robot.rig.imposed].one)
     return limit if robot.rig.imposed == "voltage" else _digits(limit)
@@ -210,7 +215,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
     Raises:
         BadConfiguration: the file states no limit.
     """
-    if Layout.of(robot).uses_paper_conditions:
+    if Layout.of(robot).complete:
         return VOLTAGES_V
     about = IMPOSED_WORDS[robot.rig.imposed]
     limit = _stated_limit(robot, option, about.several)

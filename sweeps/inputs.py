@@ -16,7 +16,6 @@ from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
 from mmrjax.derived.turning_figures import turns_under_equal_commands
 from mmrjax.errors import list_some
-from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
@@ -38,9 +37,9 @@ def load_robot(config: RobotPart) -> RobotFile:
     Raises:
         BadConfiguration: the robot does not exist, or its file or a change is rejected.
     """
-    notes: list[str] = []
-    file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
-    robot = robot_file.change_robot(file.robot, config.set, where="--set", notes=notes)
+    file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects))
+    robot = robot_file.change_robot(file.robot, config.set, where="--set")
+    notes = [*file.remarks, *robot_file.battery_remarks(robot, config.set, "--set")]
     if robot.rig.follows_goal and not (
         type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
     ):
@@ -60,8 +59,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
     runs = robot.has_ground and robot.rig.imposed == "voltage"
     runs = runs and all(c.inertia > 0 for _, c in robot.configurations.items())  # otherwise the model rejects it
-    gear = (p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
-    if resolves and runs and not any(robot.knows([name]) for name in gear):
+    if resolves and runs and not capabilities.states_running_gear(robot):
         print_message("the robot's file has no running_gear: its wheelbase, belt and masses are examples")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 

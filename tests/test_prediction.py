@@ -75,7 +75,7 @@ def test_gain_has_the_error_of_rows_or_blocks_whichever_is_larger():
 
 
 @pytest.mark.parametrize(
-    ("gains", "chosen"),
+    "gains, chosen",
     [
         ([0.5, 0.9, 1.0], 2),  # the third gains less than its error over the second
         ([0.02, 0.03, 0.04], 0),  # none gains more than its error over nothing
@@ -151,7 +151,7 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
 
 
 @pytest.mark.parametrize(
-    ("names", "tied", "dropped"),
+    "names, tied, dropped",
     [
         (("motor.resistance",), (), ()),
         (("motor.resistance", "a.loss_coulomb"), (), ("a",)),

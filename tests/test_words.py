@@ -162,7 +162,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 
 
 @pytest.mark.parametrize(
-    ("kind", "rows"),
+    "kind, rows",
     [("progress_remark", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):

@@ -119,7 +119,7 @@ def test_every_kind_of_runs_has_words():
 
 
 @pytest.mark.parametrize(
-    ("span", "count", "step"),
+    "span, count, step",
     [(17.178, 15, 1.0), (199.0, 15, 10.0), (12.0, 14, 1.0), (0.9, 15, 0.05), (3e4, 14, 2000.0)],
 )
 def test_steps_are_those_that_a_person_sets(span, count, step):

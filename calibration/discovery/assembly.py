@@ -222,8 +222,10 @@ def _next_experiment(
     """Next experiment. None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
-    if not space.bare.observe.menu or space.bare.base.rig.follows_goal:
-        return experiments.propose_nothing(space) if traced.verdict != "none" else None
+    observe, follows_goal = space.bare.observe, space.bare.base.rig.follows_goal
+    if not observe.menu or follows_goal:  # the menu has no such experiments
+        remark = fit_notes.Remark("no_menu", word="goals of a controller" if follows_goal else observe.word)
+        return experiments.Proposal((experiments.NONE,), remark) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return experiments.propose_denser_runs(space, traced.where, settings)
     return (

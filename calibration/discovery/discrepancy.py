@@ -72,13 +72,13 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
     same_kind = [j for j in range(len(names)) if happens[j] == for_a_while]
-    k = max(same_kind, key=lambda j: deviate[j])
+    k = max(same_kind, key=deviate.__getitem__)
     # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
     lacks = [j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
-    k = max(lacks, key=lambda j: deviate[j]) if lacks else k
+    k = max(lacks, key=deviate.__getitem__) if lacks else k
     place = names[k][0]
     place_columns = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
-    j = k if for_a_while else max(place_columns, key=lambda j: deviate[j])
+    j = k if for_a_while else max(place_columns, key=deviate.__getitem__)
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
@@ -141,24 +141,18 @@ def refine_window(
         included: True for included rows, shape (rows,).
     """
     (x, way), included = linear.curve_variable(place, axis), linear.at_points(included)
-    levels, counts = np.unique(x[included], return_counts=True)
-    merged = -(-len(levels) // INSTANTS)
-    edges = levels[::merged]
+    levels = np.unique(x[included])
+    edges = levels[:: -(-len(levels) // INSTANTS)]
     index = np.searchsorted(edges, x, side="right") - 1
     shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
     a, b = Projection.of(linear)(bases_room.place_signature(linear, place, way[:, None] * shapes))
-    sums = np.zeros((len(edges) + 1,) * 2)
-    sums[1:, 1:] = a.cumsum(0).cumsum(1)
-    pull = np.append(0.0, b.cumsum())
-    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(levels), merged)).cumsum())
+    sums, pull = np.pad(a.cumsum(0).cumsum(1), ((1, 0), (1, 0))), np.append(0.0, b.cumsum())
+    rows = np.append(0, np.bincount(index[included], minlength=len(edges)).cumsum())
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
     rows_in_window = rows[last] - rows[first]
-    fair = (
-        (rows_in_window >= bases_room.FEWEST)
-        & (rows_in_window <= 0.5 * rows[-1])
-        & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
-    )
+    fair = (rows_in_window >= bases_room.FEWEST) & (rows_in_window <= 0.5 * rows[-1])
+    fair &= norm2 > 1e-9 * max(float(a.max()), 1e-300)
     gain = np.where(fair, (pull[last] - pull[first]) ** 2 / np.where(fair, norm2, 1.0), -np.inf)
     k = int(np.argmax(gain))
     inside = included & (index >= first[k]) & (index < last[k])

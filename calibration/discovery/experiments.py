@@ -391,12 +391,6 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
     return Proposal((name,), instruction, (curve,), sigma)
 
 
-def propose_nothing(space: CandidateSpace) -> Proposal:
-    """Proposal without experiments, because the menu has none for this kind of data."""
-    word = "goals of a controller" if space.bare.base.rig.follows_goal else space.bare.observe.word
-    return Proposal((NONE,), Remark("no_menu", word=word))
-
-
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
     """Experiment that separates the alternatives of a class. None if each effect has only one candidate name."""
     alternatives = alternatives_of_class(best, found)

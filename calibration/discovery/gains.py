@@ -48,18 +48,13 @@ def best_hold_out_gain(
     alone = [best, *([min(sound, key=lambda c: c.cost)] if sound else [])]
     fits = {(c.key, base.key): (c, base) for c in alone}
     fits.setdefault((pair[0].key, pair[1].key), pair)
-    gains = [(having, _hold_out_gain(space, runs, having, without, predicted)) for having, without in fits.values()]
+    gains = []
+    for having, without in fits.values():
+        score, before = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
+        changed = _changed_readings(space, runs, *(simulated_reading(space, c) for c in (without, having)))
+        gains.append((having, _gain_over_changed(score, before, changed)))
     having, gain = max(gains, key=lambda one: one[1].mean / max(one[1].se, 1e-12))
     return tuple(n for n in having.effects if space.library[n].family() == family), gain
-
-
-def _hold_out_gain(
-    space: CandidateSpace, runs: Runs, having: Candidate, without: Candidate, predicted: Predicted
-) -> Gain:
-    """Hold-out gain of one fit over another, over the readings that differ."""
-    scores, before = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
-    changed = _changed_readings(space, runs, simulated_reading(space, without), simulated_reading(space, having))
-    return _gain_over_changed(scores, before, changed)
 
 
 def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:

@@ -135,7 +135,7 @@ def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.nda
             continue
         rms, reversed_rms = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
         if reversed_rms * NEARER < rms:
-            heading = runs.headings.get(channel.column, channel.column)
+            heading = runs.heading(channel.column)
             remarks.append(
                 Remark(
                     "turned",

@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
 #: Meaning of a parameter far from its prior, by the kind of result.
 FAR = {
-    "loop": "{} is {:.1f} prior sds from its mean. It probably absorbs a missing effect",
-    "calibration": "{} is {:.1f} prior sds from its mean. The prior or the model is wrong",
-    "edge": "{} is {:.1f} prior sds from its mean, at the edge of the search. Widen the prior",
+    "loop": "It probably absorbs a missing effect",
+    "calibration": "The prior or the model is wrong",
+    "edge": "The search ended there. Widen the prior",
 }
 #: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "the prior of its product with the guide share"}
@@ -129,9 +129,11 @@ def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
     }[test.what]
 
 
+#: Verdict on a model with large errors.
+UNDESCRIBED = "this model does not describe these runs"
 #: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
-    "undescribed": "This model does not describe these runs: {large}. Check units, signs and unused columns first",
+    "undescribed": f"{UNDESCRIBED.capitalize()}: {{large}}. Check units, signs and unused columns first",
     "not converged": "No verdict: the search did not converge ({every})",
     "worse": "Not adequate: its errors exceed those of the robot file ({every})",
 }
@@ -308,7 +310,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         "these runs determine only combinations: "
         + ", ".join(f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs)
     ),
-    "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
+    "far_from_prior": lambda name, sds, kind: f"{name} is {sds:.1f} prior sds from its mean. {FAR[kind]}",
     "noise_off": lambda channel, factor, source: (
         f"the residuals of {channels.find_channel(channel).label if channel else 'every channel'} are {factor:.2g} "
         f"times the {source} noise. Check the noise"

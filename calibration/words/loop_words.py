@@ -18,6 +18,7 @@ from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.settings import WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
+from calibration.words.fit_words import UNDESCRIBED
 from mmrjax import effects
 from mmrjax.effects.base import EQUATION
 from mmrjax.errors import count_noun
@@ -108,7 +109,7 @@ def loop_answer(found: loop_notes.Headline) -> str:
     )
     return {
         "none": f"Yes, as far as these runs show{noises}: the residuals are consistent with noise.",
-        "undescribed": f"No verdict{noises}: this model does not describe these runs.",
+        "undescribed": f"No verdict{noises}: {UNDESCRIBED}.",
         "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
         **dict.fromkeys(("named", "class"), f"No: {_are_missing(laws)}{noises}."),
         "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
@@ -149,9 +150,9 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of columns"]
     if not place_words:
-        return "This model does not describe these runs: it lacks backlash. Add backlash first."
+        return f"{UNDESCRIBED.capitalize()}: it lacks backlash. Add backlash first."
     return (
-        f"This model does not describe these runs: after the refit, it misses {', '.join(place_words)}. Check "
+        f"{UNDESCRIBED.capitalize()}: after the refit, it misses {', '.join(place_words)}. Check "
         f"first: {', and '.join(check)}."
     )
 
@@ -453,7 +454,7 @@ def errors_of_written_robot(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block, or "No"."""
     when = 1 if found.written else 0
     if found.headline.level == "undescribed":
-        return ["No: this model does not describe these runs."]
+        return [f"No: {UNDESCRIBED}."]
     lines = [f"**These conditions**: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
     for kind, error_pair in found.errors_held_out.items():
         lines.append(f"**Another {blocks.kind_in_words(kind)}**: {_rms(error_pair[when], len(found.runs))}.")
@@ -732,12 +733,12 @@ def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
 
 #: Reason why a log does not show the states of its equations → sentence part, and what to log.
 UNSHOWN = {
-    "motion": "no channel reads a speed or an angle. Log one for a fast answer",
-    "sign": "an instrument shows no sign. Log it for a fast answer",
-    "slack": "motor and load move apart",
-    "turn": "the robot turns",
-    "goal": "a controller gives the voltage. Log the duty for a fast answer",
-    "follower": "no channel follows the imposed speed. Log the current for a fast answer",
+    "motion": ("no channel reads a speed or an angle", "one"),
+    "sign": ("an instrument shows no sign", "it"),
+    "slack": ("motor and load move apart", ""),
+    "turn": ("the robot turns", ""),
+    "goal": ("a controller gives the voltage", "the duty"),
+    "follower": ("no channel follows the imposed speed", "the current"),
 }
 
 
@@ -774,7 +775,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
-    "unshown": lambda source, why: f"{source}: effects are simulated, in minutes, because {UNSHOWN[why]}",
+    "unshown": lambda source, why: (
+        f"{source}: effects are simulated, in minutes, because {UNSHOWN[why][0]}"
+        + f". Log {UNSHOWN[why][1]} for a fast answer" * bool(UNSHOWN[why][1])
+    ),
     "lost_replicates": "only {settled} of {asked} bootstrap tables were refitted",
     "outstanding": lambda factors, word: (
         f"no time was left to test the verdict with {' and '.join(f'{f:g}' for f in factors)} times the "

@@ -25,10 +25,10 @@ WOULD_MEASURE = {
 }
 #: Losses that data do not distinguish without variation of a condition.
 ALIKE = {
-    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses look the same",
-    "slope": "without slopes, rolling resistance and Coulomb losses look the same",
-    "voltage": "at one voltage, constant and speed-dependent losses look the same",
-    "speed": "at one speed, constant and speed-dependent losses look the same",
+    "guides": "rolling resistance, guide friction and Coulomb losses",
+    "slope": "rolling resistance and Coulomb losses",
+    "voltage": "constant and speed-dependent losses",
+    "speed": "constant and speed-dependent losses",
 }
 
 
@@ -125,7 +125,7 @@ NOT_OVER_TIME = {"sides": "a log of two sides is not fitted over time", "unfitte
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "unmeasured": lambda name: f"{name} keeps its prior value. These data lack {would_measure(name)}",
-    "constant": lambda column, value, alike: f"{column} is {value:g} in every row: {ALIKE[alike]}",
+    "constant": lambda column, value, alike: f"{column} is {value:g} in every row, so {ALIKE[alike]} look the same",
     "repeats": differing_repeats,
     "larger_noise": (
         "{channel}: {pairs} pairs of repeats scatter {factor:.2g} times the {source} noise, so its sd is "

@@ -117,7 +117,7 @@ def _operating_points(
     if layout.imposed == "motor_current":
         raise BadConfiguration("sensitivity: this robot imposes the motor current; use simulate or sweep")
     usual_axes: dict[str, tuple[float, ...]] = {}
-    if layout.uses_paper_conditions:
+    if layout.complete:
         usual_axes = CORNERS if config.method in ("sobol", "morris") else WHOLE
         if not set(OF_TURNS).isdisjoint(ranges):  # which settle only on level ground
             usual_axes = {**usual_axes, "slopes_deg": (0.0,)}

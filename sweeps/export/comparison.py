@@ -351,7 +351,7 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     """
     robot = joint.file.robot
     if data is None:
-        if not Layout.of(robot).uses_paper_conditions and capabilities.imposed_limit(robot) is None:
+        if not Layout.of(robot).complete and capabilities.imposed_limit(robot) is None:
             raise BadConfiguration(
                 f"--data: not given, and {joint.file.name} has no motor.voltage_limit; give a table of runs, or "
                 "add the limit"
