@@ -601,5 +601,8 @@ def _record(line: str) -> Done | None:
     check, _, body = line.partition(" ")
     if not body or f"{zlib.crc32(body.encode()):08x}" != check:
         return None
-    chunk, statuses, ranges, checks = json.loads(body)
-    return Done(chunk, tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, checks)
+    try:
+        chunk, statuses, ranges, checks = json.loads(body)
+        return Done(int(chunk), tuple(statuses), {name: tuple(r) for name, r in ranges.items()}, dict(checks))
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return None
