@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -27,6 +28,8 @@ from mmrjax.undercarriage.side_contacts import GearReactions
 
 T = TypeVar("T")
 
+#: Every option of a fidelity by name, from `FidelityFacts.resolved`.
+Options = Mapping[str, float]
 #: Callback for progress; receives the finished share of the work, 0..1.
 Progress = Callable[[float], None]
 
@@ -69,7 +72,7 @@ class History(eqx.Module):
             nan = jnp.full_like(signals.current, jnp.nan)
             volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
             unknown: dict[str, Any] = dict.fromkeys(volts, nan)
-            signals = dataclasses.replace(signals, **unknown)
+            signals = replace(signals, **unknown)
         clock, (distance, signals, reading, reactions) = in_table_time(
             robot.rig, time, (distance, signals, reading, reactions)
         )
@@ -149,9 +152,7 @@ class ImplicitSolution:
     shown: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
 
 
-def _accept_every_run(
-    robot: Robot, conditions: Conditions, options: Mapping[str, float]
-) -> None:  # results are pickled
+def _accept_every_run(robot: Robot, conditions: Conditions, options: Options) -> None:  # results are pickled
     """Accepts every run."""
 
 
@@ -183,7 +184,7 @@ class Fidelity:
     outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
     implicit: ImplicitSolution | None = None
     histories: SimulateBatch | None = None
-    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _accept_every_run
+    check: Callable[[Robot, Conditions, Options], None] = _accept_every_run
     cautions: Callable[[Robot, Conditions], list[str]] = _without_cautions
     columns: tuple[str, ...] = ()
 
@@ -236,7 +237,7 @@ def mask_unknown(robot: Robot, found: Result) -> Result:
     """Copy of `found` in which numbers that depend on unknown parameters of the robot are NaN."""
     unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
-    return dataclasses.replace(found, **nan)
+    return replace(found, **nan)
 
 
 def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
@@ -301,4 +302,4 @@ def withhold_numbers(answer: Result, valid: Array, sound: Array) -> Result:
         lambda x: jnp.where(valid, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
     )
     stands = {name: jnp.where(sound, getattr(answer, name), jnp.nan) for name in ("mass", "adhesion_used")}
-    return dataclasses.replace(blank, **stands, status=answer.status)
+    return replace(blank, **stands, status=answer.status)

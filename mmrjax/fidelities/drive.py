@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.base import (
     Fidelity,
     History,
+    Options,
     Progress,
     RunBatch,
     result_of_signals,
@@ -27,7 +28,7 @@ from mmrjax.fidelities.steady import operating_signals
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.driver import FAST
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Times
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
     BATTERY_EMPTY,
@@ -67,8 +68,8 @@ class DriveTrajectory(eqx.Module):
         result: the state at the end, with the run's status.
     """
 
-    time: Float[Array, " times"]
-    distance: Float[Array, " times"]
+    time: Times
+    distance: Times
     signals: Signals
     result: Result
 
@@ -205,7 +206,7 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
 def drive(
     robot: Robot,
     conditions: Conditions,
-    times: Float[Array, " times"],
+    times: Times,
     tolerance: float = 1e-6,
     max_steps: int = 4096,
     *,
@@ -374,7 +375,7 @@ def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: A
 def drive_batch(
     robot: Robot,
     conditions: Conditions,
-    times: Float[Array, " times"],
+    times: Times,
     tolerance: float = 1e-6,
     max_steps: int = 4096,
 ) -> DriveTrajectory:
@@ -389,14 +390,12 @@ def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(conditions)
 
 
-def _run_batch(
-    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
-) -> RunBatch:
+def _run_batch(robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None) -> RunBatch:
     return RunBatch(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
 
 
 def _run_histories(
-    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+    robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None
 ) -> RunBatch:
     duration = options["duration"]  # times are denser while the current rises to its peak
     early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
@@ -429,7 +428,7 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
 
     def left(current: Array) -> Array:
         total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
-        shifted = dataclasses.replace(signals, current=current, total_current=total)
+        shifted = replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
     voltage, slope = value_and_slope(left, signals.current)

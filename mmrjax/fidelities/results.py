@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import jax
@@ -15,7 +16,7 @@ from mmrjax.compile.compiling import compiled, computed_outside_trace, on_host
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words, count_noun
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Fidelity, History, RunBatch
+from mmrjax.fidelities.base import Fidelity, History, Options, RunBatch
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.model import channels
@@ -62,9 +63,7 @@ class PendingBatch:
         return total_mass(self.robot, self.conditions)
 
 
-def run_batch(
-    fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Mapping[str, float], history: bool
-) -> RunBatch:
+def run_batch(fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Options, history: bool) -> RunBatch:
     """Simulates a batch of any shape."""
     runs = math.prod(conditions.shape)
     if history and runs > HISTORIES:
@@ -231,7 +230,7 @@ class Results:
     def __post_init__(self) -> None:
         result = self.result
         if isinstance(result, Result) and (coded := _comparable_codes(result.status)) is not result.status:
-            object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
+            object.__setattr__(self, "result", replace(result, status=coded))
 
     @staticmethod
     def pending(batch: PendingBatch, configurations: Names, model: str) -> Results:
@@ -266,7 +265,7 @@ class Results:
             columns = cache.get("_shown", {})
             reading = {k: columns.get(k, x) for k, x in batch_result.reading.items()}
             status = columns.get(STATUS, _comparable_codes(batch_result.status))
-            cache["result"] = dataclasses.replace(batch_result, reading=reading, status=status)
+            cache["result"] = replace(batch_result, reading=reading, status=status)
 
     def __getattr__(self, name: str) -> Any:
         self._compute(name)

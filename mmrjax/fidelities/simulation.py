@@ -6,6 +6,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox.internal as eqxi
@@ -240,7 +241,7 @@ def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     names, configuration = robot.configurations.names, conditions.configuration
     if isinstance(configuration, NamedConfigurations):
         try:
-            return dataclasses.replace(conditions, configuration=configuration.among(names))
+            return replace(conditions, configuration=configuration.among(names))
         except KeyError as error:
             raise UsageError(f"configuration: got {error.args[0]}; {allowed_words(error.args[0], names)}") from error
     if (

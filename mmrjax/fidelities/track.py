@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +17,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch, flag_mask, withhold_numbers
+from mmrjax.fidelities.base import Fidelity, History, Options, Progress, RunBatch, flag_mask, withhold_numbers
 from mmrjax.model import balances, contact, masses
 from mmrjax.model.balances import signals_of
 from mmrjax.model.conditions import Conditions
@@ -190,7 +189,7 @@ def _assemble_trajectory(
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | flag_mask({"jumps": jumps})
-    answer = withhold_numbers(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
+    answer = withhold_numbers(replace(answer, flags=flags), valid, status != FAILED)
     return TrackTrajectory(time[1:], motions.q, motions.v, signals, reactions, averages, answer)
 
 
@@ -313,9 +312,7 @@ def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: track(robot, c, duration=TIME_ROLLED, rolling=True).result)(conditions)
 
 
-def _run_batch(
-    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
-) -> RunBatch:
+def _run_batch(robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None) -> RunBatch:
     runs = track_batch(
         robot, conditions, duration=options["duration"], step=options["step"], rolling=True, progress=progress
     )
@@ -323,7 +320,7 @@ def _run_batch(
 
 
 def _run_histories(
-    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+    robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None
 ) -> RunBatch:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
     away, reactions = _moving_system_module(conditions).distance_and_reactions(runs.q, runs.reactions)
@@ -331,7 +328,7 @@ def _run_histories(
     return RunBatch(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 
-def _check_time_step_and_conditions(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
+def _check_time_step_and_conditions(robot: Robot, conditions: Conditions, options: Options) -> None:
     check_track_runs(robot, conditions, duration=options["duration"], step=options["step"])
 
 

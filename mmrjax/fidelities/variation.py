@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import outputs as table_of_outputs
-from mmrjax.fidelities.base import RunBatch
+from mmrjax.fidelities.base import Options, RunBatch
 from mmrjax.missions.profile import Profile
 from mmrjax.model import params, quantities
 from mmrjax.model.channels import Channel
@@ -114,7 +114,7 @@ class Variation(eqx.Module):
         if "configuration" in condition_values:
             condition_values["configuration"] = jnp.round(condition_values["configuration"]).astype(int)
         robot = params.replace(self.robot, values_by_name) if values_by_name else self.robot
-        return robot, dataclasses.replace(conditions, **condition_values)
+        return robot, replace(conditions, **condition_values)
 
 
 def variable_names(robot: Robot) -> Names:
@@ -127,7 +127,7 @@ def evaluate_points(
     fidelity: str,
     values: Float[Array, "points names"],
     conditions: Conditions,
-    options: Mapping[str, float],
+    options: Options,
     outputs: Names,
     profile: Profile | None = None,
 ) -> dict[str, Array]:

@@ -7,9 +7,9 @@ rear pulley (up), upper run (forwards), front pulley (down).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -80,9 +80,7 @@ class Levers(eqx.Module):
         """Main track of a side, and track of one lever, with their parts of the losses."""
 
         def share(coulomb: Scalar, viscous: Scalar) -> Track:
-            return dataclasses.replace(
-                side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous
-            )
+            return replace(side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous)
 
         own_share = share(self.share_coulomb, self.share_viscous)
         return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own_share
