@@ -214,7 +214,7 @@ def after(case: Case, runs, found) -> dict:
     included, sd = space.included[:rows], np.asarray(space.bare.data.sd)[:rows]
 
     def rms(candidate) -> float:
-        indices = space.library.indices(candidate.active)
+        indices = space.coordinates.indices(candidate.active)
         seen = hold_out_blocks(space.equipped, candidate.z, masks, indices).reading
         return float(np.sqrt(np.nanmean((((seen - runs.measured()) / sd)[included]) ** 2)))
 

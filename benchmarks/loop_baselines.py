@@ -82,7 +82,7 @@ class Ladder:
 
         space, settings, scores = self.space, self.settings, self.look(candidate)[1]
         strength = space.library.largest(np.abs(np.asarray(scores.single)))
-        strength[list(space.library.indices(candidate.effects))] = -1.0
+        strength[list(space.coordinates.indices(candidate.effects))] = -1.0
         names = [space.library.names[k] for k in np.argsort(-strength)[:BATCH]]
         wanted = [fill_slots([*candidate.effects, name], settings) for name in names]
         new = [w for w in wanted if frozenset(w) - {""} not in self.fitted]

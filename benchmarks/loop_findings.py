@@ -144,7 +144,7 @@ def _held_out(runs: Any, found: Any) -> dict[str, Any]:
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
 
     def reading(candidate: Any) -> dict[str, np.ndarray]:
-        active = space.library.indices(candidate.active)
+        active = space.coordinates.indices(candidate.active)
         return {
             kind: hold_out_blocks(space.equipped, candidate.z, list(by.values()), active).reading
             for kind, by in kinds.items()
@@ -190,7 +190,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
         return {}
     off, score = [], []
     for candidate in (base, best):
-        fitted = prediction.FittedProblem(there.equipped, candidate.z, there.library.indices(candidate.active))
+        fitted = prediction.FittedProblem(there.equipped, candidate.z, there.coordinates.indices(candidate.active))
         seen = fitted.observation()
         lost = there.equipped.observe.unreachable(np.asarray(seen.status))[:rows, None]
         off.append(np.where(lost, np.nan, (np.asarray(seen.reading)[:rows] - measured) / sd))

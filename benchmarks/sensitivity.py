@@ -122,7 +122,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     exact = ishigami_indices()
     held = np.zeros((2, 3))
     for seed in range(seeds):
-        design = sampled_indices.sobol_design(3, size, seed, second=False)
+        design = sampled_indices.sobol_design(3, size, seed)
         found = sampled_indices.sobol_terms(design, ishigami(design.points))
         assert found is not None
         indices = sampled_indices.indices_of_terms(found)
@@ -132,7 +132,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     print("Ishigami, share of seeds whose interval holds the index:", record["ishigami"], flush=True)
 
     inputs, model, conditions = ours()
-    design = sampled_indices.sobol_design(len(NAMES), reference_size, 2**31, second=False)
+    design = sampled_indices.sobol_design(len(NAMES), reference_size, 2**31)
     values = inputs.values(inputs.scores(design.points))
     began = time.perf_counter()
     by = by_scipy(values[:, : len(NAMES)])
@@ -140,7 +140,7 @@ def coverage(seeds: int, size: int, reference_size: int) -> dict[str, Any]:
     known = [sampled_indices.indices_of_terms(sampled_indices.sobol_terms(design, by[:, j])) for j in range(3)]  # type: ignore[arg-type]
     held = np.zeros((3, 2, len(NAMES)))
     for seed in range(seeds):
-        design = sampled_indices.sobol_design(len(NAMES), size, seed, second=False)
+        design = sampled_indices.sobol_design(len(NAMES), size, seed)
         values = inputs.values(inputs.scores(design.points))
         answer = model(values, conditions)
         for j, name in enumerate(OUTPUTS):

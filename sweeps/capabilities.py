@@ -37,6 +37,11 @@ OF_TRAVEL = (
 RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
 
 
+def states_running_gear(robot: Robot) -> bool:
+    """True if the robot's file or its base gives a parameter of the running gear."""
+    return any(p.name.startswith("running_gear.") and robot.knows([p.name]) for p in params.walk_parameters(robot))
+
+
 def has_battery(robot: Robot) -> bool:
     """True if the robot has its own battery."""
     if robot.rig.inherits:

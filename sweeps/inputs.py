@@ -16,7 +16,6 @@ from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
 from mmrjax.derived.turning_figures import turns_under_equal_commands
 from mmrjax.errors import list_some
-from mmrjax.model import params
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
@@ -60,8 +59,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
     runs = robot.has_ground and robot.rig.imposed == "voltage"
     runs = runs and all(c.inertia > 0 for _, c in robot.configurations.items())  # otherwise the model rejects it
-    gear = (p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
-    if resolves and runs and not any(robot.knows([name]) for name in gear):
+    if resolves and runs and not capabilities.states_running_gear(robot):
         print_message("the robot's file has no running_gear: its wheelbase, belt and masses are examples")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 

@@ -1,14 +1,19 @@
 """The command line in this process, the tables that it leaves, and files that it reads."""
 
+import contextlib
 import csv
+import dataclasses
 import json
+import os
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
+from calibration.data.input_errors import BadData
 from sweeps import cli
 
 #: The checkout.
@@ -19,6 +24,7 @@ def command(arguments):
     """Run a command, its first words as one string. Returns its exit code."""
     words, *rest = arguments
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it
         patch.setattr(sys, "argv", ["mmrjax", *str(words).split(), *map(str, rest)])
         cli.main()
     return end.value.code
@@ -30,6 +36,11 @@ def rows(path):
         return list(csv.DictReader(stream))
 
 
+def columns_of(path):
+    """Columns of a CSV file: numbers, an empty cell NaN, or texts."""
+    return {name: cells.to_numpy() for name, cells in pd.read_csv(path).items()}
+
+
 def ends(run, *said, code=2):
     """A run (exit code, stdout, stderr) that ended with `code` and says each sentence, on stderr if it was refused."""
     ended, out, err = run
@@ -38,6 +49,14 @@ def ends(run, *said, code=2):
     for sentence in said:
         assert sentence in text or sentence in " ".join(text.split()), text
     return run
+
+
+@contextlib.contextmanager
+def refused(says, error=BadData):
+    """What it does is refused in one sentence that matches `says`."""
+    with pytest.raises(error, match=says) as refusal:
+        yield
+    assert "\n" not in str(refusal.value)
 
 
 def text_file(path, text):
@@ -60,6 +79,11 @@ def read_rig(folder, text, name="rig.toml", **options):
 def read_table(folder, text, robot=None, name="log.csv", **options):
     """The runs of a new table with this text."""
     return records.read_runs(text_file(folder / name, text), robot=robot, **options)
+
+
+def with_columns(runs, **columns):
+    """The runs with these columns added or replaced."""
+    return dataclasses.replace(runs, columns=runs.columns | columns)
 
 
 def read_json(path):

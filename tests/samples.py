@@ -95,18 +95,25 @@ def mat73(path, columns):
         stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + struct.pack("<H2s", 0x0200, b"IM"))
 
 
-def _messages(store, names, fast_signals, slow_signals, stamped):
-    """(topic, time [ns], message) of both rates in the order of time. Joint states and voltages."""
-    joint, volts, current = names
-    found = []
+#: Topics of bags, and types of their messages.
+TOPICS = {
+    "/volts": "std_msgs/msg/Float64", "/drive/amps": "std_msgs/msg/Float64", "/joint_states": "sensor_msgs/msg/JointState",
+}  # fmt: skip
+
+
+def _write_messages(writer, store, serialize, fast_signals, slow_signals, header, lose=False):
+    """Messages of both rates into a bag in the order of time. `header` of a time [s] and [ns]."""
+    links = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in TOPICS.items()}
+    number, joint = (store.types[TOPICS[topic]] for topic in ("/volts", "/joint_states"))
+    found, empty, last = [], np.zeros(0), slow_signals["t"][-1]
     for t, v, a in zip(*fast_signals.values(), strict=True):
-        found.append(("/volts", t, store.types[volts](v)))
-        found.append(("/drive/amps", t, store.types[current](a)))
+        found += [("/volts", t, number(v)), ("/drive/amps", t, number(a))]
     for t, rpm in zip(*slow_signals.values(), strict=True):
-        empty = np.zeros(0)
-        rates = np.array([0.0, 0.0, rpm])
-        found.append(("/joint_states", t, store.types[joint](stamped(t), ["a", "b", "c"], empty, rates, empty)))
-    return sorted(found, key=lambda each: each[1])
+        rates = np.array([0.0, 0.0, rpm])[: 2 if lose and t == last else 3]
+        stamp = header(*divmod(BEGIN * 10**9 + round(t * 1e9), 10**9))
+        found.append(("/joint_states", t, joint(stamp, ["a", "b", "c"], empty, rates, empty)))
+    for topic, t, message in sorted(found, key=lambda each: each[1]):
+        writer.write(links[topic], BEGIN * 10**9 + round(t * 1e9), serialize(message, links[topic].msgtype))
 
 
 #: When the bags begin [s since 1970].
@@ -119,58 +126,26 @@ def ros1(path, fast_signals, slow_signals):
 
     store = get_typestore(Stores.ROS1_NOETIC)
     header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-
-    def stamped(t):
-        ns = round(t * 1e9)
-        return header(0, time(BEGIN + ns // 10**9, ns % 10**9), "")
-
-    kinds = ("sensor_msgs/msg/JointState", "std_msgs/msg/Float64", "std_msgs/msg/Float64")
     with Writer(path) as writer:
-        links = {
-            topic: writer.add_connection(topic, kind, typestore=store)
-            for topic, kind in (("/volts", kinds[1]), ("/drive/amps", kinds[2]), ("/joint_states", kinds[0]))
-        }
-        for topic, t, message in _messages(store, kinds, fast_signals, slow_signals, stamped):
-            kind = links[topic].msgtype
-            at = BEGIN * 10**9 + round(t * 1e9)
-            writer.write(links[topic], at, store.serialize_ros1(message, kind))
+        _write_messages(writer, store, store.serialize_ros1, fast_signals, slow_signals,
+                        lambda s, ns: header(0, time(s, ns), ""))  # fmt: skip
 
 
 def mcap(path, fast_signals, slow_signals):
     ros2(path, fast_signals, slow_signals, as_mcap=True)
 
 
-def ros2(
-    path,
-    fast_signals,
-    slow_signals,
-    as_mcap=False,
-    lose=False,
-):
+def ros2(path, fast_signals, slow_signals, as_mcap=False, lose=False):
     """The last message of the joints has one joint less with `lose`."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-
-    def stamped(t):
-        ns = round(t * 1e9)
-        return header(time(BEGIN + ns // 10**9, ns % 10**9), "")
-
-    kinds = ("sensor_msgs/msg/JointState", "std_msgs/msg/Float64", "std_msgs/msg/Float64")
     plugin = StoragePlugin.MCAP if as_mcap else StoragePlugin.SQLITE3
     with Writer(path, version=9, storage_plugin=plugin) as writer:
-        links = {
-            topic: writer.add_connection(topic, kind, typestore=store)
-            for topic, kind in (("/volts", kinds[1]), ("/drive/amps", kinds[2]), ("/joint_states", kinds[0]))
-        }
-        last = slow_signals["t"][-1]
-        for topic, t, message in _messages(store, kinds, fast_signals, slow_signals, stamped):
-            if lose and t == last and topic == "/joint_states":
-                message.velocity = message.velocity[:2]
-            at = BEGIN * 10**9 + round(t * 1e9)
-            writer.write(links[topic], at, store.serialize_cdr(message, links[topic].msgtype))
+        _write_messages(writer, store, store.serialize_cdr, fast_signals, slow_signals,
+                        lambda s, ns: header(time(s, ns), ""), lose)  # fmt: skip
 
 
 def ulog(path, fast_signals, slow_signals):

@@ -7,6 +7,7 @@ import pytest
 from numpy.random import default_rng
 
 from calibration.discovery.classes import ammeter_families
+from calibration.discovery.projection import Projection
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels
@@ -26,7 +27,7 @@ def families(imposed, *shown):
     jacobian = np.append(np.repeat(1 - shape, len(ordered)), 1.0)[:, None]
     rig = SimpleNamespace(imposed=imposed)
     space = SimpleNamespace(bare=SimpleNamespace(channels=ordered, base=SimpleNamespace(rig=rig)))
-    return ammeter_families(space, jacobian, residual, column[:, None], LOSS, settings_for(SettledRuns))
+    return ammeter_families(space, Projection(jacobian, residual), column[:, None], LOSS, settings_for(SettledRuns))
 
 
 @pytest.mark.parametrize(

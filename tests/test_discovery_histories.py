@@ -16,9 +16,8 @@ from worlds import histories
 
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery.adequacy import AdequacyTest
-from calibration.discovery.discrepancy import fit_discrepancy, locate_discrepancy
-from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
+from calibration.discovery.score_tests import bootstrap_statistics
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import noise
@@ -111,7 +110,7 @@ def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
 def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     space, left, searched = oval.space, oval.left, oval.searched
     assert left.test.rejected
-    stood = judge_names(space, oval.base, searched, left, oval.bases, ANALYST.settings)
+    stood = judge_names(BaseCurve(space, oval.base, left, oval.bases), searched)
     assert not stood.stands and stood.why
     where = locate_discrepancy(left, oval.bases, space.included)
     assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
@@ -130,32 +129,6 @@ def test_wave_without_a_name_is_in_the_result(oval):
     assert found.verdict in WITHOUT_NAME and found.effects == () and found.unnamed is None
     assert (where.balance, where.variable) == (location.balance, location.variable)
     assert where.explained > 0.5 * oval.label["sigmas"] ** 2
-
-
-@pytest.mark.slow
-def test_wave_without_a_name_can_be_added_to_the_robot(oval):
-    """To the simulated fit."""
-    run, scored = oval.traced.run, oval.space.library.scored
-    posed, z = run.space.bare, jnp.asarray(run.base.z[: run.space.free])
-    before = posed.observe.linearise(posed, z, scored)
-    curve = fit_discrepancy(run.space, run.base, before, "track", "order 2 of the driving shaft")
-    assert (
-        curve.converged and curve.effect == "wave_track" and isinstance(curve.robot.effects[0], UNNAMED["wave_track"])
-    )
-    assert curve.chi2[0] - curve.chi2[1] > 0.5 * oval.label["sigmas"] ** 2
-    # a sin(2 θ + φ) of the generator
-    wave = curve.robot.effects[0]
-    got = complex(wave.y_sin, wave.y_cos) * float(wave.amplitude)
-    expected = oval.label["amplitude"] * np.exp(1j * oval.label["shapes"]["phase"])
-    assert abs(got - expected) < 0.3 * abs(expected) and float(wave.order_shaft) == 2.0
-    assert "sin(2 θ_k" in curve.proposal.formula
-    told = curve.problem, jnp.asarray(curve.z), scored, oval.bases
-    exact, (linear, _, strongest) = diagnose_fit(*told), diagnose_fit(*told, near=before)
-    assert_allclose(linear.residual, exact[0].residual, atol=1e-6)
-    for kind in ("single", "curve", "chi2"):  # by signatures of the fit without the curve
-        assert abs(getattr(strongest, kind) - getattr(exact[2], kind)) < 0.3
-    after = AdequacyTest(jax.device_get(strongest), oval.left.test.null, ANALYST.settings)
-    assert not after.rejected_with_margin and oval.left.test.rejected_with_margin
 
 
 @pytest.mark.slow

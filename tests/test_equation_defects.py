@@ -94,15 +94,16 @@ def test_each_side_has_its_own_defects():
 def turns():
     """Columns of a table of turns."""
     n = 40
-    duty = RANDOM.uniform(-1, 1, (2, n))
-    voltage = np.repeat([15.0, 33.0], n // 2)
+    duty, voltage = dict(zip(SIDES, RANDOM.uniform(-1, 1, (2, n)), strict=True)), np.repeat([15.0, 33.0], n // 2)
     table = {"configuration": np.full(n, "6T2A"), "supply_voltage_V": voltage, "payload_kg": np.zeros(n)}
-    table |= {"duty_left": duty[0], "duty_right": duty[1], "slope_deg": np.zeros(n)}
-    for side, d in zip(("left", "right"), duty, strict=True):
-        table[f"motor_speed_{side}_rpm"] = 360 * d * voltage
-        table[f"motor_current_{side}_A"] = RANDOM.uniform(-2, 2, n)
+    table |= {"slope_deg": np.zeros(n)} | {f"duty_{side}": d for side, d in duty.items()}
+    for side, d in duty.items():
+        table |= {f"motor_speed_{side}_rpm": 360 * d * voltage, f"motor_current_{side}_A": RANDOM.uniform(-2, 2, n)}
         table |= {f"defect_before_{b}_{side}": RANDOM.normal(size=n) for b in EQUATIONS}
     return table
+
+
+SIDES = ("left", "right")
 
 
 @pytest.mark.parametrize(
@@ -142,12 +143,10 @@ def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
 def test_defects_of_turns_are_drawn_by_side_over_what_that_side_does():
     table = turns()
     fig = draw_defects(table, "none", crosses_zero=True)
-    for axes, column in zip(
-        fig.axes, ("motor_current_{}_A", "motor_speed_{}_rpm", "motor_speed_{}_rpm"), strict=True
-    ):
+    for axes, quantity in zip(fig.axes, ("current_{}_A", "speed_{}_rpm", "speed_{}_rpm"), strict=True):
         lines = {line.get_label(): line.get_xdata() for line in axes.get_lines()}
-        for side in ("left", "right"):
-            assert np.array_equal(lines[f"6T2A, {side}"], table[column.format(side)])
+        for side in SIDES:
+            assert np.array_equal(lines[f"6T2A, {side}"], table[f"motor_{quantity.format(side)}"])
         assert "of that side" in axes.get_xlabel()
 
 

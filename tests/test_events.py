@@ -52,7 +52,7 @@ def simulated():
     at = np.searchsorted(times, SAMPLES)
 
     def of(shares, robot, values):
-        moved = {NAMES[f]: value * share for f, value, share in zip(MOVED, values, shares, strict=True)}
+        moved = dict(zip((NAMES[f] for f in MOVED), values * shares, strict=True))
         signals = history_signals(params.replace(robot, moved), run, jnp.asarray(times), at=at)
         return jnp.stack([signals.current, signals.speed_motor], -1), signals
 

@@ -318,7 +318,10 @@ def named(experiments, name):
 def test_menu_stays_within_the_reach_of_a_small_robot(rover):
     made = menu.experiment_menu(reach(rover))
     runs = runs_of(made)
-    assert {r.configuration for r in runs} == {0} and {r.where for r in runs} == {"", "rover"}
+    assert {r.configuration for r in runs} == {0} and {r.used and r.used.configuration for r in runs} == {
+        None,
+        "rover",
+    }
     voltages, payloads, slopes = (
         np.concatenate([getattr(r, n) for r in runs]) for n in ("voltage", "payload", "slope")
     )
@@ -331,7 +334,10 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
 @pytest.mark.slow
 def test_configurations_without_rows_are_not_on_the_menu():
     made = menu.experiment_menu(reach(CLIMBING, conditions(settled.table8(configurations=(1,)))))
-    assert not any("6T2A" in e.name for e in made) and {r.where for r in runs_of(made)} == {"", "4W2T"}
+    assert not any("6T2A" in e.name for e in made) and {r.used and r.used.configuration for r in runs_of(made)} == {
+        None,
+        "4W2T",
+    }
     assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
     assert named(made, "weigh").at == ((1.0, 0.0), (1.0, 8.0))
 
@@ -350,7 +356,7 @@ def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     within = reach(change_robot(rover, {"motor.voltage_limit": 18.0}, where="test"))
     run = named(menu.experiment_menu(within), "other voltages, rover")
     assert max(run.voltage) == 18.0
-    shown = menu.restrict_run(run, *plain(run), within)
+    shown = menu.restrict_run(run, *plain(run))
     assert Remark("overvoltage", voltage=18.0, used=12.0) in shown.watch
 
 
@@ -398,7 +404,7 @@ def test_the_zero_of_a_meter_is_read_at_rest_as_well_as_its_table_is(rover):
 def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
     made = menu.experiment_menu(reach(replace(rover, sides=jnp.asarray(1.0))))
     assert not any("one motor" in e.kinds for e in made)
-    assert {r.motors for r in runs_of(made)} == {1}
+    assert {r.reach.motors for r in runs_of(made)} == {1}
 
 
 @pytest.mark.slow
@@ -452,7 +458,7 @@ def test_steepest_slope_is_one_that_the_robot_climbs():
 ])  # fmt: skip
 def test_what_can_do_damage_is_to_be_watched(name, temperature, speed, watch):
     run = BY[name]
-    found = menu.restrict_run(run, *plain(run, temperature, speed), REACH).watch
+    found = menu.restrict_run(run, *plain(run, temperature, speed)).watch
     assert watch in found if watch else found == ()
 
 
@@ -475,7 +481,7 @@ def test_runs_against_a_brake_have_its_torque():
     assert torque.max() == 0.5 and (torque * conditions_of(made).voltage >= 0).all()  # it brakes either way
     run = next(r for r in made if "other torques" in r.kinds)
     done = np.asarray(run.torque) < 0.5  # it stalls the motor
-    kept = menu.restrict_run(run, menu.possible_runs(run, done), *plain(run)[1:], within)
+    kept = menu.restrict_run(run, menu.possible_runs(run, done), *plain(run)[1:])
     assert set(kept.torque) == set(run.torque) - {0.5} and len(kept.voltage) == len(kept.torque)
     assert conditions_of(menu.experiment_menu(replace(within, torques=()))).load_torque is None
 

@@ -520,8 +520,7 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     """
     arm = RIG.split("[effects")[0].replace("torque_gravity = 0.6", f"torque_constant = {torque}")
     rig.write_text(arm + LOSSES)
-    file = find_robot_file(str(rig))
-    drive = joint_of_robot(file)
+    drive = drive_of(rig)
     module = law_of(drive)
     step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
 
@@ -532,16 +531,15 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
         return (state, speed), (speed, info["current"])
 
     found = jax.lax.scan(advance, (module.initial_state(), 0.0), None, length=5000)[1]
-    history = mm.simulate(
-        file.robot, mm.Conditions(voltage=voltage), model="drive", duration=0.1, history=True
-    ).history
-    times = step * np.arange(1, 5001)
-    expected = np.asarray(history.reading["motor_speed"]) / 19.7, np.asarray(history.reading["total_current"])
+    robot = find_robot_file(str(rig)).robot
+    run = mm.simulate(robot, mm.Conditions(voltage=voltage), model="drive", duration=0.1, history=True).history
+    time, reading = run.time, run.reading
+    # a step is a tenth of the winding's L/R
     for mine, native, begins in zip(
-        found, expected, (0.0, 2e-3), strict=True
-    ):  # a step is a tenth of the winding's L/R
-        error = np.interp(history.time, times, mine) - native
-        assert np.max(np.abs(error[history.time > begins])) < 1e-3 * np.max(np.abs(native))
+        found, (reading["motor_speed"] / 19.7, reading["total_current"]), (0.0, 2e-3), strict=True
+    ):
+        error = np.interp(time, step * np.arange(1, 5001), mine) - native
+        assert np.abs(error[time > begins]).max() < 1e-3 * np.abs(native).max()
 
 
 def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
@@ -734,11 +732,13 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
     """A start from rest under one goal or voltage: MJCF in MuJoCo C, and the law in JAX beside a simulator's steps."""
     text, in_mujoco, in_jax = APART[name]
     rig.write_text(text)
-    file = find_robot_file(str(rig))
-    drive, goal = joint_of_robot(file), "servo" in name
-    command, times = 0.5 if goal else 6.0, np.linspace(0, 0.5, 26)
-    given = {"voltage": 7.4, "goal": command} if goal else {"voltage": command}
-    run = drive_batch(file.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], mm.Conditions(**given)), times, 1e-8, 20_000)  # fmt: skip
+    drive, times = drive_of(rig), np.linspace(0, 0.5, 26)
+    goal, command = {"goal": 0.5}, 0.5
+    if "servo" not in name:
+        goal, command = {}, 6.0
+    given = mm.Conditions(voltage=7.4 if goal else command, **goal)
+    batch = jax.tree.map(lambda x: jnp.asarray(x, float)[None], given)
+    run = drive_batch(find_robot_file(str(rig)).robot, batch, times, 1e-8, 20_000)
     native = np.asarray(run.signals.angle[0])
     if in_mujoco is not None:
         angles = mujoco.angles_in_mujoco(xml_of(rig), command * (200 if goal else 1), times, 1e-4)
@@ -754,7 +754,7 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
         return (state, speed, angle + step * speed), angle
 
     angles = jax.lax.scan(advance, (module.initial_state(), 0.0, 0.0), None, length=10_001)[1]
-    assert np.abs(np.asarray(angles)[::400] - native).max() < in_jax
+    assert np.abs(angles[::400] - native).max() < in_jax
 
 
 def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):

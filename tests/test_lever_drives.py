@@ -1,7 +1,5 @@
 """Drives of levers: closed forms of one lever under load, and the law of both pairs at random states."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,28 +96,23 @@ def test_rate_that_is_asked_for_is_had_until_the_voltage_or_the_current_ends():
 def test_both_pairs_obey_their_law_together_at_random_states():
     """What carries them and what drives them agree. A pair that moves has its friction against it, one that stands
     what friction can hold, and a voltage is at its end where a rate is not what is asked for."""
-    random = default_rng(3)
+    random, n = default_rng(3), 400
     drives = [lever_drive(with_worm(efficiency)) for efficiency in (0.5, 0.7)]
-    n = 400
     whole = random.normal(size=(n, 2, 2))
-    mass = whole @ whole.transpose(0, 2, 1) + 0.05 * np.eye(2)
-    yields = STEP * np.linalg.inv(mass) / 2
+    yields = STEP * np.linalg.inv(whole @ whole.transpose(0, 2, 1) + 0.05 * np.eye(2)) / 2
     rate = 0.5 * random.normal(size=(n, 2)) * (random.random((n, 2)) < 0.7)
     free = rate + np.einsum("nij,nj->ni", yields, 60 * random.normal(size=(n, 2)))
     asked = np.where(random.random((n, 2)) < 0.7, rate + 2e-3 * random.normal(size=(n, 2)), 0.0)
     volts = np.where(random.random((n, 1)) < 0.5, 12.0, 4.0) + np.zeros((n, 2))
-    for drive in drives:
-        done = jax.vmap(lambda *x, drive=drive: step_levers(drive, STEP, *x))(
-            *(jnp.asarray(x) for x in (rate, free, yields, asked, -volts, volts))
-        )
+    for k in drives:
+        done = jax.vmap(lambda *x, k=k: step_levers(k, STEP, *x))(rate, free, yields, asked, -volts, volts)
         torque, after, voltage, current = (np.asarray(x) for x in done[:4])
         assert after == pytest.approx(free + np.einsum("nij,nj->ni", yields, torque), abs=1e-9)
-        k = {name: float(getattr(drive, name)) for name in [f.name for f in dataclasses.fields(drive)]}
-        assert current == pytest.approx((voltage - k["constant"] * after) / k["resistance"], abs=1e-9)
+        assert current == pytest.approx(np.asarray((voltage - k.constant * after) / k.resistance), abs=1e-9)
         # on the motor's side of the gears, without its friction
-        left = k["constant"] * current - k["inertia"] * (after - rate) / STEP - k["viscous"] * after
-        up = np.where(torque > 0, k["ahead"], k["back"]) * torque + k["dry"]
-        down = np.where(torque < 0, k["ahead"], k["back"]) * torque - k["dry"]
+        left = k.constant * current - k.inertia * (after - rate) / STEP - k.viscous * after
+        up = np.where(torque > 0, k.ahead, k.back) * torque + k.dry
+        down = np.where(torque < 0, k.ahead, k.back) * torque - k.dry
         scale = 1e-6 * (1 + np.abs(torque))
         obeys = np.where(after > 1e-12, np.abs(left - up) < scale, np.where(
             after < -1e-12, np.abs(left - down) < scale, (left < up + scale) & (left > down - scale)))  # fmt: skip

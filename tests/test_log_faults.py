@@ -149,7 +149,7 @@ def test_a_sign_that_is_reversed_half_way_is_seen_in_an_angle(tmp_path, kind, ma
 
 
 @pytest.mark.parametrize("delay, stated, words", [
-    (0.149, True, "a longer delay is not searched"), (-0.2, False, "earlier than its column states, and a longer delay"),
+    (0.149, True, "no longer delay is searched"), (-0.2, False, "earlier than its column states, and no longer delay"),
     (0.1, False, "the rig file gives no delay. To start"), (0.1, True, ""), (0.003, False, ""),
 ])  # fmt: skip
 def test_a_delay_at_the_end_of_its_search_is_reported(runs, delay, stated, words):
@@ -227,7 +227,7 @@ def test_a_log_without_a_motion_is_reported_with_what_to_log(robot, runs):
     assert missing_states_remarks(runs, robot) == []
     runs.columns[SPEED] = np.full(600, np.nan)
     (note,) = missing_states_remarks(runs, robot)
-    assert "no channel reads a speed or an angle" in describe(note) and "log one" in describe(note)
+    assert "no channel reads a speed or an angle" in describe(note) and "Log one" in describe(note)
 
 
 @pytest.mark.parametrize("levels, converged", [(6, False), (6, True), (5, False)])

@@ -74,7 +74,7 @@ def found(monkeypatch):
     monkeypatch.setattr(gains_room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curves_without_blocks", lambda *_: ((), None))
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
-    monkeypatch.setattr(room, "_with_ammeter_families", lambda beside, found, settings: found)
+    monkeypatch.setattr(room, "_with_ammeter_families", lambda beside, found: found)
     monkeypatch.setattr(gains_room, "linear_gain_of_curve", lambda *_: Gain(1.0, 0.1))
     differs = [(None, "", 0.0)]
     monkeypatch.setattr(room, "changed_run", lambda *_: differs[0])
@@ -87,9 +87,10 @@ def found(monkeypatch):
         space.bare.observe.reads, differs[0] = reads, run
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
         beside = SimpleNamespace(
-            where=where, curve=drawn, space=space, base=fitted(explains=0.0), left=left, bases=()
-        )
-        return room.find_mechanism(beside, None, ladder, {}, settings_for(SettledRuns))
+            where=where, curve=drawn, space=space, base=fitted(explains=0.0), left=left, bases=(),
+            settings=settings_for(SettledRuns),
+        )  # fmt: skip
+        return room.find_mechanism(beside, None, ladder, {})
 
     return of
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
+from worlds import paper
 
 import mmrjax as mm
 from calibration.data import robot_file
@@ -40,62 +41,32 @@ def with_battery(robot, cutoff=3.3, delay=1.0, **changes):
 # --- an independent integration -------------------------------------------------------------------------------------
 
 
-def integrated(robot, cutoff, delay=1.0, slope_deg=10.0, payload=5.0):
-    """Time [s] and distance [m] at which tracks at full duty are cut off: SciPy's Radau on plain rates of one motor's
-    current, motor speed, speed, charge, winding, housing and way, with its root of the cell's voltage."""
-    p = {q.name: float(q.value) for q in params.walk_parameters(robot)}
-    own = {name.removeprefix("6T2A."): x for name, x in p.items() if name.startswith("6T2A.")}
-    ratio, k, radius, cells = p["gearbox.ratio"], p["motor.torque_constant"], own["radius"], robot.battery.cells
-    mass, slope = (own["mass"] + payload) / 2, np.radians(slope_deg)
-    normal, uphill = mass * 9.80665 * np.cos(slope), mass * 9.80665 * np.sin(slope)
-    guide = own["track.guide_friction"] * own["track.guide_share"] * normal
-    static, dynamic, v_s, v_d = (
-        own[f"ground.friction.{n}"] for n in ("static", "dynamic", "speed_static", "speed_dynamic")
-    )
-    R_wh, R_ha = p["motor.resistance_thermal_winding"], p["motor.resistance_thermal_housing"]
-
-    def way(v, rest):
-        x = np.clip(v / rest, -1, 1)
-        return x * (3 - x * x) / 2
-
-    def adhesion(v):
-        u = np.clip((abs(v) - v_s) / (v_d - v_s), 0, 1)
-        return (
-            static * way(v, v_s) if abs(v) < v_s else np.sign(v) * (static + (dynamic - static) * u * u * (3 - 2 * u))
-        )
+def integrated(cutoff, delay=1.0):
+    """Time [s] and distance [m] at which tracks at full duty are cut off: SciPy's Radau on the plain rates of `paper`
+    with heat of winding and housing, and its root of the cell's voltage."""
+    side = paper.Side(0.0, np.radians(10.0), 5.0, battery=True)
+    cold = side.R
 
     def cell(y):
-        none = p["battery.curvature"] * y[3] ** 2 + p["battery.slope"] * y[3] + p["battery.voltage_full"]
-        return none - p["battery.resistance"] * (2 * y[0] + p["battery.current_other"])
+        return side.supply(y[0], y[4]) / paper.CELLS
 
     def rates(t, y):
-        current, w, v, _, winding, housing, _ = y
-        resistance, wheel = p["motor.resistance"] * (1 + 0.00393 * (winding - 25)), w / ratio
-        turns = way(radius * wheel, 0.1 * v_s)
-        pull = adhesion(radius * wheel - v) * normal
-        drive = k * current - (p["motor.friction_coulomb"] + p["gearbox.friction_coulomb"]) * turns
-        drive -= (p["motor.friction_viscous"] + p["gearbox.friction_viscous"]) * w
-        load = own["track.loss_coulomb"] * turns + own["track.loss_viscous"] * wheel + radius * (guide * turns + pull)
-        eta = 1 + turns * (p["gearbox.efficiency_load"] - 1)
-        turning = (ratio * eta * drive - load) / (own["inertia"] + eta * ratio**2 * p["motor.inertia"])
-        resists = uphill + own["ground.rolling_resistance"] * normal * way(v, 0.1 * v_s)
-        flow = (winding - housing) / R_wh
-        return [
-            (cells * cell(y) - k * w - resistance * current) / p["motor.inductance"], ratio * turning,
-            (pull - resists) / mass, 2 * current + p["battery.current_other"],
-            (resistance * current**2 - flow) * R_wh / 16.3, (flow - (housing - 25) / R_ha) * R_ha / 593.0, v,
-        ]  # fmt: skip
+        winding, housing = y[5:]
+        side.R = cold * (1 + 0.00393 * (winding - 25))
+        flow = (winding - housing) / 1.7
+        heat = (side.R * y[0] ** 2 - flow) * 1.7 / 16.3, (flow - (housing - 25) / 6.0) * 6.0 / 593.0
+        return [*side.rates(t, y[:5]), *heat]
 
     def falls(t, y):
         return cell(y) - cutoff
 
     falls.terminal, falls.direction = True, -1
-    accuracy = {"method": "Radau", "rtol": 1e-8, "atol": 1e-8 * np.array([10, 1000, 1, 100, 50, 50, 1.0])}
-    start = solve_ivp(rates, [0, 10], [0, 0, 0, 0, 25.0, 25.0, 0], **accuracy)
+    accuracy = {"method": "Radau", "rtol": 1e-8, "atol": 1e-8 * np.array([10, 1000, 1, 1, 100, 50, 50.0])}
+    start = solve_ivp(rates, [0, 10], [0, 0, 0, 0, 0, 25.0, 25.0], **accuracy)
     assert cell(start.y[:, -1]) > cutoff  # the surge of the start is over
     found = solve_ivp(rates, [10, 3600], start.y[:, -1], events=falls, **accuracy)
     after = solve_ivp(rates, [0, delay], found.y[:, -1], **accuracy)
-    return found.t[-1] + delay, after.y[6, -1]
+    return found.t[-1] + delay, after.y[3, -1]
 
 
 @pytest.fixture(scope="module")
@@ -113,17 +84,13 @@ def cut(robot, followed):
     return followed(with_battery(robot))
 
 
-def beside(found, robot, cutoff):
-    time, distance = integrated(robot, cutoff)
-    assert STATUSES[int(found.result.status)] == "cut_off"
-    assert float(found.total.time) == pytest.approx(time, rel=2e-5)
-    assert float(found.total.of["path"]) == pytest.approx(distance, rel=5e-5)
-
-
 @pytest.mark.slow
-def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut, robot):
+def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut):
     """990.3 s and 816 m, where whole steps gave 1161 s and 944 m."""
-    beside(cut, robot, 3.3)
+    time, distance = integrated(3.3)
+    assert STATUSES[int(cut.result.status)] == "cut_off"
+    assert cut.total.time == pytest.approx(time, rel=2e-5)
+    assert float(cut.total.of["path"]) == pytest.approx(distance, rel=5e-5)
 
 
 @pytest.mark.slow
@@ -142,7 +109,7 @@ def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
 def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
     at = mm.Conditions(configuration=0, battery=1.0)
     numbers = mission_batch.mission_numbers(with_battery(robot), at, cut)
-    assert float(numbers["endurance"]) == float(cut.total.time) and float(numbers["state_of_charge"]) > 0.1
+    assert float(numbers["endurance"]) == cut.total.time and float(numbers["state_of_charge"]) > 0.1
     assert float(numbers["range"]) == float(cut.total.of["path"])
 
 
@@ -150,7 +117,7 @@ def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
 def test_the_inrush_recovers_in_time_and_a_longer_stay_below_does_not(robot, followed):
     """The start presses the cells below for 9 ms: a delay that is shorter ends the mission there, timed."""
     short = followed(with_battery(robot, delay=0.004))
-    assert STATUSES[int(short.result.status)] == "cut_off" and float(short.total.time) < 0.005
+    assert STATUSES[int(short.result.status)] == "cut_off" and short.total.time < 0.005
     marks, count = short.course.event, int(short.steps - short.rejected)
     k = int(np.flatnonzero(marks[:count] == MARKS.index("below_cut_off"))[-1])
     assert short.course.time[count - 1] - short.course.time[k] == pytest.approx(0.004, abs=1e-12)
@@ -176,23 +143,23 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     for k in range(4):
         apart = (both(zero.at[k].add(h))[0] - both(zero.at[k].add(-h))[0]) / (2 * h)
         assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
-        assert abs(float(apart[0])) > 1.0  # s: the moment moves
+        assert abs(apart[0]) > 1.0  # s: the moment moves
 
 
 @pytest.mark.slow
 def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
     """The energy of a battery follows from its charge: one that has drifted by 1.3e-4 is not overlooked."""
     through = float(cut.total.of["drawn"])
-    assert abs(float(cut.total.unaccounted)) < 1e-6 * through
+    assert abs(cut.total.unaccounted) < 1e-6 * through
     drifted = dataclasses.replace(cut.total, given=cut.total.given * (1 + 1.3e-4))
-    assert float(drifted.unaccounted) == pytest.approx(1.3e-4 * through, rel=1e-2)
+    assert drifted.unaccounted == pytest.approx(1.3e-4 * through, rel=1e-2)
 
 
 # --- what is said ---------------------------------------------------------------------------------------------------
 
 
-def written(folder, cutoff, text=""):
-    (folder / "low.toml").write_text(f"[battery]\nvoltage_cutoff = {cutoff}\n{text}")
+def written(folder, cutoff):
+    (folder / "low.toml").write_text(f"[battery]\nvoltage_cutoff = {cutoff}\n")
     (folder / "hour.csv").write_text("time_s,duty,slope_deg,payload_kg\n0,1,10,5\n3600,1,10,5\n")
     return "simulate", "--robot", "low.toml", "--profile", "hour.csv", "--battery"
 

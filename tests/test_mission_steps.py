@@ -14,14 +14,14 @@ from mmrjax.model import params
 def test_a_row_holds_until_the_next_or_ramps_to_it():
     rows = dict(demand=[0.0, 0.4, 0.2], slope_deg=[0.0, 5.0, 5.0])
     held, ramped = (profile([0.0, 2.0, 6.0], "speed", linear=x, cycles=3, **rows) for x in (False, True))
-    assert float(held.duration) == float(ramped.duration) == 18.0
+    assert held.duration == ramped.duration == 18.0
     assert (float(held.row(1).at(1.0).demand), float(ramped.row(1).at(1.0).demand)) == pytest.approx((0.4, 0.35))
     assert (float(held.row(0).at(0.5).slope_deg), float(ramped.row(0).at(0.5).slope_deg)) == (0.0, 1.25)
     assert ramped.row(0).at(0.5).payload is None
 
 
 @pytest.mark.parametrize(
-    ("curve", "top"),
+    "curve, top",
     [
         (lambda t: 1 + 4 * t - 4 * t**2, 2.0),  # a parabola, highest in the middle
         (lambda t: -(1 + 4 * t - 4 * t**2), 2.0),  # its size counts
@@ -34,7 +34,7 @@ def test_the_largest_within_a_step_is_that_of_the_cubic(curve, top):
     h = 1e-6
     ends = [jnp.asarray(float(x)) for x in (curve(0.0), curve(1.0))]
     slopes = [jnp.asarray((curve(t + h) - curve(t - h)) / (2 * h)) for t in (0.0, 1.0)]
-    assert float(_peak_between(*ends, *slopes)) == pytest.approx(top, rel=1e-6)
+    assert _peak_between(*ends, *slopes) == pytest.approx(top, rel=1e-6)
 
 
 def test_a_current_within_a_step_counts_up_to_the_drivers_limit(robot):

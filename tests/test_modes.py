@@ -4,7 +4,6 @@ import dataclasses
 from itertools import pairwise
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import fsolve
@@ -12,7 +11,7 @@ from scipy.optimize import fsolve
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.half_robot import advance, build_system, centre_of_mass, instant, roll, stand
+from mmrjax.undercarriage.half_robot import advance, build_system, roll
 from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised_steps, _run_modes, modes
 
 PAYLOADS = [0.0, 8.0]
@@ -120,20 +119,3 @@ def test_mode_over_an_octave_is_no_frequency_to_meet():
     mode = Mode("pitch", 59.0, 11.0, 106.0, 60.0, 0.17, 0.7, 1.0)
     assert mode.amplifies and not mode.resonant
     assert mode._replace(low=60.0).resonant
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("recess", [3.5e-4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 3e-3))])
-def test_standing_robot_is_in_balance_wherever_its_belt_stands(robot, recess):
-    """Normal force to the weight. With a recess some grousers bear alone."""
-    gear = params.replace(robot, {"running_gear.guide_recess": jnp.asarray(recess)})
-    run = build_system(gear, jax.tree.map(lambda x: x[1], conditions(gear, "6T2A")), 1e-4)
-    weight = centre_of_mass(run)[2] * GRAVITY
-
-    @jax.jit
-    @jax.vmap
-    def unbalanced(turned):
-        _, at, _ = instant(run, stand(run, turned))
-        return at.normal / weight - 1
-
-    assert np.abs(unbalanced(jnp.linspace(0, 0.9, 8))).max() < 1e-9

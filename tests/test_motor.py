@@ -36,7 +36,7 @@ def test_motor_temperature_settles_at_ambient_plus_heat():
     motor = Motor(
         resistance=2.0, resistance_thermal_winding=1.0, resistance_thermal_housing=4.0, temperature_ambient=20.0
     )
-    assert float(motor.temperature_cold(3.0)) == 20.0 + 5.0 * 2.0 * 9.0
+    assert motor.temperature_cold(3.0) == 20.0 + 5.0 * 2.0 * 9.0
     settled = float(motor.temperature_settled(3.0))
     power = 3.0 * float(motor.voltage_winding(3.0, settled))  # copper at that temperature
     assert settled == pytest.approx(20.0 + 5.0 * power, rel=1e-12) and settled > 110.0
@@ -50,7 +50,8 @@ def test_no_temperature_settles_where_every_kelvin_brings_more_than_a_kelvin():
     motor = Motor()
     edge = float((motor.temperature_coefficient * motor.resistance_thermal * motor.resistance) ** -0.5)
     assert np.isfinite(motor.temperature_settled(0.99 * edge)) and np.isinf(motor.temperature_settled(1.01 * edge))
-    assert float(motor.temperature_settled(3.91)) == pytest.approx(motor.temperature_limit, rel=5e-3)
+    assert motor.current_continuous == pytest.approx(3.91, abs=0.005)
+    assert motor.temperature_settled(3.91) == pytest.approx(motor.temperature_limit, rel=5e-3)
 
 
 @pytest.mark.parametrize("current", [0.0, 3.0, 6.0, 20.0])
@@ -74,10 +75,10 @@ def test_permissible_time_is_when_the_limit_is_reached():
     )
     for current in (4.5, 8.0, 30.0):
         time = float(permissible(current))
-        assert float(motor.temperatures_after(current, time, 25.0, 25.0)[0]) == pytest.approx(125.0, rel=1e-9)
-    assert float(permissible(3.9)) == np.inf  # below the continuous current
-    assert float(permissible(8.0, 130.0)) == 0.0
-    assert float(permissible(8.0, 80.0)) < float(permissible(8.0)) == float(motor.time_permissible(8.0))
+        assert motor.temperatures_after(current, time, 25.0, 25.0)[0] == pytest.approx(125.0, rel=1e-9)
+    assert permissible(3.9) == np.inf  # below the continuous current
+    assert permissible(8.0, 130.0) == 0.0
+    assert permissible(8.0, 80.0) < permissible(8.0) == motor.time_permissible(8.0)
 
 
 @pytest.mark.slow
@@ -87,4 +88,4 @@ def test_permissible_time_has_the_derivative_of_differences():
     for current in (4.5, 8.0, 30.0):
         step = 1e-4 * current
         apart = float(permissible(current + step)) - float(permissible(current - step))
-        assert float(slope(current)) == pytest.approx(apart / (2 * step), rel=1e-5)
+        assert slope(current) == pytest.approx(apart / (2 * step), rel=1e-5)

@@ -11,7 +11,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from sweeps.commands import rig_numbers
 from sweeps.commands.rig_new import write_new_rig
-from tests.commands import ends, read_json
+from tests.commands import ends, read_json, refused
 
 #: maxon RE30 310007, as printed.
 RE30 = {
@@ -78,8 +78,8 @@ def test_viscous_friction_of_a_motor_does_not_look_like_a_missing_effect(mmrjax,
     ends(mmrjax("loop runs.csv --robot rig.toml --out out --no-report"), code=0)
     assert read_json(tmp_path / "out/result.json")["verdict"] == "none"
     fitted = robot_file.read_robot(tmp_path / "out/fitted.toml").motor
-    assert float(fitted.friction_viscous) == pytest.approx(viscous, rel=0.1)
-    assert float(fitted.friction_coulomb) == pytest.approx(coulomb, rel=0.1)
+    assert fitted.friction_viscous == pytest.approx(viscous, rel=0.1)
+    assert fitted.friction_coulomb == pytest.approx(coulomb, rel=0.1)
 
 
 def test_printed_sheet_gives_the_makers_torque_constant():
@@ -89,7 +89,7 @@ def test_printed_sheet_gives_the_makers_torque_constant():
 
 
 @pytest.mark.parametrize(
-    ("text", "torque"), [("1 Nm", 1.0), ("10 kg.cm", 0.980665), ("100 oz-in", 0.70615518), ("100N·cm", 1.0)]
+    "text, torque", [("1 Nm", 1.0), ("10 kg.cm", 0.980665), ("100 oz-in", 0.70615518), ("100N·cm", 1.0)]
 )
 def test_torques_are_read_in_the_units_of_makers(text, torque):
     sheet = {"voltage": "12V", "no-load-current": "1A", "resistance": "1 ohm", "stall-torque": text}
@@ -103,7 +103,7 @@ def test_numbers_that_differ_widen_the_constant():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         ({"resistance": "1.2 ohm"}, r"resistance is 1.2 ohm \(resistance\) and 0.611 ohm \(voltage / stall current\), 96 %"),
         ({"stall-torque": "0.5 Nm"}, r"torque constant is 0.0259 N·m/A .* and 0.0128 N·m/A .*, 103 % apart; expected at most 10 %"),
@@ -117,7 +117,7 @@ def test_numbers_that_differ_widen_the_constant():
     ],
 )  # fmt: skip
 def test_sheets_that_contradict_themselves_or_lack_numbers_are_refused(change, message):
-    with pytest.raises(BadConfiguration, match=message):
+    with refused(message, BadConfiguration):
         rig_numbers.read_data_sheet({name: text for name, text in (RE30 | change).items() if text is not None})
 
 

@@ -1,15 +1,10 @@
 """One name is one quantity in every file that a command writes: tables of names, and the files of every command."""
 
 import contextlib
-import csv
 import inspect
-import io
 import itertools
-import os
 import re
-import sys
 import tomllib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +23,7 @@ from mmrjax.model import channels, quantities
 from mmrjax.undercarriage.ripple_peaks import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.commands import sweep
-from tests.commands import read_json
+from tests.commands import columns_of, command, read_json
 
 #: Ends of names, and the unit of each.
 UNITS = {
@@ -172,18 +167,12 @@ def keys(content, before=""):
             yield from keys(value, f"{before}[]")
 
 
-def table(path):
-    with path.open(newline="") as stream:
-        rows = list(csv.reader(stream))
-    return {name: [row[k] for row in rows[1:]] for k, name in enumerate(rows[0])}
-
-
 def walk(folder):
     """Every name in every file of a folder, with one place where it is."""
     found = {}
     for path in sorted(folder.rglob("*"), key=lambda path: (path.suffix == ".csv", path)):
         if path.suffix == ".csv":
-            found |= {name: str(path) for name in table(path)}
+            found |= dict.fromkeys(columns_of(path), str(path))
         elif path.suffix == ".json" and path.name not in ("zarr.json", "identity.json"):
             found |= {name: f"{path}{where}" for name, where in keys(read_json(path))}
         elif path.suffix == ".toml" and path.name != "robot.toml":  # names of parameters, in SI units
@@ -202,13 +191,9 @@ def unknown(folder):
     }
 
 
-def numbers(found):
-    """Columns of numbers. An empty cell is NaN."""
-    kept = {}
-    for name, cells in found.items():
-        with contextlib.suppress(ValueError):
-            kept[name] = np.array([float(x) if x else np.nan for x in cells])
-    return kept
+def numbers(path):
+    """Columns of numbers of a table. An empty cell is NaN."""
+    return {name: x for name, x in columns_of(path).items() if x.dtype.kind in "fi"}
 
 
 #: Columns with the same numbers where nothing tells them apart, and why.
@@ -226,7 +211,7 @@ ALIKE = {
 
 def twins(path):
     """Columns with one unit and the same numbers in at least two rows that differ: one quantity under two names."""
-    found = {n: x for n, x in numbers(table(path)).items() if END.search(n) and not NUMBERED.fullmatch(n)}
+    found = {n: x for n, x in numbers(path).items() if END.search(n) and not NUMBERED.fullmatch(n)}
     pairs = itertools.combinations(found, 2)
     return [
         (a, b)
@@ -238,18 +223,10 @@ def twins(path):
     ]
 
 
-def command(folder, *arguments):
-    """Run a command in this process and in a folder."""
-    out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.chdir(folder)
-        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
-        patch.setattr(os, "_exit", sys.exit)
-        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-    assert end.value.code in (0, None), err.getvalue()
-    return SimpleNamespace(code=end.value.code, out=out.getvalue(), err=err.getvalue())
+def run(folder, *arguments):
+    """Run a command in a folder."""
+    with contextlib.chdir(folder):
+        assert command(arguments) == 0
 
 
 def sound(folder):
@@ -344,13 +321,13 @@ def made(folder):
     """A command's folder, made once."""
     done = {}
 
-    def run(name, *arguments):
+    def once(name, *arguments):
         if name not in done:
-            command(folder, *arguments, "--out", name)
+            run(folder, *arguments, "--out", name)
             done[name] = folder / name
         return done[name]
 
-    return run
+    return once
 
 
 @pytest.fixture(scope="module")
@@ -363,7 +340,7 @@ def test_files_of_a_sweep_and_of_its_runs_simulated_hold_the_same_numbers(made, 
     sound(swept)
     simulated = made("simulate", "simulate", "--runs", swept / "runs.csv", "--no-report")
     sound(simulated)
-    one, other = (numbers(table(f / "runs.csv")) for f in (swept, simulated))
+    one, other = (numbers(f / "runs.csv") for f in (swept, simulated))
     assert len(same(one, other)) > 15
 
 
@@ -373,16 +350,16 @@ def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
     (folder / "charge.toml").write_text(
         '[conditions]\nbattery = 1\nconfiguration = "6T2A"\n[axes]\ndischarge = [0, 1800]\n'
     )
-    command(folder, "sweep", "charge.toml", "--export", "csv", "--no-report", "--out", "charge")
+    run(folder, "sweep", "charge.toml", "--export", "csv", "--no-report", "--out", "charge")
     sound(folder / "charge")
-    assert numbers(table(folder / "charge/runs.csv"))["discharge_mAh"].tolist() == [0.0, 500.0]
+    assert numbers(folder / "charge/runs.csv")["discharge_mAh"].tolist() == [0.0, 500.0]
 
 
 @pytest.mark.slow
 def test_files_of_compare_hold_the_numbers_of_runs(made):
     compared = made("compare", "compare", "measured", "--no-report")
     sound(compared)
-    one, other = (numbers(table(compared / n)) for n in ("comparison.csv", "runs.csv"))
+    one, other = (numbers(compared / n) for n in ("comparison.csv", "runs.csv"))
     simulated = {n.removeprefix("simulated_"): x for n, x in one.items() if n.startswith("simulated_")}
     assert same(simulated, other) == {c.column for c in channels.usual_channels()}
 
@@ -395,18 +372,16 @@ WALK = "time_s,supply_voltage_V\n0,24\n2,24\n"
 def test_files_over_time_end_on_the_numbers_of_their_runs(made, folder):
     (folder / "walk.csv").write_text(WALK)
     mission = made("mission", "simulate", "--profile", "walk.csv", "--slope", "2", "--no-report")
-    for run in (made("drive", *DRIVE), mission):
-        sound(run)
-        end, course = (numbers(table(run / n)) for n in ("runs.csv", "history.csv"))
+    for made_folder in (made("drive", *DRIVE), mission):
+        sound(made_folder)
+        end, course = (numbers(made_folder / n) for n in ("runs.csv", "history.csv"))
         last = {n: x[-1:] for n, x in course.items()}
         assert same(last, end, but=("time_s",)) >= {"displacement_m"}
-        result = read_json(run / "result.json")
+        result = read_json(made_folder / "result.json")
         stated = {n: np.array([x]) for n, x in result.items() if isinstance(x, float)}
         assert same(stated, end)
-    rows = numbers(table(mission / "history.csv"))
-    assert rows["winding_temperature_C"][-1] == pytest.approx(
-        numbers(table(mission / "runs.csv"))["winding_end_C"][0]
-    )
+    rows = numbers(mission / "history.csv")
+    assert rows["winding_temperature_C"][-1] == pytest.approx(numbers(mission / "runs.csv")["winding_end_C"][0])
 
 
 @pytest.mark.slow
@@ -414,7 +389,7 @@ def test_files_of_a_calibration_are_those_of_compare_with_its_robot(made, folder
     found = made("calibrate", "calibrate", "measured", "--starts", "2", "--no-profiles", "--no-report")
     sound(found)
     compared = made("after", "compare", "measured", "--robot", "calibrate/robot.toml", "--no-report")
-    rows, other = numbers(table(found / "rows.csv")), numbers(table(compared / "comparison.csv"))
+    rows, other = numbers(found / "rows.csv"), numbers(compared / "comparison.csv")
     after = {n.replace("after_", "simulated_"): x for n, x in rows.items() if n.startswith("after_")}
     assert len(same(after, other)) == 3
     assert same(rows, other) >= {f"error_{c.name}_percent" for c in channels.usual_channels()}

@@ -91,7 +91,7 @@ def one_sided_differences(robot, rows, outputs):
 
 @pytest.mark.quick("frictionless_shaft")
 @pytest.mark.parametrize(
-    ("robot", "rows", "outputs"),
+    "robot, rows, outputs",
     [(tracked, GROUND, OUTPUTS), (bench, SHAFT, OUTPUTS_SHAFT)],
     ids=["tracked", "frictionless_shaft"],
 )
@@ -105,7 +105,7 @@ def test_derivatives_at_defaults_and_bounds_are_one_sided_differences(robot, row
 def test_a_duty_of_all_the_voltage_has_the_derivative_from_inside():
     limited = Driver(current_limit=5.0).duty_limited
     for duty, current, slope in ((1.0, 2.0, 1.0), (-1.0, -2.0, 1.0), (0.5, 5.0, 1.0), (1.0, 6.0, 0.0)):
-        assert float(jax.grad(limited)(duty, current)) == slope
+        assert jax.grad(limited)(duty, current) == slope
 
 
 @pytest.mark.parametrize("name", ["bench.inertia", "effects.rotating_inertia.amplitude"])
@@ -119,11 +119,11 @@ def test_a_shaft_without_inertia_speeds_up_less_with_some(name):
         return balances.moving_signals(own, Conditions(voltage=8.0), State(0.5, 40.0, 40.0, 0.0)).acceleration_wheel
 
     value, slope = jax.value_and_grad(acceleration)(0.0)
-    assert float(slope) == pytest.approx(-float(value) / 1e-6, rel=1e-3)
+    assert slope == pytest.approx(-float(value) / 1e-6, rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("function", "at", "slope"),
+    "function, at, slope",
     [
         (lambda x: elementary.clip(x, -1.0, 1.0), 1.0, 1.0),
         (lambda x: elementary.clip(x, -1.0, 1.0), -1.0, 1.0),
@@ -137,4 +137,4 @@ def test_a_shaft_without_inertia_speeds_up_less_with_some(name):
     ],
 )
 def test_bounds_have_the_derivative_from_inside(function, at, slope):
-    assert float(jax.grad(function)(at)) == slope
+    assert jax.grad(function)(at) == slope

@@ -245,15 +245,15 @@ def test_one_evaluation_has_the_derivatives_of_the_root(posed, truth):
 def test_the_objective_is_finite_where_the_robot_slides_and_leads_back(posed):
     nominal_z = jnp.zeros(len(posed.coordinates))
     seen = posed.observation(nominal_z)
-    assert np.sum(np.asarray(seen.status) == SLIDES) == 6  # Table 5's adhesion against 15 and 20 degrees
-    assert np.all(np.isfinite(np.asarray(seen.reading)))
+    assert np.sum(seen.status == SLIDES) == 6  # Table 5's adhesion against 15 and 20 degrees
+    assert np.all(np.isfinite(seen.reading))
     gradient = jax.grad(lambda z: 0.5 * jnp.sum(residuals(posed, z) ** 2))(nominal_z)
     for name, g in zip(posed.coordinates.names, np.asarray(gradient), strict=True):
         if name.endswith("friction.static"):
             assert g < 0  # more adhesion costs less
     found = solve(posed, nominal_z)
     assert found.converged
-    assert np.all(np.asarray(posed.observation(found.z).status) == CONVERGED)
+    assert np.all(posed.observation(found.z).status == CONVERGED)
 
 
 @pytest.mark.slow
@@ -306,7 +306,7 @@ def test_search_goes_along_the_edge_of_a_penalty():
         z, end = to_the_end(start, True)
         assert end.steps < 30
         assert_allclose(z[1:], 0.0, atol=1e-6)
-        assert 0.1999 < float(z[0]) < 0.2
+        assert 0.1999 < z[0] < 0.2
         found = end.found
         assert jnp.linalg.norm(one_sided_step(found.residual, found.jacobian, found.one_sided, 0.0)) < 1e-6
 
@@ -341,15 +341,15 @@ def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured, 
     it nothing shows the penalty."""
     posed = pose(measured, robot, stated="current=10%,motor_speed=6%,speed=4%")
     limit = fit.search_starts(posed, jnp.zeros((1, len(posed.coordinates))))[0]
-    assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
+    assert np.any(posed.observation(limit.z[0]).adhesion_used > 1 - problem.MARGIN)
     inside = jnp.asarray(limit.z[0]).at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
     r, jacobian, seen = fit.linearise(posed, inside)
-    assert (np.asarray(seen.adhesion_used) < 1 - problem.MARGIN)[:10].all()
+    assert (seen.adhesion_used < 1 - problem.MARGIN)[:10].all()
     plain = np.linalg.lstsq(np.asarray(jacobian), np.asarray(r))[0]
     assert 0.5 * np.sum((jacobian @ plain) ** 2) > 3 * fit.DECREMENT  # a gain that is not there
     found, _, _ = fit.search_rollout(posed, inside)
-    assert found.converged and float(found.decrement) < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
-    assert float(found.cost) == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
+    assert found.converged and found.decrement < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
+    assert found.cost == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
 
 
 def test_directions_that_no_data_tell_apart_are_the_same_from_any_basis():
@@ -426,6 +426,12 @@ def test_blocks_left_out_are_not_seen(posed, measured, robot):
     assert_allclose(other.reading[rows], held.reading[rows], rtol=1e-4)
 
 
+def nothing_measured(readings, coordinates):
+    """Data of one row, where a test has residuals of its own."""
+    one = jnp.ones((1, readings))
+    return problem.Data(0 * one, one, one, jnp.zeros(coordinates), jnp.asarray(1.0))
+
+
 def test_blocks_of_what_does_not_vary_are_none(measured):
     flat = measured.where(measured["slope_deg"] == 0)
     assert (
@@ -450,8 +456,7 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
         r, jacobian = jax.vmap(residual)(members, z), jax.vmap(jax.jacfwd(residual, 1))(members, z)
         return jax.device_get((r, jacobian, members))
 
-    evaluated, one = [], jnp.ones((1, 3))
-    data = problem.Data(0 * one, one, one, jnp.zeros(2), jnp.asarray(1.0))
+    evaluated, data = [], nothing_measured(3, 2)
     begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
     weights = jnp.ones((6, 1, 3))
     found, _ = fit.search_rollouts(evaluate, begin, data, weights, 40, 2, within=fit.SAME)
@@ -479,8 +484,7 @@ def test_a_rival_that_promises_much_and_brings_nothing_ends():
         )
         return r, slopes[members], members
 
-    one = jnp.ones((1, 2))
-    data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
+    data = nothing_measured(2, 1)
     found, alone = (
         fit.search_rollouts(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, within=distance)[0]
         for distance in (3.0, np.inf)
@@ -496,8 +500,7 @@ def test_a_search_that_hardly_lowers_its_objective_ends(monkeypatch):
         r = np.stack([[(4000 - 0.02 * abs(x)) ** 0.5, 0.0] for x in z[:, 0]])
         return r, np.tile([[-0.01], [0.0]], (len(members), 1, 1)), members
 
-    one = jnp.ones((1, 1))
-    data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
+    data = nothing_measured(1, 1)
     search = lambda: fit.search_rollouts(evaluate, np.zeros((1, 1)), data, np.ones((1, 1, 1)), 40, 1)[0].steps[0]  # noqa: E731
     soon = search()
     monkeypatch.setattr(fit, "STALLED", -1.0)

@@ -9,7 +9,7 @@ import typer
 
 from calibration.data.input_errors import BadConfiguration
 from sweeps import cli, config, config_campaign, options
-from tests.commands import ends
+from tests.commands import ends, refused
 
 KINDS = {
     "simulate": (config.Simulate, config.OneRun),
@@ -113,7 +113,7 @@ def test_keys_of_a_file_are_read_and_options_win(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("replicate = 300\n", r"c.toml, replicate: no such key; did you mean replicates"),
         ("replicates = 3\n", r"c.toml, replicates: got 3; expected 250 to 100000"),
@@ -121,7 +121,7 @@ def test_keys_of_a_file_are_read_and_options_win(tmp_path):
     ],
 )
 def test_keys_of_a_file_that_cannot_be_are_refused_in_a_sentence(text, message, tmp_path):
-    with pytest.raises(BadConfiguration, match=message):
+    with refused(message, BadConfiguration):
         config.resolve_configuration(config.Loop, _file(tmp_path, text), {})
 
 
@@ -144,12 +144,12 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}
     assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
     given = {"left_V": 5.0, "battery": True}
-    with pytest.raises(BadConfiguration, match=r"^--left needs --right; give both$"):
+    with refused(r"^--left needs --right; give both$", BadConfiguration):
         config.resolve_configuration(config.Simulate, None, given)
     (tmp_path / "a.toml").write_text("left_V = 5.0\n")
-    with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V needs right_V; give both$"):
+    with refused(r"^a\.toml: left_V needs right_V; give both$", BadConfiguration):
         config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {})
-    with pytest.raises(BadConfiguration, match=r"^--left: got 50000\.0; "):
+    with refused(r"^--left: got 50000\.0; ", BadConfiguration):
         config.resolve_configuration(config.Simulate, None, {"left_V": 50000.0, "right_V": 1.0})
 
 
@@ -161,7 +161,7 @@ ASKED = [
 ]
 
 
-@pytest.mark.parametrize(("command", "text"), ASKED)
+@pytest.mark.parametrize("command, text", ASKED)
 def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, text):
     (tmp_path / "own.py").write_text(HARM)
     (tmp_path / "plan.toml").write_text(text)

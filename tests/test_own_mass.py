@@ -12,7 +12,7 @@ from synthetic import SETTLED, STATED
 
 from calibration.data import inferred_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import findings, loop_input
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
@@ -22,6 +22,7 @@ from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
+from tests.commands import refused
 
 #: Mass without payload that the tables here state [kg]; the nominal robot has 13.1 and 11.5 kg.
 MASSES = {"6T2A": 14.2, "4W2T": 13.1}
@@ -105,13 +106,8 @@ def _sd(effect):
     return next(p for p in params.walk_parameters(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
 
 
-def shown(name):
-    """A test of many effects: one compiles, the rest only run."""
-    return pytest.param(name, marks=[] if name in ("", "mass_offset", "sinkage") else pytest.mark.slow)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [shown(n) for n in ("", *SEEN)])
+@pytest.mark.parametrize("name", ("", *SEEN))
 def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     reading, status, again, status_again = fits(name)
     assert_array_equal(status_again, status)
@@ -146,32 +142,42 @@ def test_comparison_can_fail(tmp_path):
 # --- what is said ---------------------------------------------------------------------------------------
 
 
-def test_mass_of_the_table_is_taken_and_said(robot):
-    runs = table({"6T2A": 13.1, "4W2T": 13.1})
-    assert inferred_facts.mass_notes(robot, runs) == [
-        "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg. 13.1 kg is used, and written to robot.toml"
-    ]
+NOMINAL = {"6T2A": 13.1, "4W2T": 11.5}
+#: Masses and surface of a table, what is added to its total masses, what is said, and the masses that are written.
+SAID = {
+    "as the robot": (NOMINAL, "lacquered_wood", 0.0, (), NOMINAL),
+    "another mass": (
+        {"6T2A": 13.1, "4W2T": 13.1}, None, 0.0,
+        ("4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg. 13.1 kg is used, and written to robot.toml",),
+        {"6T2A": 13.1, "4W2T": 13.1},
+    ),
+    "a mass that varies": (
+        {"6T2A": 14.2, "4W2T": 11.5}, None, np.append([0.0, 0.0, 0.1, 0.2, 0.3, 0.4], np.zeros(6)),
+        ("6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. robot.toml contains "
+         "the median, 14.35 kg, so it does not reproduce the fit in other rows",),
+        {"6T2A": 14.35, "4W2T": 11.5},
+    ),
+    "another surface": (
+        NOMINAL, "asphalt", 0.0,
+        ("the table has runs on asphalt: the written friction is for lacquered_wood. Simulate with "
+         "--surface asphalt to use the fitted values",),
+        NOMINAL,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SAID)
+def test_mass_of_the_table_is_taken_and_said(robot, case):
+    masses, surface, added, said, written = SAID[case]
+    runs = table(masses, surface)
+    runs.columns["total_mass_kg"][:] += added
+    assert tuple(inferred_facts.mass_notes(robot, runs)) == said
     taken = inferred_facts.with_table_mass(robot, runs)
-    assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1
+    assert {name: float(taken.configurations[name].mass) for name in written} == written
     # Of a sum of floats the rounding is neither written nor said, and what is taken is not taken again.
-    assert inferred_facts.mass_notes(taken, runs) == []
-
-
-def test_a_table_without_masses_leaves_the_robots(robot):
-    runs = unweighed(table())
-    assert inferred_facts.with_table_mass(robot, runs) is robot or inferred_facts.stated_masses(robot, runs) == {}
-    assert inferred_facts.mass_notes(robot, runs) == []
-
-
-def test_a_mass_that_varies_is_said_and_its_median_written(robot):
-    runs = table()
-    runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
-    (said, _) = inferred_facts.mass_notes(robot, runs)
-    assert said == (
-        "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. robot.toml contains "
-        "the median, 14.35 kg, so it does not reproduce the fit in other rows"
-    )
-    assert float(inferred_facts.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
+    assert "without payload" not in "".join(inferred_facts.mass_notes(taken, runs))
+    bare = unweighed(runs)
+    assert inferred_facts.with_table_mass(robot, bare) is robot or inferred_facts.stated_masses(robot, bare) == {}
 
 
 def test_a_total_without_its_payload_is_suspected(robot):
@@ -181,25 +187,16 @@ def test_a_total_without_its_payload_is_suspected(robot):
     assert len(said) == 2 and all(s.endswith("; does total_mass_kg exclude the payload?") for s in said)
 
 
-def test_a_surface_other_than_the_robots_is_said(robot):
-    said = inferred_facts.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
-    assert said == [
-        "the table has runs on asphalt: the written friction is for lacquered_wood. Simulate with "
-        "--surface asphalt to use the fitted values"
-    ]
-    assert inferred_facts.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
-
-
 def test_a_mass_that_no_robot_has_is_refused(robot):
     runs = table({"6T2A": 0.003, "4W2T": 13.1})
     says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected 0\.01 to 10000 kg without"
-    with pytest.raises(BadData, match=says):
+    with refused(says):
         inferred_facts.with_table_mass(robot, runs)
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
     says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column or the prior"
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
     inferred_facts.check_priors(["4W2T.mass"], robot, unweighed(table()))
 

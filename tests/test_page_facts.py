@@ -17,6 +17,7 @@ from sweeps.pages import figure_style, power_figures, sweep_figures
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
 from sweeps.report.document import Document, Section
+from tests.commands import with_columns
 
 
 def run_of(robot, **conditions):
@@ -60,7 +61,7 @@ def test_an_inrush_is_judged_or_it_is_said_that_nobody_stated_its_limit():
 
 
 @pytest.mark.parametrize(
-    ("levels", "ticks"),
+    "levels, ticks",
     [
         (np.arange(0, 20.5, 0.5), ["0", "5", "10", "15", "20"]),
         (np.round(np.arange(0, 8.05, 0.1), 1), ["0", "2", "4", "6", "8"]),
@@ -97,7 +98,7 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
             )
 
 
-@pytest.mark.parametrize(("cells", "visible"), [(12, True), (40, False)])
+@pytest.mark.parametrize("cells, visible", [(12, True), (40, False)])
 def test_a_wide_map_shows_numbers_that_fit_its_cells(cells, visible):
     with figure_style.figure_settings():
         fig, grid = figure_style.new_figure(1, 1, 6.0)
@@ -133,7 +134,7 @@ def test_the_plane_of_drive_and_back_drive_is_that_of_the_gearbox(robot):
     assert_allclose(power_figures.torque_of_motor(robot, -24.0, load), -needs[::-1], rtol=1e-4)
     runs = records.read_runs("measured")
     simulated = mm.simulate(losing, runs.conditions(losing))
-    runs = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": np.asarray(simulated.total_current)})
+    runs = with_columns(runs, total_current_A=np.asarray(simulated.total_current))
     with figure_style.figure_settings():
         plane = power_figures.draw_measured_drive_plane(losing, runs).axes[0]
     lines = {line.get_label(): line.get_xydata() for line in plane.lines}

@@ -30,7 +30,7 @@ def test_running_gear_is_that_of_tables_6_and_7(robot):
         "additional_pulley_mass": 0.104, "wheel_mass": 0.086,
     }  # fmt: skip
     for name, value in printed.items():
-        assert float(getattr(robot.running_gear, name)) == pytest.approx(value, rel=1e-12), name
+        assert getattr(robot.running_gear, name) == pytest.approx(value, rel=1e-12), name
     assert 10.3 * float(robot.running_gear.body_gyration) ** 2 == pytest.approx(0.119, rel=1e-3)
 
 
@@ -38,14 +38,14 @@ def test_running_gear_is_that_of_tables_6_and_7(robot):
 def test_parameters_lie_within_their_bounds(name):
     for p in params.walk_parameters(paper_robots.ROBOTS[name]()):
         low, high = p.spec.bounds
-        assert low < high and low <= float(p.value) <= high, p.name
+        assert low < high and low <= p.value <= high, p.name
 
 
 def test_parameters_state_unit_meaning_source_and_prior(robot_with_effects):
     for p in params.walk_parameters(robot_with_effects):
         assert p.spec.unit and p.spec.meaning and p.spec.source, p.name
         assert (p.spec.sd is None) != (p.spec.relative_sd is None), p.name
-        if float(p.value) == 0.0 or p.spec.amplitude:
+        if p.value == 0.0 or p.spec.amplitude:
             assert p.spec.prior_sd(float(p.value)) > 0, p.name
 
 
@@ -78,7 +78,7 @@ def test_replace_takes_batches_and_tracers(robot):
     batch = params.replace(robot, {"motor.resistance": jnp.arange(3.0)})
     assert batch.motor.resistance.shape == (3,)
     gradient = jax.grad(lambda x: params.replace(robot, {"motor.resistance": x}).motor.voltage_winding(2.0))(1.0)
-    assert float(gradient) == 2.0
+    assert gradient == 2.0
 
 
 def test_parameters_have_no_weak_types(robot_with_effects):
@@ -99,11 +99,11 @@ def test_parameters_have_no_weak_types(robot_with_effects):
     assert traced(given) == given
 
 
-@pytest.mark.parametrize(("build", "torque"), [(paper_robots.sm1, 0.108), (paper_robots.sm2, 0.300)])
+@pytest.mark.parametrize("build, torque", [(paper_robots.sm1, 0.108), (paper_robots.sm2, 0.300)])
 def test_simplified_robots_are_table_a4(build, torque):
     robot = build()
-    assert float(robot.motor.torque_loss(0.0, 1.0)) == float(robot.motor.torque_loss(1200.0, 1.0)) == 4.2e-3
-    assert float(robot.gearbox.efficiency(0.03, 900.0)) == 0.75
+    assert robot.motor.torque_loss(0.0, 1.0) == robot.motor.torque_loss(1200.0, 1.0) == 4.2e-3
+    assert robot.gearbox.efficiency(0.03, 900.0) == 0.75
     assert float(robot.configurations["6T2A"].track.torque_loss(20.0, 1.0)) == torque
     assert_allclose(robot.battery.voltage(5.0, 3000.0), 33.6, rtol=1e-12)
 

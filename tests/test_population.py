@@ -20,6 +20,7 @@ from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
 from sweeps.store import RunFolder
+from tests.commands import refused
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -238,13 +239,13 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, 
 
     monkeypatch.setattr(population, "_observe_points", broken)
     name = "6T2A.ground.rolling_resistance"
-    with pytest.raises(BadConfiguration, match=r"none of \d+ members runs in every row .*: \d+ tips"):
+    with refused(r"none of \d+ members runs in every row .*: \d+ tips", BadConfiguration):
         calibrate(runs, robot, model="drive", free=(name,), population=4, generations=1)
 
 
 @pytest.mark.quick(1)
 @pytest.mark.parametrize(
-    ("options", "says"),
+    "options, says",
     [
         (dict(generations=3), "--generations: has an effect only with --population"),
         (dict(population=50), "a population search needs settled rows and --model drive or track"),
@@ -253,7 +254,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch, 
     ],
 )
 def test_options_of_a_population_that_cannot_be_are_refused(options, says, robot):
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         calibrate(records.read_runs("measured"), robot, **options)
 
 

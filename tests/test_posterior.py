@@ -5,12 +5,12 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import calibrated
 
 from calibration.data import posterior_file as room
 from calibration.data import robot_file
-from calibration.data.input_errors import BadData
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
 from calibration.data.runs import read_runs
 from calibration.inference import priors
@@ -18,6 +18,7 @@ from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax.model import params
 from sweeps import config
 from sweeps.points import run
+from tests.commands import refused
 
 NAMES = ("motor.resistance", "6T2A.track.guide_share", "6T2A.ground.friction.static", "motor.temperature_ambient")
 
@@ -58,15 +59,11 @@ def test_file_holds_all_of_a_posterior(posterior, tmp_path):
 
 
 def test_file_is_a_dataset_with_units_and_names(posterior, tmp_path):
-    xarray = pytest.importorskip("xarray")
-    room.write_posterior(posterior, tmp_path / room.FILE)
-    with xarray.open_dataset(tmp_path / room.FILE) as data:
-        data.load()
+    data = _written(posterior, tmp_path)
     assert data.attrs["schema"] == room.SCHEMA
-    assert [str(n.decode() if isinstance(n, bytes) else n) for n in data["coordinate"].values] == list(NAMES)
+    assert data["coordinate"].astype(str).values.tolist() == list(NAMES)
     assert data["covariance"].shape == (4, 4) and data["covariance"].attrs["long_name"] == "covariance of z"
-    units = [str(u.decode() if isinstance(u, bytes) else u) for u in data["units"].values]
-    assert units[0] == "ohm" and units[3] == "°C"
+    assert [x.decode() for x in data["units"].values[[0, 3]]] == ["ohm", "°C"]
     assert float(data["value"][0]) == pytest.approx(float(posterior.at(posterior.mean)[0]))
 
 
@@ -123,26 +120,24 @@ def test_cut_bounds_hold_and_soft_ones_are_not_cut_twice():
 
 def test_posterior_of_another_robot_is_refused(robot, posterior, fitted):
     posterior.check(fitted, "here")
-    with pytest.raises(BadData, match=r"here: motor.resistance is 0.611 in the robot; expected 0.62\d+, the centre"):
+    with refused(r"here: motor.resistance is 0.611 in the robot; expected 0.62\d+, the centre"):
         posterior.check(robot, "here")
     other = dataclasses.replace(posterior, coordinates=("8W8T.mass", *posterior.coordinates[1:]))
-    with pytest.raises(
-        BadData, match=r"here: this robot has no 8W8T.mass, so the posterior is another robot's.*6T2A.mass"
-    ):
+    with refused(r"here: this robot has no 8W8T.mass, so the posterior is another robot's.*6T2A.mass"):
         other.check(fitted, "here")
 
 
 def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
     path = tmp_path / room.FILE
-    with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc next to robot\.toml"):
+    with refused(r"no such file; expected the posterior\.nc next to robot\.toml"):
         room.read_posterior(path)
     path.write_text("nothing of the kind")
-    with pytest.raises(BadData, match="not a readable posterior"):
+    with refused("not a readable posterior"):
         room.read_posterior(path)
     skew = posterior.covariance.copy()
     skew[0, 1] = skew[1, 0] = 5.0  # more than their sds allow
     room.write_posterior(dataclasses.replace(posterior, covariance=skew), path)
-    with pytest.raises(BadData, match="a number is missing, invalid"):
+    with refused("a number is missing, invalid"):
         room.read_posterior(path)
 
 
@@ -150,12 +145,12 @@ def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
 def test_a_check_refuses_a_posterior_without_a_number(posterior, fitted, field):
     column = getattr(posterior, field).copy()
     column[0] = np.nan
-    with pytest.raises(BadData, match=r"motor.resistance is 0\.62\d+ in the robot; expected nan"):
+    with refused(r"motor.resistance is 0\.62\d+ in the robot; expected nan"):
         dataclasses.replace(posterior, **{field: column}).check(fitted, "here")
 
 
 @pytest.mark.parametrize(
-    ("column", "value"),
+    "column, value",
     [
         ("tied_to", 4),
         ("tied_to", -1),
@@ -166,7 +161,7 @@ def test_a_file_with_a_number_that_cannot_be_is_refused(posterior, tmp_path, col
     sound = _written(posterior, tmp_path)
     sound[column][0] = value
     sound.to_netcdf(tmp_path / room.FILE, engine="scipy")
-    with pytest.raises(BadData, match="a number is missing, invalid or out of range; write the file again"):
+    with refused("a number is missing, invalid or out of range; write the file again"):
         room.read_posterior(tmp_path / room.FILE)
 
 
@@ -178,7 +173,6 @@ def test_file_without_bounds_is_read(posterior, tmp_path):
 
 
 def _written(posterior, folder):
-    xarray = pytest.importorskip("xarray")
     room.write_posterior(posterior, folder / room.FILE)
     assert len(room.read_posterior(folder / room.FILE)) == len(posterior)
     with xarray.open_dataset(folder / room.FILE, engine="scipy") as data:
@@ -191,7 +185,7 @@ def test_draws_of_which_some_never_settle_have_no_spread_and_warn_of_nothing():
     assert np.isnan(found["winding_settled_C_sd"]).all()
 
 
-@pytest.mark.parametrize(("value", "sd", "most", "said"), [
+@pytest.mark.parametrize("value, sd, most, said", [
     (4.1932, 0.0612, 3, "4.193 ± 0.061"), (5243.2, 12.3, 1, "5243 ± 12"), (2.0, 0.0, 2, "2.00 ± 0.00"),
     (0.5, 0.000012, 3, "0.500 ± 0.000"), (-0.0001, 0.02, 3, "0.000 ± 0.020"), (-0.001, 0.0, 2, "0.00 ± 0.00"),
 ])  # fmt: skip
@@ -212,7 +206,7 @@ def test_saved_calibration_has_its_posterior(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("names", "verdict"), [(["churning"], "named"), ([], "none")])
+@pytest.mark.parametrize("names, verdict", [(["churning"], "named"), ([], "none")])
 def test_posterior_of_the_loop_has_what_it_found(names, verdict):
     from synthetic import SETTLED, table
     from worlds import tables

@@ -46,7 +46,7 @@ def test_angle_at_which_a_lever_is_flush():
 
 
 @pytest.mark.parametrize(
-    ("rear", "up", "tail", "reach", "millimetres"),
+    "rear, up, tail, reach, millimetres",
     [
         (180.0, UP, RADIUS, HALF, 86),
         (180.0, UP_LOADED, RADIUS, HALF, 67),
@@ -56,8 +56,8 @@ def test_angle_at_which_a_lever_is_flush():
 )
 def test_highest_step_is_that_of_its_closed_form(robot, rear, up, tail, reach, millimetres):
     found = highest_step(held(robot, 180.0, rear, up))
-    assert float(found.height) == pytest.approx(closed_step(tail, reach, up), abs=3e-4)
-    assert 1e3 * float(found.height) == pytest.approx(millimetres, abs=1)
+    assert found.height == pytest.approx(closed_step(tail, reach, up), abs=3e-4)
+    assert 1e3 * found.height == pytest.approx(millimetres, abs=1)
 
 
 @pytest.mark.slow
@@ -71,22 +71,22 @@ def test_highest_step_falls_by_what_the_levers_mass_moves(robot):
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize(("angle", "millimetres"), [(45.0, 202), (60.0, 235), (90.0, 262)])
+@pytest.mark.parametrize("angle, millimetres", [(45.0, 202), (60.0, 235), (90.0, 262)])
 def test_raised_tips(robot, angle, millimetres):
     found = limits(robot, run(angle, angle))
-    assert 1e3 * float(found.tip_front) == pytest.approx(millimetres, abs=1)
-    assert float(found.tip_front) == float(found.tip_rear)
+    assert 1e3 * found.tip_front == pytest.approx(millimetres, abs=1)
+    assert found.tip_front == found.tip_rear
 
 
-@pytest.mark.parametrize(("angle", "gap", "contact"), [(180.0, 150, 300), (FLUSH, 352.5, 705)])
+@pytest.mark.parametrize("angle, gap, contact", [(180.0, 150, 300), (FLUSH, 352.5, 705)])
 def test_gaps_and_contacts(robot, angle, gap, contact):
     found = limits(robot, run(angle, angle))
-    assert 1e3 * float(found.gap) == pytest.approx(gap, abs=0.5)
-    assert 1e3 * float(found.contact) == pytest.approx(contact, abs=1)
+    assert 1e3 * found.gap == pytest.approx(gap, abs=0.5)
+    assert 1e3 * found.contact == pytest.approx(contact, abs=1)
 
 
 @pytest.mark.parametrize(
-    ("angle", "up", "back", "aside"),
+    "angle, up, back, aside",
     [
         (180.0, UP, 72.0, 68.2),
         (180.0, UP_LOADED, 63.6, 58.5),
@@ -97,39 +97,39 @@ def test_gaps_and_contacts(robot, angle, gap, contact):
 def test_slopes_on_which_it_tips(robot, angle, up, back, aside):
     rests = rest(held(robot, angle, angle, up), 0.0, 0.0)
     assert math.degrees(float(rests.tips_back)) == pytest.approx(back, abs=0.1)
-    assert float(rests.tips_back) == pytest.approx(float(rests.tips_forward), abs=1e-12)
+    assert rests.tips_back == pytest.approx(float(rests.tips_forward), abs=1e-12)
     width = float(robot.configurations["6T2A"].turning.width)
     assert math.degrees(math.atan(width / 2 / float(rests.centre_height))) == pytest.approx(aside, abs=0.1)
     slope = math.radians(back)
-    assert float(rest(held(robot, angle, angle, up), slope - 0.005, 0.0).margin) > 0
-    assert float(rest(held(robot, angle, angle, up), slope + 0.005, 0.0).margin) < 0
+    assert rest(held(robot, angle, angle, up), slope - 0.005, 0.0).margin > 0
+    assert rest(held(robot, angle, angle, up), slope + 0.005, 0.0).margin < 0
 
 
 CASES = [(180, 180, 0), (-30, 180, 0), (180, -50, 8), (-45, -20, 3), (-90, -90, 0), (20, -75, 5), (-100, -60, 0)]
 
 
-@pytest.mark.parametrize(("front", "rear", "payload"), CASES)
+@pytest.mark.parametrize("front, rear, payload", CASES)
 def test_rest_is_that_of_a_world_of_polygons(robot, front, rear, payload):
     rests = resting_posture.posture(robot, run(front, rear, payload=payload))
     pitch, centre, height = world.rest(math.radians(front), math.radians(rear), payload)
-    assert float(rests.pitch) == pytest.approx(pitch, abs=1e-4)
-    assert float(rests.centre_height) == pytest.approx(centre, abs=2e-5)
-    assert float(rests.height) == pytest.approx(height, abs=2e-5)
-    assert 0 < float(rests.load_front) < 1 and float(rests.margin) > 0
+    assert rests.pitch == pytest.approx(pitch, abs=1e-4)
+    assert rests.centre_height == pytest.approx(centre, abs=2e-5)
+    assert rests.height == pytest.approx(height, abs=2e-5)
+    assert 0 < rests.load_front < 1 and rests.margin > 0
 
 
-@pytest.mark.parametrize(("front", "rear", "payload"), [*CASES[:3], (-54, -39, 0), (180, -125, 0), (20, 45, 2)])
+@pytest.mark.parametrize("front, rear, payload", [*CASES[:3], (-54, -39, 0), (180, -125, 0), (20, 45, 2)])
 def test_highest_step_is_that_of_a_world_of_polygons(robot, front, rear, payload):
     found = limits(robot, run(front, rear, payload=payload)).step
-    assert float(found) == pytest.approx(world.step(math.radians(front), math.radians(rear), payload), abs=4e-4)
+    assert found == pytest.approx(world.step(math.radians(front), math.radians(rear), payload), abs=4e-4)
 
 
 def test_loads_balance_the_moment_of_gravity(robot):
     """Of the two ends about the centre of mass, on a slope too."""
     rests = resting_posture.posture(robot, run(-40.0, 180.0, slope_deg=15.0))
     ends = rests.load_front * rests.front + (1 - rests.load_front) * rests.rear
-    assert float(ends) == pytest.approx(float(rests.centre_ahead - rests.centre_height * math.tan(math.radians(15))))
-    assert float(rests.line) == 0
+    assert ends == pytest.approx(float(rests.centre_ahead - rests.centre_height * math.tan(math.radians(15))))
+    assert rests.line == 0
 
 
 @pytest.mark.slow
@@ -137,8 +137,8 @@ def test_on_wheels_a_robot_rests_on_them(robot):
     rests = resting_posture.posture(robot, mm.Conditions("4W2T").resolved(robot))
     assert (float(rests.pitch), float(rests.height), float(rests.line)) == (0.0, 0.05, 0.0)
     found = limits(robot, mm.Conditions("4W2T").resolved(robot))
-    assert float(found.length) == pytest.approx(0.4) and float(found.height) == pytest.approx(0.1)
-    assert float(found.gap) == 0
+    assert found.length == pytest.approx(0.4) and found.height == pytest.approx(0.1)
+    assert found.gap == 0
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_derivative_where_two_parts_decide_the_step(robot, angles):
     exact, at = jax.jit(jax.grad(height))(jnp.array(angles)), np.array(angles)
     for k, step in enumerate(0.02 * np.eye(2)):
         apart = (float(height(at + step)) - float(height(at - step))) / 0.04
-        assert float(exact[k]) == pytest.approx(apart, rel=2e-3), k
+        assert exact[k] == pytest.approx(apart, rel=2e-3), k
 
 
 @pytest.mark.quick("-180.0")
@@ -203,9 +203,9 @@ def test_no_posture_stands_on_a_higher_step_than_the_best(robot, least):
         return static_limits.find_highest_step(resting_posture.side_outline(of, levers)).height
 
     heights = np.asarray(jax.jit(jax.vmap(at))(pairs))
-    assert heights.max() <= float(best.height) + 1e-8
+    assert heights.max() <= best.height + 1e-8
     assert heights.max() == pytest.approx(float(best.height), abs=1e-6)
-    assert np.median(heights) < float(best.height) - 0.02
+    assert np.median(heights) < best.height - 0.02
     if least == -30.0:
         assert front == rear == pytest.approx(-30.0)
     else:  # front levers level, rear ones upright but for a few degrees
@@ -220,18 +220,18 @@ def test_folded_levers_stand_as_none_stated(robot, name):
         balances.stance(robot, c, robot.configurations["6T2A"], mass)
         for c in (run(180.0, 180.0, payload=5.0), run(payload=5.0))
     )
-    assert float(getattr(folded, name)) == pytest.approx(float(getattr(plain, name)), abs=1e-12)
+    assert getattr(folded, name) == pytest.approx(float(getattr(plain, name)), abs=1e-12)
 
 
 @pytest.mark.slow
 def test_straight_travel_does_not_change_with_posture(robot):
     speeds = [steady.operating_state(robot, c)[0].speed for c in (run(), run(180.0, 180.0), run(-30.0, 40.0))]
-    assert float(speeds[0]) == float(speeds[1]) == float(speeds[2])
+    assert speeds[0] == speeds[1] == speeds[2]
 
 
 def test_outstretched_levers_turn_more_slowly(robot):
     """On a contact of 705 mm the lateral friction takes more of the traction."""
     stands = balances.stance(robot, run(FLUSH, FLUSH), robot.configurations["6T2A"], jnp.asarray(13.1))
-    assert float(stands.length) == pytest.approx(0.7055, abs=1e-4) and float(stands.on_tracks) == 1
+    assert stands.length == pytest.approx(0.7055, abs=1e-4) and stands.on_tracks == 1
     lifted = balances.stance(robot, run(-60.0, -60.0), robot.configurations["6T2A"], jnp.asarray(13.1))
-    assert float(lifted.on_tracks) == 0
+    assert lifted.on_tracks == 0

@@ -1,17 +1,15 @@
 """Levers stated of runs: `simulate` leaves their posture, and what cannot be is refused in a sentence."""
 
-import csv
-
 import numpy as np
 import pytest
 
 from calibration.data import contradictions
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from sweeps.inputs import one_run
 from sweeps.report import turn_words
-from tests.commands import ends, text_file
+from tests.commands import ends, refused, rows, text_file
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +42,7 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
 
 
 @pytest.mark.parametrize(
-    ("cells", "words"),
+    "cells, words",
     [
         (
             {"configuration": "4W2T", "levers_rear_deg": 10.0},
@@ -54,14 +52,14 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     ],
 )
 def test_levers_that_cannot_be_are_refused(robot, cells, words):
-    with pytest.raises(BadConfiguration, match=words):
+    with refused(words, BadConfiguration):
         one_run(robot, cells)
 
 
 def test_angle_beyond_the_range_of_a_robots_levers_is_refused(robot):
     narrow = params.replace(robot, {"running_gear.levers.angle_least": np.radians(-45.0)})
     words = r"--levers-rear: got -60; expected -45 to 180, the range of the robot's levers"
-    with pytest.raises(BadConfiguration, match=words):
+    with refused(words, BadConfiguration):
         one_run(narrow, {"levers_rear_deg": -60.0})
 
 
@@ -74,7 +72,7 @@ def test_a_table_states_levers_by_row(robot, tmp_path):
     conditions = runs.conditions(robot)
     assert conditions.levers_front_deg.tolist() == [30, 180] and conditions.levers_rear_deg.tolist() == [-8, 180]
     assert contradictions.misplaced_levers(runs, robot) is None
-    with pytest.raises(BadData, match=r"runs.csv row 2, levers_front_deg: 4W2T has no levers"):
+    with refused(r"runs.csv row 2, levers_front_deg: 4W2T has no levers"):
         records.read_runs(
             text_file(path, head + "6T2A,33,0,0,13.1,30,-8\n4W2T,24,0,5,11.5,180,180\n"), robot=robot, measured=False
         )
@@ -88,8 +86,7 @@ def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
         "steps up to 236 mm",
         code=0,
     )
-    with (folder / "posture.csv").open(newline="") as file:
-        (row,) = csv.DictReader(file)
+    (row,) = rows(folder / "posture.csv")
     assert float(row["highest_step_mm"]) == pytest.approx(236, abs=1)
     page = (folder / "report.html").read_text()
     assert 'id="posture-section"' in page and (folder / "figures/posture.svg").exists()

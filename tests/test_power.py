@@ -45,7 +45,7 @@ def test_battery_of_any_capacity_falls_as_the_papers_over_its_own(capacity):
     share = np.linspace(0.0, 1.0, 101)
     own, other = Battery(), Battery(capacity=capacity)
     assert_allclose(other.voltage_no_load(share * capacity), own.voltage_no_load(share * 7920.0), rtol=1e-12)
-    assert (np.diff(np.asarray(other.voltage_no_load(share * capacity))) < 0).all()
+    assert (np.diff(other.voltage_no_load(share * capacity)) < 0).all()
     assert not bool(other.rises(capacity)) and curve_remark(other) is None
 
 
@@ -58,21 +58,21 @@ def test_battery_whose_own_parabola_turns_up_is_remarked():
     )
 
 
-@pytest.mark.parametrize(("discharge", "empty"), [(0.0, False), (7919.9, False), (7920.0, True), (1e5, True)])
+@pytest.mark.parametrize("discharge, empty", [(0.0, False), (7919.9, False), (7920.0, True), (1e5, True)])
 def test_battery_is_empty_from_its_capacity(discharge, empty):
     assert bool(Battery().empty(discharge)) is empty
 
 
-@pytest.mark.parametrize(("mode", "on_battery"), [(1, 1.0), (2, 0.0)])
+@pytest.mark.parametrize("mode, on_battery", [(1, 1.0), (2, 0.0)])
 def test_voltage_source_selects_as_reference(mode, on_battery):
     battery = Battery()
     own = float(battery.voltage(2.0, 100.0))
-    assert float(voltage_source(battery, 24.0, on_battery, 2.0, 100.0)) == paper.source_voltage(mode, 24.0, own)
+    assert voltage_source(battery, 24.0, on_battery, 2.0, 100.0) == paper.source_voltage(mode, 24.0, own)
 
 
 def test_voltage_source_external_has_no_battery_gradient():
     gradient = jax.grad(lambda b: voltage_source(b, jnp.asarray(24.0), 0.0, 2.0, 100.0))(Battery())
-    assert all(float(g) == 0.0 for g in jax.tree.leaves(gradient))
+    assert all(g == 0.0 for g in jax.tree.leaves(gradient))
 
 
 def test_battery_energy_is_the_integral_of_its_voltage_over_the_charge():

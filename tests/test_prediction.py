@@ -1,6 +1,5 @@
 """Scores of data held out: against SciPy's densities, and the set of effects that is chosen by them."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,7 +75,7 @@ def test_gain_has_the_error_of_rows_or_blocks_whichever_is_larger():
 
 
 @pytest.mark.parametrize(
-    ("gains", "chosen"),
+    "gains, chosen",
     [
         ([0.5, 0.9, 1.0], 2),  # the third gains less than its error over the second
         ([0.02, 0.03, 0.04], 0),  # none gains more than its error over nothing
@@ -89,11 +88,11 @@ def test_smallest_set_within_one_error_of_the_best_is_chosen(monkeypatch, runs, 
     noise -= noise.mean(1, keepdims=True)
     candidates = [SimpleNamespace(effects=tuple("abc"[:k])) for k in range(4)]
     scores = {c.effects: score(noise[k] + ([0.0, *gains])[k], np.arange(12)) for k, c in enumerate(candidates)}
-    monkeypatch.setattr(prediction, "score_candidate", lambda space, runs, c: scores[c.effects])
+    monkeypatch.setattr(prediction, "cached_hold_out_score", lambda space, runs, c, predicted: scores[c.effects])
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
     )
-    found = smallest_predictive_set(space, runs, candidates[0], candidates[1:])
+    found = smallest_predictive_set(space, runs, candidates[0], candidates[1:], {})
     assert (found is None) if chosen == 0 else (found is candidates[chosen])
 
 
@@ -102,16 +101,15 @@ def test_what_candidates_predict_is_kept_and_not_fitted_again(monkeypatch, runs)
         SimpleNamespace(effects=tuple("abc"[:k]), active=tuple("abc"[:k]), z=np.full(2, k)) for k in range(2)
     ]
     shown = {c.effects: {kind: np.full((12, 2), len(c.effects)) for kind in ("slope", "voltage")} for c in candidates}
-    monkeypatch.setattr(
-        prediction,
-        "score_candidate",
-        lambda space, runs, c: dataclasses.replace(score(np.zeros(12), np.arange(12)), reading=shown[c.effects]),
-    )
-    space = SimpleNamespace(
-        bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
-    )
-    predicted = {}
-    smallest_predictive_set(space, runs, candidates[0], candidates[1:], predicted)
+    bare = SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=("slope", "voltage")))
+    space = SimpleNamespace(bare=bare, fit_of=lambda active, z: (bare, z, active))
+    predicted, times = {}, []
+    with monkeypatch.context() as patched:
+        patched.setattr(prediction, "score_predictions", lambda *_: score(np.zeros(12), np.arange(12)))
+        patched.setattr(prediction.FittedProblem, "held_out", lambda fit, kinds: times.append(1) or shown[fit.active])
+        for _ in range(2):
+            smallest_predictive_set(space, runs, candidates[0], candidates[1:], predicted)
+    assert len(times) == 2
     assert [predicted[prediction.candidate_key(c)] for c in candidates] == [shown[c.effects] for c in candidates]
     assert (
         prediction.candidate_key(SimpleNamespace(active=(), z=np.ones(2))) not in predicted
@@ -146,14 +144,14 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     space = SimpleNamespace(
         bare=SimpleNamespace(base=None, coordinates=NONE_FREE, observe=SimpleNamespace(blocks=()))
     )
-    assert smallest_predictive_set(space, runs, None, [None]) is None
+    assert smallest_predictive_set(space, runs, None, [None], {}) is None
     assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
         HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
     ) == Gain(0.0, np.inf)
 
 
 @pytest.mark.parametrize(
-    ("names", "tied", "dropped"),
+    "names, tied, dropped",
     [
         (("motor.resistance",), (), ()),
         (("motor.resistance", "a.loss_coulomb"), (), ("a",)),

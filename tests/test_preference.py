@@ -14,6 +14,7 @@ from calibration.discovery.result import WorseChannel
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
 from mmrjax.model import channels
+from tests.commands import refused
 
 NAMES = channels.USUAL
 
@@ -69,7 +70,7 @@ def alternative(name, rms, *, leads=False, rise=0.0, lost=0):
 
 
 @pytest.mark.parametrize(
-    ("rms", "lost", "first"),
+    "rms, lost, first",
     [((3.0, 2.0, 2.5), (0, 0, 0), 1), ((2.01, 2.0, 2.5), (0, 0, 0), 0), ((3.0, 2.0, 2.5), (0, 3, 0), 2)],
     ids=["smallest", "a draw goes to the fit", "predicts fewer"],
 )
@@ -79,9 +80,7 @@ def test_order_of_alternatives(rms, lost, first):
 
 
 def test_another_preference_lists_the_choices():
-    with pytest.raises(
-        BadConfiguration, match=r"--prefer: got heldout; did you mean held-out\? allowed: fit, held-out"
-    ):
+    with refused(r"--prefer: got heldout; did you mean held-out\? allowed: fit, held-out", BadConfiguration):
         settings_for(SettledRuns, prefer="heldout")
 
 

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 
 from calibration.data import presets_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.sources import reading
-from tests.commands import read_rig, text_file
+from tests.commands import read_rig, refused, text_file
 
 RIG = """
 base = "none"
@@ -55,9 +55,7 @@ def test_vesc_counts_electrical_turns_and_has_two_clocks(tmp_path):
     assert_allclose(found["duty"], [0.1, 0.2, 0.3])
     assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array(VESC["current_motor"]))
     assert any("erpm, read as motor_speed_rpm, is electrical" in note for note in found.notes)
-    with pytest.raises(
-        BadConfiguration, match=r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7"
-    ):
+    with refused(r"pole_pairs is missing, the pairs of poles .* --columns vesc,pole_pairs=7", BadConfiguration):
         records.read_runs(tmp_path / "log.csv", rig, columns="vesc")
 
 
@@ -80,7 +78,7 @@ def test_a_three_phase_motor_is_the_dc_motor_of_the_same_power_and_torque(tmp_pa
     assert any("equivalent DC motor" in note for note in found.notes)
 
 
-@pytest.mark.parametrize(("along_d", "noted"), [(0.1, False), (3.0, True)])
+@pytest.mark.parametrize("along_d, noted", [(0.1, False), (3.0, True)])
 def test_a_weakened_field_is_noted(tmp_path, along_d, noted):
     log = {**VESC, "d_axis_current": [along_d, -along_d, along_d]}
     rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
@@ -88,67 +86,67 @@ def test_a_weakened_field_is_noted(tmp_path, along_d, noted):
     assert any("field weakening" in note for note in notes) == noted
 
 
-def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
-    found = records.read_runs(
-        text_file(tmp_path / "log.txt", "2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n"),
-        robot(tmp_path, "motor_current", "motor_speed"),
-        columns="simplefoc",
-    )
-    assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array([0.15, 0.25]))
-    assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
-    assert_allclose(found["supply_voltage_V"], np.sqrt(3) * np.array([2, 3]))
+SYSID = [[0.02 * k, 0.5 * k, 0.1 * k, 1.0 * k] for k in range(4)]
+ENTRIES = [
+    {"position": 0.1 * k, "speed": 1.0 * k, "load": 102.3 * k, "input_volts": 15.0, "timestamp": 0.01 * k}
+    for k in range(4)
+]
+EPISODES = {
+    "observation.state": [[1.0 * k, 10.0 * k] for k in range(4)], "timestamp": [0.0, 0.1, 0.0, 0.1],
+    "episode_index": [0, 0, 1, 1], "supply_voltage_V": 12.0,
+}  # fmt: skip
+#: Preset → log, channels of the robot, and columns that are read. A log is a text, a frame that is written, or a table.
+LOGS = {
+    "simplefoc": (  # milliamperes, and no header
+        "2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n",
+        ("motor_current", "motor_speed"),
+        {"motor_current_A": np.sqrt(0.75) * np.array([0.15, 0.25]),
+         "motor_speed_rpm": np.array([10.0, 15.0]) * 30 / np.pi, "supply_voltage_V": np.sqrt(3) * np.array([2, 3])},
+    ),
+    "sysid": (  # a run for each test
+        json.dumps({"sysid": True, "slow-forward": SYSID, "fast-forward": SYSID}),
+        ("output_speed",),
+        {"run_id": ["slow-forward"] * 4 + ["fast-forward"] * 4, "output_speed_rpm": np.tile([0.0, 60, 120, 180], 2)},
+    ),
+    "bam,load_limit=1023": (  # entries with a duty
+        json.dumps({"mass": 0.5, "entries": ENTRIES}),
+        ("output_speed",),
+        {"duty": [0, 0.1, 0.2, 0.3], "output_speed_rpm": np.arange(4) * 30 / np.pi},
+    ),
+    "lerobot,joint=1": (  # a run for each episode
+        pd.DataFrame(EPISODES),
+        ("output_angle",),
+        {"run_id": ["0", "0", "1", "1"], "output_angle_deg": [0, 10, 20, 30]},
+    ),
+    "rcbenchmark": (  # an optical speed without readings gives way to the electrical one
+        {"Time (s)": [0.0, 0.1], "Voltage (V)": [16.0, 16.0], "Current (A)": [1.0, 2.0],
+         "Motor Electrical Speed (RPM)": [1000.0, 2000.0], "Motor Optical Speed (RPM)": [0, 0]},
+        ("motor_speed",),
+        {"motor_speed_rpm": [1000, 2000]},
+    ),
+}  # fmt: skip
 
 
-def test_sysid_has_a_run_for_each_test(tmp_path):
-    test = [[0.02 * k, 0.5 * k, 0.1 * k, 1.0 * k] for k in range(4)]
-    found = records.read_runs(
-        text_file(tmp_path / "log.json", json.dumps({"sysid": True, "slow-forward": test, "fast-forward": test})),
-        robot(tmp_path, "output_speed"),
-        columns="sysid",
-    )
-    assert dict.fromkeys(found["run_id"].tolist()).keys() == {"slow-forward", "fast-forward"}
-    assert_allclose(found["output_speed_rpm"], np.tile([0.0, 60, 120, 180], 2))
-
-
-def test_bam_has_entries_with_a_duty(tmp_path):
-    entries = [
-        {"position": 0.1 * k, "speed": 1.0 * k, "load": 102.3 * k, "input_volts": 15.0, "timestamp": 0.01 * k}
-        for k in range(4)
-    ]
-    found = records.read_runs(
-        text_file(tmp_path / "log.json", json.dumps({"mass": 0.5, "entries": entries})),
-        robot(tmp_path, "output_speed"),
-        columns="bam,load_limit=1023",
-    )
-    assert_allclose(found["duty"], [0, 0.1, 0.2, 0.3])
-    assert_allclose(found["output_speed_rpm"], np.arange(4) * 30 / np.pi)
-
-
-def test_lerobot_has_a_run_for_each_episode(tmp_path):
-    states = [[1.0 * k, 10.0 * k] for k in range(4)]
-    data = {"observation.state": states, "timestamp": [0.0, 0.1, 0.0, 0.1], "episode_index": [0, 0, 1, 1]}
-    pd.DataFrame({**data, "supply_voltage_V": 12.0}).to_parquet(tmp_path / "file-000.parquet")
-    found = records.read_runs(
-        tmp_path / "file-000.parquet", robot(tmp_path, "output_angle"), columns="lerobot,joint=1"
-    )
-    assert found["run_id"].tolist() == ["0", "0", "1", "1"]
-    assert_allclose(found["output_angle_deg"], [0, 10, 20, 30])
-
-
-def test_an_optical_speed_without_readings_gives_way_to_the_electrical(tmp_path):
-    columns = {
-        "Time (s)": [0.0, 0.1], "Voltage (V)": [16.0, 16.0], "Current (A)": [1.0, 2.0],
-        "Motor Electrical Speed (RPM)": [1000.0, 2000.0], "Motor Optical Speed (RPM)": [0, 0],
-    }  # fmt: skip
-    pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
-    found = records.read_runs(tmp_path / "log.csv", robot(tmp_path, "motor_speed"), columns="rcbenchmark")
-    assert_allclose(found["motor_speed_rpm"], [1000, 2000])
+@pytest.mark.parametrize("preset", LOGS)
+def test_a_log_of_a_preset_is_read(tmp_path, preset):
+    log, shown, expected = LOGS[preset]
+    if isinstance(log, str):
+        log = text_file(tmp_path / ("log.json" if log.startswith("{") else "log.txt"), log)
+    elif isinstance(log, pd.DataFrame):
+        log.to_parquet(tmp_path / "file-000.parquet")
+        log = tmp_path / "file-000.parquet"
+    found = records.read_runs(log, robot(tmp_path, *shown), columns=preset)
+    for column, values in expected.items():
+        if column == "run_id":
+            assert found[column].tolist() == values
+        else:
+            assert_allclose(found[column], values, atol=1e-12)
 
 
 def test_columns_of_ones_own_win_over_those_of_the_robots_file(tmp_path):
-    rig = robot(tmp_path, "motor_speed")
     mine = {"supply_voltage_V": "u", "motor_speed_rad_s": {"column": "w", "factor": -1.0}}
-    found = records.read_runs({"u": [1.0, -2.0], "w": [-3.0, 4.0], "speed": [1.0, 1.0]}, rig, columns=mine)
+    log = {"u": [1.0, -2.0], "w": [-3.0, 4.0], "speed": [1.0, 1.0]}
+    found = records.read_runs(log, robot(tmp_path, "motor_speed"), columns=mine)
     assert_allclose(found["motor_speed_rpm"], np.array([3.0, -4.0]) * 30 / np.pi)
 
 
@@ -169,7 +167,7 @@ def test_feetech_signs_are_bits(tmp_path):
         assert_allclose(found["output_angle_deg"], [180, 4095 * 360 / 4096, -180, -180])
 
 
-@pytest.mark.parametrize(("preset", "names", "bits", "limits"), [
+@pytest.mark.parametrize("preset, names, bits, limits", [
     ("damiao,v_max=30,t_max=10", ("p_int", "v_int", "t_int"), (16, 12, 12), (12.5, 30, 10)),
     ("robstride,speed_max=44,torque_max=17", ("angle_raw", "velocity_raw", "torque_raw"), (16, 16, 16), (4 * np.pi, 44, 17)),
 ])  # fmt: skip
@@ -199,7 +197,7 @@ def test_integers_are_decoded_before_they_are_interpolated(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["/arm/joint_states", "/dynamic_joint_states"])
-@pytest.mark.parametrize(("preset", "column"), [("ros2", "output_torque_Nm"), ("ros2_amperes", "motor_current_mA")])
+@pytest.mark.parametrize("preset, column", [("ros2", "output_torque_Nm"), ("ros2_amperes", "motor_current_mA")])
 def test_ros_2_effort_is_what_the_preset_assumes(tmp_path, topic, preset, column):
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -253,35 +251,28 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_a_preset_that_cannot_be_is_refused(case):
-    stated, says = WRONG[case]
-    with pytest.raises(BadConfiguration, match=says):
-        presets_file.find_preset(stated)
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_a_presets_file_that_cannot_be_is_refused(tmp_path, case):
-    text, says = FILES[case]
-    with pytest.raises(BadConfiguration, match=says):
-        presets_file.find_preset(text_file(tmp_path / "mine.toml", text))
+@pytest.mark.parametrize("case", WRONG | FILES)
+def test_a_preset_that_cannot_be_is_refused(tmp_path, case):
+    stated, says = (WRONG | FILES)[case]
+    with refused(says, BadConfiguration):
+        presets_file.find_preset(stated if case in WRONG else text_file(tmp_path / "mine.toml", stated))
 
 
 def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):
-    with pytest.raises(BadData, match=r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
+    with refused(r"has none of the columns of vesc \(ms_today, .*\), but a, b"):
         records.read_runs(
             {"a": [1.0, 2.0], "b": [1.0, 2.0]}, robot(tmp_path, "motor_speed"), columns="vesc,pole_pairs=7"
         )
 
 
-@pytest.mark.parametrize(("imposed", "refused"), [("voltage", True), ("motor_speed", False)])
+@pytest.mark.parametrize("imposed, refused", [("voltage", True), ("motor_speed", False)])
 def test_a_supply_without_its_duty_does_not_drive_the_motor(tmp_path, imposed, refused):
     text = "input_voltage,erpm,current_motor\n40,7000,3\n41,8000,4\n"
     (tmp_path / "log.csv").write_text(text)
     channels = ("motor_speed", "motor_current") if refused else ("motor_current",)
     rig = robot(tmp_path, *channels, imposed=imposed)
     if refused:
-        with pytest.raises(BadData, match=r"has no duty_cycle; --columns vesc needs it for duty"):
+        with refused(r"has no duty_cycle; --columns vesc needs it for duty"):
             records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")
     else:
         assert len(records.read_runs(tmp_path / "log.csv", rig, columns="vesc,pole_pairs=7")) == 2

@@ -14,7 +14,7 @@ from calibration.inference.fit_notes import Remark
 from calibration.inference.preparation import inherited_friction_remarks
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
-from tests.commands import read_rig
+from tests.commands import read_rig, refused
 
 EVERY = [
     p.name
@@ -108,7 +108,7 @@ def test_choose_takes_default_groups_and_fixes(robot):
 
 
 @pytest.mark.parametrize(
-    ("free", "fix", "says"),
+    "free, fix, says",
     [
         (["6T2A.mu"], [], r"--free 6T2A.mu: no such parameter; .*allowed: 6T2A\."),
         (
@@ -123,7 +123,7 @@ def test_choose_takes_default_groups_and_fixes(robot):
     ],
 )
 def test_choose_refuses_with_the_choices(robot, free, fix, says):
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         priors.choose_free_names(robot, priors.default_names(("6T2A", "4W2T"), robot), free, fix)
 
 
@@ -143,12 +143,12 @@ def test_parse_prior_reads_all_forms():
 
 @pytest.mark.parametrize("text", ["a", "a=1", "a=x±1", "a=1±x", "a=1±0", "a=1±-1", "a=1±nan"])
 def test_parse_prior_refuses(text):
-    with pytest.raises(BadConfiguration, match=r"--prior .*name=value±sd"):
+    with refused(r"--prior .*name=value±sd", BadConfiguration):
         priors.parse_prior(text)
 
 
 @pytest.mark.parametrize(
-    ("names", "stated", "says"),
+    "names, stated, says",
     [
         (["motor.resistance"], {"motor.resistanse": (1, 1)}, "no such parameter; did you mean motor.resistance"),
         (["motor.resistance"], {"motor.inertia": (1, 1)}, "is not free; add --free motor.inertia"),
@@ -156,13 +156,13 @@ def test_parse_prior_refuses(text):
     ],
 )
 def test_coordinates_refuse_stated_priors(robot, names, stated, says):
-    with pytest.raises(BadConfiguration, match=says):
+    with refused(says, BadConfiguration):
         priors.parameter_coordinates(robot, names, stated)
 
 
 def test_coordinates_refuse_a_prior_without_width():
 
-    with pytest.raises(BadConfiguration, match=r"motor.friction_viscous: its prior has no width"):
+    with refused(r"motor.friction_viscous: its prior has no width", BadConfiguration):
         priors.parameter_coordinates(paper_robots.sm1(), ["motor.friction_viscous"])
 
 

@@ -45,18 +45,23 @@ def untraceable(function):
     return fails
 
 
+def program(function, *args):
+    """The program of a function for arguments like these, as a function of them. None: it has none."""
+    found = programs.Programs(function).of((args, {}))
+    return found and (lambda *args: found((args, {})))
+
+
 def named(function, *args):
     return programs._program_name(function, jax.tree.map(programs._leaf_structure, (args, {})))
 
 
 def test_a_second_process_finds_a_program_without_tracing(folder, compilations):
-    first = programs.Programs(sine).of(((MATRIX,), {}))
-    answer = first(((MATRIX,), {}))
+    answer = program(sine, MATRIX)(MATRIX)
     assert_allclose(answer, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
     made = len(compilations)
-    again = programs.Programs(untraceable(sine)).of(((2 * MATRIX,), {}))  # as a new process, with other numbers
-    assert_allclose(again(((2 * MATRIX,), {})), np.sin(2 * MATRIX), rtol=1e-12, atol=1e-15)
-    assert_array_equal(again(((MATRIX,), {})), answer)
+    again = program(untraceable(sine), 2 * MATRIX)  # as a new process, with other numbers
+    assert_allclose(again(2 * MATRIX), np.sin(2 * MATRIX), rtol=1e-12, atol=1e-15)
+    assert_array_equal(again(MATRIX), answer)
     assert len(compilations) == made
 
 
@@ -70,7 +75,7 @@ def test_a_program_of_this_process_is_not_read_again(folder):
 
 def test_results_come_back_with_what_is_no_array(folder, robot):
     for function in (for_equations, untraceable(for_equations)):
-        found = programs.Programs(function).of(((robot,), {}))(((robot,), {}))
+        found = program(function, robot)(robot)
         assert found.configurations.names == robot.configurations.names and found.rig == robot.rig
         assert jax.tree.structure(found) == jax.tree.structure(robot)
         assert_array_equal(found.motor.resistance, robot.motor.resistance)
@@ -141,7 +146,7 @@ class Own(eqx.Module):
 
 @pytest.mark.parametrize("what", [Own(jnp.zeros(2)), jax.random.key(0), untraceable, lambda x: x], ids=type)
 def test_what_has_no_name_goes_the_usual_way(what, folder):
-    assert programs.Programs(for_equations).of(((what, MATRIX), {})) is None
+    assert program(for_equations, what, MATRIX) is None
     assert not list(folder.iterdir())
 
 
@@ -172,7 +177,7 @@ def test_programs_that_call_back_into_python_are_used_and_not_kept(folder):
         jax.debug.callback(seen.append, matrix[0, 0])
         return sine(matrix)
 
-    found = programs.Programs(watched).of(((MATRIX,), {}))(((MATRIX,), {}))
+    found = program(watched, MATRIX)(MATRIX)
     jax.effects_barrier()
     assert_allclose(found, np.sin(MATRIX), rtol=1e-12, atol=1e-15)
     assert seen == [4.0] and not list(folder.iterdir())
@@ -180,16 +185,15 @@ def test_programs_that_call_back_into_python_are_used_and_not_kept(folder):
 
 @pytest.mark.parametrize("ending", ["program", "executable"])
 def test_broken_files_are_made_again(folder, ending):
-    made = programs.Programs(sine).of(((MATRIX,), {}))(((MATRIX,), {}))
+    made = program(sine, MATRIX)(MATRIX)
     (broken,) = folder.glob(f"*.{ending}")
     broken.write_bytes(b"nonsense")
-    again = programs.Programs(sine).of(((MATRIX,), {}))(((MATRIX,), {}))
-    assert_array_equal(made, again)
+    assert_array_equal(made, program(sine, MATRIX)(MATRIX))
 
 
 def test_nothing_is_kept_unless_a_folder_is_stated(folder, monkeypatch):
     monkeypatch.setenv(programs.VARIABLE, "")
-    assert programs.Programs(sine).of(((MATRIX,), {})) is None
+    assert program(sine, MATRIX) is None
     monkeypatch.setenv(programs.VARIABLE, str(folder / "is not there"))
-    found = programs.Programs(sine).of(((MATRIX,), {}))  # cannot be written to: the program is used all the same
-    assert_allclose(found(((MATRIX,), {})), np.sin(MATRIX), rtol=1e-12, atol=1e-15)
+    found = program(sine, MATRIX)  # cannot be written to: the program is used all the same
+    assert_allclose(found(MATRIX), np.sin(MATRIX), rtol=1e-12, atol=1e-15)

@@ -4,7 +4,6 @@ import tomllib
 
 import numpy as np
 import pytest
-import samples
 from numpy.testing import assert_allclose
 
 from calibration.data import contents, robot_file, runs
@@ -162,8 +161,3 @@ def test_a_column_of_a_channel_that_the_robot_lacks_is_reported(tmp_path):
     table = {"supply_voltage_V": 9 + WAVE, "motor_speed_rpm": 900 + WAVE, "Torque [Nm]": 0.2 + 0.1 * WAVE}
     (note,) = (str(n) for n in runs.read_runs(table, robot).notes if "Torque [Nm]" in str(n))
     assert '"channels" does not list output_torque' in note and "load_torque_Nm if a brake" in note
-
-
-def test_contents_of_a_log_with_two_rates_say_so(tmp_path):
-    samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
-    assert "2 clocks" in contents.inspect_source(tmp_path / "log.h5").notes[0]

@@ -26,7 +26,7 @@ from mmrjax.fidelities import outputs
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.signals import Result
-from tests.commands import ROOT
+from tests.commands import ROOT, refused
 
 
 def python(code, **environment):
@@ -65,7 +65,7 @@ def test_a_sweep_is_its_grid_simulated(robot):
     alone = mm.simulate(robot, mm.Conditions("4W2T", voltage=24.0, payload=2.0, slope_deg=5.0))
     assert_allclose(found.total_current[3], alone.total_current, rtol=1e-12)
     assert mm.sweep(robot).shape == (180,)  # Table 8
-    with pytest.raises(BadConfiguration, match="6T2B; the robot has no such configuration; did you mean 6T2A"):
+    with refused("6T2B; the robot has no such configuration; did you mean 6T2A", BadConfiguration):
         mm.sweep(robot, configurations=["6T2B"])
     with pytest.raises(mm.UsageError, match=r"slope_deg\[1\]: got 95; expected -45 to 45"):
         mm.sweep(robot, configurations="6T2A", voltages=24.0, payloads=0.0, slopes_deg=[0, 95])
@@ -219,7 +219,7 @@ def test_drive_keeps_histories(robot):
     history = one.history
     assert history.time.shape == history.signals.speed.shape == history.reading["speed"].shape
     assert history.time.ndim == 1 and len(history.time) > 1000
-    assert float(history.time[-1]) == 1.0 and 0.5 < float(history.distance[-1]) < 0.75
+    assert history.time[-1] == 1.0 and 0.5 < history.distance[-1] < 0.75
     assert_allclose(history.reading["total_current"][-1], one.total_current, rtol=1e-12)
     assert mm.simulate(robot, mm.Conditions(voltage=24.0), model="drive", duration=1.0, history=False).history is None
 
@@ -285,7 +285,7 @@ def test_vmap_and_jit_go_through(robot):
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize(("model", "transform"), [("steady", jax.grad), ("drive", lambda f: f)])
+@pytest.mark.parametrize("model, transform", [("steady", jax.grad), ("drive", lambda f: f)])
 def test_a_turn_passes_jit_though_its_default_duty_is_a_tracer_there(robot, model, transform):
     """Traced, not compiled."""
     options = {} if model == "steady" else dict(model="drive", duration=0.1, history=False)
@@ -319,10 +319,6 @@ def test_every_packaged_robot_is_within_its_bounds(robot):
     mm.simulate(dataclasses.replace(robot, effects=tuple(effect() for effect in ALL)), mm.Conditions())
 
 
-def with_value(name, value):
-    return lambda robot: params.replace(robot, {name: value})
-
-
 WRONG = {
     "slope_deg: got 95; expected -45 to 45 deg": dict(slope_deg=95),
     "slope_deg[1]: got -50; expected -45 to 45 deg": dict(slope_deg=[0.0, -50.0]),
@@ -343,15 +339,11 @@ WRONG = {
     "configuration: got 2; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=2),
     "configuration[1]: got -1; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=[0, -1]),
 }
-WRONG_ROBOT = {
-    "motor.resistance: got -1; expected 0.001 to 1000 ohm (terminal resistance R_rot, eq. (15))": with_value(
-        "motor.resistance", -1.0
-    ),
-    "motor.resistance: got nan; expected 0.001 to 1000 ohm (terminal resistance R_rot, eq. (15))": with_value(
-        "motor.resistance", jnp.nan
-    ),
-    "4W2T.mass: got 0; expected 0.01 to 10000 kg (mass of the robot without payload)": with_value("4W2T.mass", 0.0),
-    "robot: got function; expected a Robot such as mmrjax.nominal()": lambda robot: mm.nominal,
+#: Value of a parameter → what is said.
+WRONG_VALUE = {
+    ("motor.resistance", -1.0): "got -1; expected 0.001 to 1000 ohm (terminal resistance R_rot, eq. (15))",
+    ("motor.resistance", np.nan): "got nan; expected 0.001 to 1000 ohm (terminal resistance R_rot, eq. (15))",
+    ("4W2T.mass", 0.0): "got 0; expected 0.01 to 10000 kg (mass of the robot without payload)",
 }
 WRONG_CALL = {
     "model: got fast; allowed: steady, drive, track": dict(model="fast"),
@@ -361,35 +353,27 @@ WRONG_CALL = {
     "model track, duration: got 0.0015 s; expected a whole number of samples of 0.001 s": dict(
         model="track", duration=0.0015
     ),
+    "history: got 1001 runs; expected at most 1000; set history=False": dict(
+        conditions=mm.Conditions(voltage=np.full(1001, 24.0)), model="drive"
+    ),
+    "conditions: got dict; expected mmrjax.Conditions(...)": dict(conditions={"voltage": 3.0}),
+    "robot: got function; expected a Robot such as mmrjax.nominal()": dict(robot=mm.nominal),
 }
-
-
-def refused(robot, conditions, **call):
-    with pytest.raises(mm.UsageError) as error:
-        mm.simulate(robot, conditions, **call)
-    assert isinstance(error.value, ValueError)
-    return str(error.value)
-
-
-@pytest.mark.parametrize("message", WRONG)
-def test_wrong_conditions_are_said(message, robot):
-    assert refused(robot, mm.Conditions(**WRONG[message])) == message
-
-
-@pytest.mark.parametrize("message", WRONG_ROBOT)
-def test_wrong_robots_are_said(message, robot):
-    assert refused(WRONG_ROBOT[message](robot), mm.Conditions()) == message
+WRONG_CALL |= {message: dict(conditions=mm.Conditions(**given)) for message, given in WRONG.items()}
+WRONG_CALL |= {
+    f"{name}: {said}": dict(robot=params.replace(paper_robots.nominal(), {name: value}))
+    for (name, value), said in WRONG_VALUE.items()
+}
 
 
 @pytest.mark.parametrize("message", WRONG_CALL)
 def test_wrong_calls_are_said(message, robot):
-    assert refused(robot, mm.Conditions(), **WRONG_CALL[message]) == message
+    with pytest.raises(mm.UsageError) as error:
+        mm.simulate(**{"robot": robot, "conditions": mm.Conditions()} | WRONG_CALL[message])
+    assert isinstance(error.value, ValueError) and str(error.value) == message
 
 
-def test_other_wrong_use_is_said(robot):
-    assert refused(robot, {"voltage": 3.0}) == "conditions: got dict; expected mmrjax.Conditions(...)"
-    said = refused(robot, mm.Conditions(voltage=np.full(1001, 24.0)), model="drive")
-    assert said == "history: got 1001 runs; expected at most 1000; set history=False"
+def test_shapes_that_do_not_broadcast_are_refused():
     with pytest.raises(ValueError, match="shapes do not broadcast"):
         mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
 

@@ -4,7 +4,6 @@ A result that is corrected on purpose is changed there too, with a line in CHANG
 renews what the loop gives (all of its tables, or those that are named), and nothing else.
 """
 
-import csv
 import json
 import sys
 from pathlib import Path
@@ -19,7 +18,7 @@ from calibration.inference import priors
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
-from tests.commands import read_json
+from tests.commands import columns_of, read_json
 
 RECORD = Path(__file__).parent / "record"
 RESULTS = read_json(RECORD / "results.json")
@@ -28,16 +27,9 @@ EQUAL = {"steady": 1e-9, "drive": 1e-9, "track": 1e-6}
 NUMBERS = ("total_current", "motor_speed", "speed", "slip", "traction", "power_gear")
 
 
-def _table8():
-    with (RECORD / "table8.csv").open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    words = {"configuration": np.array([r["configuration"] for r in rows])}
-    return words | {k: np.array([float(r[k] or "nan") for r in rows]) for k in rows[0] if k != "configuration"}
-
-
 @pytest.mark.parametrize("name", ["steady", *(pytest.param(n, marks=pytest.mark.slow) for n in ("drive", "track"))])
 def test_table8_is_as_recorded(name):
-    was, robot = _table8(), nominal()
+    was, robot = columns_of(RECORD / "table8.csv"), nominal()
     conditions = Conditions(
         was["configuration"], was["supply_voltage_V"], was["slope_deg"], was["payload_kg"]
     ).resolved(robot)

@@ -60,7 +60,7 @@ def table(step, late):
 
 
 @pytest.mark.parametrize(
-    ("step", "late", "settled"), [(3.0, 0, True), (0.01, 0, False), (3.0, 1, False), (0.6, 0, True), (0.4, 0, False)]
+    "step, late, settled", [(3.0, 0, True), (0.01, 0, False), (3.0, 1, False), (0.6, 0, True), (0.4, 0, False)]
 )
 def test_settled_points_that_have_a_time_are_settled_runs(step, late, settled, tmp_path):
     """Case t5-17: nine points three seconds apart were a log that starts at rest, and too short for one."""

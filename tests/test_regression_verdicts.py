@@ -20,6 +20,7 @@ from calibration.discovery import (
     standing,
     verdict,
 )
+from calibration.discovery.projection import Projection
 from calibration.discovery.settings import settings_for
 from calibration.inference import weak_form
 from calibration.inference.bases import family_names
@@ -38,11 +39,37 @@ SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
 SETTINGS = settings_for(Histories, 333)
 
 
+def motor_log(volts, loss, rng, sd=SD, late=0, resistance=0.9, saturates=0.0, scale=1.0):
+    """U = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M of four runs, with noise. `loss`: M of a row and ω."""
+    rows = volts.shape[1]
+    acts = np.concatenate([np.zeros((4, late)), volts], 1)
+    current, speed, shown = np.zeros(4), np.zeros(4), []
+    for n in range(rows):
+        shown.append((current, speed))
+        for _ in range(round(EVERY / STEP)):
+            settled = (acts[:, n] - 0.042 * speed) / resistance
+            # exact for the winding, whose time constant is two steps long
+            current = settled + (current - settled) * np.exp(-STEP * resistance / 4e-4)
+            torque = 0.042 * current * (1 - saturates * np.abs(current)) - loss(n, speed)
+            speed = speed + STEP * torque / 2.4e-4
+    current, speed = (np.array(x).T for x in zip(*shown, strict=True))
+    return {
+        "run_id": np.repeat(["a", "b", "c", "d"], rows),
+        "configuration": np.repeat(["bench"], 4 * rows),
+        "time_s": np.tile(np.arange(rows) * EVERY, 4),
+        "supply_voltage_V": volts.ravel(),
+        "motor_speed_rpm": (scale * speed + sd[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
+        "motor_current_A": (current + sd[1] * rng.standard_normal(current.shape)).ravel(),
+        "slope_deg": np.zeros(4 * rows),
+        "payload_kg": np.zeros(4 * rows),
+    }
+
+
 def log(
     seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0, rough=0.0, swings=False, slow=0.0,
     cold=0.0,
 ):  # fmt: skip
-    """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
+    """A log of four runs under stairs of voltage. `sag`: of the supply [ohm].
 
     Args:
         late: rows by which the voltage acts later than its column says.
@@ -58,32 +85,14 @@ def log(
     if swings:
         volts = 13 * np.sin(np.arange(ROWS) * EVERY * np.array([[7.0], [9.0], [11.0], [5.0]])) + 4
     unknown = np.repeat(slow * np.random.default_rng(seed + 99).standard_normal((4, 5)), ROWS // 5, axis=1)
-    acts = np.concatenate([np.zeros((4, late)), volts], 1)[:, :ROWS]
-    current, speed, shown = np.zeros(4), np.zeros(4), []
-    for n in range(ROWS):
-        shown.append((current, speed))
-        for _ in range(round(EVERY / STEP)):
-            settled = (acts[:, n] - 0.042 * speed) / (0.9 + sag)  # exact for the winding, of time constant 2 steps
-            current = settled + (current - settled) * np.exp(-STEP * (0.9 + sag) / 4e-4)
-            dry = (
-                0.02
-                * (1 + rough * (np.arange(4) == 2) + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60))
-                * (1 + cold * np.exp(-n * EVERY / 0.5))
-                * np.tanh(speed / 0.05)
-            )
-            torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed + unknown[:, n]
-            speed = speed + STEP * torque / 2.4e-4
-    current, speed = (np.array(x).T for x in zip(*shown, strict=True))
-    return {
-        "run_id": np.repeat(["a", "b", "c", "d"], ROWS),
-        "configuration": np.repeat(["bench"], 4 * ROWS),
-        "time_s": np.tile(np.arange(ROWS) * EVERY, 4),
-        "supply_voltage_V": volts.ravel(),
-        "motor_speed_rpm": (scale * speed + SD[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
-        "motor_current_A": (current + SD[1] * rng.standard_normal(current.shape)).ravel(),
-        "slope_deg": np.zeros(4 * ROWS),
-        "payload_kg": np.zeros(4 * ROWS),
-    }
+
+    def loss(n, speed):
+        dry = 1 + rough * (np.arange(4) == 2) + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60)
+        return (
+            0.02 * dry * (1 + cold * np.exp(-n * EVERY / 0.5)) * np.tanh(speed / 0.05) + 3e-5 * speed - unknown[:, n]
+        )
+
+    return motor_log(volts, loss, rng, late=late, resistance=0.9 + sag, saturates=saturates, scale=scale)
 
 
 @pytest.fixture(scope="module")
@@ -189,9 +198,9 @@ def test_a_constant_that_differs_in_one_run_explains_more_than_an_effect_that_im
     space = dataclasses.replace(
         space, bare=posed, equipped=dataclasses.replace(space.equipped, observe=posed.observe)
     )
-    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    run, changed, root = standing.changed_run(space, linear, (), jacobian, residual)
-    effects = standing._largest_root(jacobian, residual, np.asarray(linear.signatures))
+    fit = Projection.of(linear)
+    run, changed, root = standing.changed_run(space, linear, (), fit)
+    effects = fit.roots(np.asarray(linear.signatures)).max()
     if "rough" in fault:
         assert (run, changed) == (3, "motor.friction_coulomb") and root > 1.2 * effects
     else:
@@ -212,7 +221,7 @@ def test_an_error_of_a_balance_everywhere_changes_windows_as_its_effect(answered
 def test_a_torque_that_changes_slowly_does_not_look_like_an_effect(answered):
     """As white noise of its windows, it gave an effect 3.0 sds."""
     posed = answered.windows_of(seed=5, slow=0.01)[2]
-    scores = np.abs(np.asarray(score_tests.score_tests(posed.observe.linear, ()).single))
+    scores = np.abs(score_tests.score_tests(posed.observe.linear, ()).single)
     assert 0 < scores.max() < 2.0
 
 

@@ -1,7 +1,5 @@
 """Noise as repeats in a table show it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -14,6 +12,7 @@ from calibration.inference import noise
 from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers import SettledRuns
 from calibration.inference.preparation import prepare_input
+from tests.commands import with_columns
 
 
 def table(sd, times=4, seed=0):
@@ -53,7 +52,7 @@ def test_one_wrong_reading_does_not_enlarge_the_noise():
     runs = table(0.02)
     current = runs["total_current_A"].copy()
     current[5] += 2.0
-    wrong = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
+    wrong = with_columns(runs, total_current_A=current)
     assert enlarged(wrong, "current=0.02A,motor_speed=0.5%")[2] == []
     assert enlarged(table(0.2, times=1), "current=0.02A,motor_speed=0.5%")[2] == []
 
@@ -75,7 +74,7 @@ def test_every_command_takes_the_larger_noise():
 
 
 @pytest.mark.parametrize(
-    ("levels", "here", "beside"),
+    "levels, here, beside",
     [
         ([-0.40216, -0.40214, -0.2, 0.3], -0.40216, (-0.5, -0.3)),  # the same level as measured is no neighbour
         ([12.0, 18.0, 24.0], 18.0, (15.0, 21.0)),

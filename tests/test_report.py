@@ -106,20 +106,16 @@ def test_extremes_are_those_of_the_settled_runs(small):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "shape",
+    "grid",
     [
-        "line over slope",
-        *(pytest.param(s, marks=pytest.mark.slow) for s in ("line over voltage", "large grid")),
+        ("4W2T", 24.0, 2.0, np.linspace(-10, 25, 8)),
+        ("6T2A", np.linspace(2.0, 36.0, 6), 0.0, 3.0),
+        (("6T2A", "4W2T"), np.linspace(10, 36, 5), np.linspace(0, 20, 40), np.linspace(0, 20, 50)),
     ],
+    ids=["line over slope", "line over voltage", "large grid"],
 )
-def test_other_grids_are_drawn(shape, tmp_path):
-    runs = {
-        "line over slope": lambda: _runs("4W2T", 24.0, 2.0, np.linspace(-10, 25, 8)),
-        "line over voltage": lambda: _runs("6T2A", np.linspace(2.0, 36.0, 6), 0.0, 3.0),
-        "large grid": lambda: _runs(
-            ("6T2A", "4W2T"), np.linspace(10, 36, 5), np.linspace(0, 20, 40), np.linspace(0, 20, 50)
-        ),
-    }[shape]()
+def test_other_grids_are_drawn(grid, tmp_path):
+    runs = _runs(*grid)
     path, page = _write(tmp_path, runs)
     assert drawn(page) == SWEEP_FIGURES
     assert f"<h1>Sweep of {len(runs['status']):,} runs</h1>" in page
@@ -171,7 +167,7 @@ def test_operating_points_lie_on_the_chart_of_motor_and_gear(robot):
     lost = 33.0 * curves["motor_A"] - curves["torque_Nm"] * curves["motor_rpm"] * np.pi / 30 / float(
         robot.gearbox.ratio
     )
-    assert (lost > 0).all() and curves["efficiency_percent"].max() < 100 * float(robot.gearbox.efficiency_load)
+    assert (lost > 0).all() and curves["efficiency_percent"].max() < 100 * robot.gearbox.efficiency_load
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 """The paper remade by `mmrjax reproduce`: complete, offline, true to the paper's tables and to the model's numbers."""
 
 import dataclasses
-import sys
 
 import jax
 
@@ -10,13 +9,13 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np
 import pytest
+from commands import command
 from numpy.testing import assert_allclose
 from pages import Tables, drawn, outside
 
 from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
-from sweeps import cli
 from sweeps.paper import data
 
 FIGURES = {
@@ -34,15 +33,11 @@ FIGURES = {
 def reproduced(tmp_path_factory):
     """A function that runs the command and returns its exit code and folder."""
 
-    def command(*arguments):
+    def of(*arguments):
         folder = tmp_path_factory.mktemp("reproduced") / "p"
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", ["mmrjax", "reproduce", "--out", str(folder), *map(str, arguments)])
-            with pytest.raises(SystemExit) as end:
-                cli.main()
-        return end.value.code, folder
+        return command(["reproduce", "--out", folder, *arguments]), folder
 
-    return command
+    return of
 
 
 @pytest.fixture(scope="module")

@@ -89,7 +89,7 @@ def by_wheel(size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
+@pytest.mark.parametrize("channel", [CURRENT, MOTOR, SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
     hits = [find_residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(20)]

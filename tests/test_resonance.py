@@ -52,9 +52,7 @@ def test_peak_at_a_crossing_names_mode_and_order():
     assert [(c.order, c.signals) for c in met] == [(3, ("reaction",))]
 
 
-@pytest.mark.parametrize(
-    ("natural", "modes"), [(104.0, [BOUNCE]), (90.0, []), (90.0, [BOUNCE._replace(damping=0.6)])]
-)
+@pytest.mark.parametrize("natural, modes", [(104.0, [BOUNCE]), (90.0, []), (90.0, [BOUNCE._replace(damping=0.6)])])
 def test_peak_away_from_a_mode_names_none(natural, modes):
     ripple, line = response(natural)
     (peak,) = peaks_over_speed("reaction", 3.0, SPEED, SPEED / TRAVEL, ripple, line, modes)
@@ -74,7 +72,7 @@ def test_ripple_too_small_to_notice_has_no_peaks():
     assert peaks_over_speed("speed", 0.0, SPEED[:2], SPEED[:2], ripple[:2], line[:2], [BOUNCE]) == []
 
 
-@pytest.mark.parametrize(("lines", "mode"), [((95.0, 80.0), "bounce"), ((80.0, 95.0), "")])
+@pytest.mark.parametrize("lines, mode", [((95.0, 80.0), "bounce"), ((80.0, 95.0), "")])
 def test_peaks_that_move_against_a_mode_are_not_confirmed_by_it(lines, mode):
     natural = {0.0: [BOUNCE._replace(frequency=94.0)], 8.0: [BOUNCE._replace(frequency=81.0)]}
     found = [

@@ -42,7 +42,7 @@ def draw(count, seed):
 
 def of_kind(values, runs, name):
     """A parameter of the configuration of each run."""
-    return np.where(np.asarray(runs.configuration) == 1, values[f"4W2T.{name}"], values[f"6T2A.{name}"])
+    return np.where(runs.configuration == 1, values[f"4W2T.{name}"], values[f"6T2A.{name}"])
 
 
 def asked(values, runs):
@@ -109,7 +109,7 @@ def test_a_robot_that_stands_is_in_static_equilibrium(robot):
     voltage, slope, payload = np.array(STANDING).T
     runs = Conditions(np.zeros(len(voltage), int), voltage, slope, payload)
     found = steady_batch(robot, runs)
-    assert (np.asarray(found.status) == STALLED).all()
+    assert (found.status == STALLED).all()
     normal, pull = ((13.1 + payload) / 2 * paper.G * f(np.radians(slope)) for f in (np.cos, np.sin))
     radius = 48 * 5e-3 / (2 * np.pi)
     belt, current = 0.35 + 0.2 * 0.3 * radius * normal, voltage / 0.611

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import bases, observers
 from sweeps.commands import rig_check
-from tests.commands import read_rig, text_file
+from tests.commands import read_rig, refused, text_file
 
 BRAKE = """
 base = "none"
@@ -68,13 +68,12 @@ FILES = {
 @pytest.mark.parametrize("case", FILES)
 def test_a_mistake_in_a_rigs_file_is_one_sentence(tmp_path, case):
     text, message = FILES[case]
-    with pytest.raises(BadConfiguration, match=message) as refused:
+    with refused(message, BadConfiguration):
         rig_of(tmp_path, text)
-    assert "\n" not in str(refused.value)
 
 
 def test_a_folder_is_no_rigs_file(tmp_path):
-    with pytest.raises(BadConfiguration, match=r"is a folder; expected a rig's TOML file$"):
+    with refused(r"is a folder; expected a rig's TOML file$", BadConfiguration):
         rig_check.check_rig_file(tmp_path, None, (), False)
 
 
@@ -82,7 +81,7 @@ def test_a_folder_is_no_rigs_file(tmp_path):
 def test_a_current_against_the_imposed_speed_is_refused_forward_too(tmp_path, rows):
     robot = rig_of(tmp_path, BRAKE)
     message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; nothing else drives the motors, so the reading should have its sign"
-    with pytest.raises(BadData, match=message):
+    with refused(message):
         records.read_runs(table(tmp_path, *rows), robot=robot)
 
 

@@ -2,7 +2,6 @@
 
 import re
 
-import jax
 import numpy as np
 import pytest
 
@@ -10,12 +9,12 @@ from calibration.data import robot_file
 from calibration.data.columns import Layout
 from calibration.data.runs import Runs
 from calibration.inference.simulation_errors import relative_error, sized_error
-from mmrjax import fidelities
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params, quantities
 from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.report import fit_tables
-from tests.commands import ends, read_json
+from tests.commands import csv_text, ends, read_json, text_file
 from tests.commands import rows as rows_of
 
 #: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
@@ -58,30 +57,21 @@ def of_kind(tmp_path, kind, speed=False):
     return path
 
 
-def table_of(rig, changed, levels, slopes=None, sd=0.01, seed=5):
+def table_of(rig, changed, levels, slopes=None):
     """A table of settled runs of a rig with changed parameters, beside its file. Every reading with its sd."""
-    robot = robot_file.read_robot(rig)
-    layout = Layout.of(robot)
-    levels = np.asarray(levels, float)
-    columns = {"configuration": np.full(len(levels), robot.configurations.names[0]), layout.imposed_column: levels}
+    robot, drawn = robot_file.read_robot(rig), np.random.default_rng(5)
+    layout, columns = Layout.of(robot), {}
+    columns[layout.imposed_column] = np.asarray(levels, float)
     if slopes is not None:
         columns |= {"slope_deg": np.asarray(slopes, float), "payload_kg": np.zeros(len(levels))}
     robot = params.replace(robot, {name: np.asarray(value, float) for name, value in changed.items()})
-    conditions = Runs("a table", columns, layout=layout).conditions(robot)
-    result = jax.device_get(fidelities.get_fidelity("steady").run(robot, conditions, {}, lambda share: None).result)
-    drawn = np.random.default_rng(seed)
-    written = {key: value for key, value in columns.items() if key != "configuration"}
+    of_load = {"configuration": np.full(len(levels), robot.configurations.names[0])}
+    reading = steady_batch(robot, Runs("a table", of_load | columns, layout=layout).conditions(robot)).reading
     for c in robot.channels:
-        reading = np.asarray(result.reading[c.name]) / c.factor
-        size = sd * np.abs(reading).mean()
-        written |= {
-            c.column: reading + size * drawn.normal(size=len(levels)),
-            c.sd_column: np.full(len(levels), size),
-        }
-    path = rig.with_suffix(".csv")
-    lines = [",".join(written), *(",".join(f"{v[k]:.8g}" for v in written.values()) for k in range(len(levels)))]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+        shown = np.asarray(reading[c.name]) / c.factor
+        size = np.full(len(levels), 0.01 * np.abs(shown).mean())
+        columns |= {c.column: shown + size * drawn.normal(size=len(levels)), c.sd_column: size}
+    return text_file(rig.with_suffix(".csv"), csv_text(columns))
 
 
 BOTH_WAYS = [800, 1600, 2400, 3200, 4000, 4800, -800, -1600, -2400, -3200, -4000, -4800]
@@ -104,6 +94,18 @@ def rover(tmp_path):
     return rig, table_of(rig, {"rover.ground.rolling_resistance": 0.03}, speeds, slopes)
 
 
+@pytest.fixture
+def ran(mmrjax, tmp_path):
+    """What a command prints, and the folder that it leaves. No word of another robot is in either."""
+
+    def command(*words):
+        _, out, err = ends(mmrjax(*words, "--out", "run"), code=0)
+        assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+        return out, tmp_path / "run"
+
+    return command
+
+
 # --- simulate -----------------------------------------------------------------------------------------------------
 
 SIMULATED = {
@@ -115,53 +117,37 @@ SIMULATED = {
 }
 
 
-@pytest.mark.quick(1)
-@pytest.mark.parametrize("case", [
-    k if k in ("bench, speed", "wheeled") else pytest.param(k, marks=pytest.mark.slow) for k in SIMULATED
-])  # fmt: skip
-def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_path, case):
+@pytest.mark.quick("bench, speed")
+@pytest.mark.parametrize("case", SIMULATED)
+def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(ran, tmp_path, case):
     kind, speed, options, columns = SIMULATED[case]
-    _, out, err = ends(mmrjax("simulate --robot", of_kind(tmp_path, kind, speed), *options, "--out", "run"), code=0)
-    (row,) = rows_of(tmp_path / "run/runs.csv")
+    _, folder = ran("simulate --robot", of_kind(tmp_path, kind, speed), *options)
+    (row,) = rows_of(folder / "runs.csv")
     assert columns <= set(row) and row["status"] in ("converged", "reverses")
     on_ground = {"slip", "adhesion_used", "slope_deg", "total_mass_kg", "power_ground_W"}
     assert on_ground <= set(row) if kind in ("wheeled", "tracked") else on_ground.isdisjoint(row)
     assert "winding_settled_C" not in row  # nobody has stated how heat leaves the windings
-    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["bench", *(pytest.param(k, marks=pytest.mark.slow) for k in ("pendulum", "wheeled"))]
-)
-def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind):
+@pytest.mark.parametrize("kind", ["bench", "pendulum", "wheeled"])
+def test_simulate_over_time_draws_the_channels_of_the_rig(ran, tmp_path, kind):
     rig = of_kind(tmp_path, kind)
-    _, out, err = ends(
-        mmrjax("simulate --robot", rig, "--voltage", "3", "--model", "drive", "--duration", "0.5", "--out", "run"),
-        code=0,
-    )  # an arm still moves
-    history = rows_of(tmp_path / "run/history.csv")
+    _, folder = ran("simulate --voltage 3 --model drive --duration 0.5 --robot", rig)  # an arm still moves
+    history = rows_of(folder / "history.csv")
     shafts = {"motor_speed_rpm", "output_angle_deg"}
     assert (shafts <= set(history[0])) == (kind != "wheeled") and len(history) > 100
-    assert (tmp_path / "run/figures" / ("history.svg" if kind == "wheeled" else "courses.svg")).is_file()
-    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+    assert (folder / "figures" / ("history.svg" if kind == "wheeled" else "courses.svg")).is_file()
 
 
 @pytest.mark.slow
-def test_a_profile_turns_a_bench(mmrjax, tmp_path):
+def test_a_profile_turns_a_bench(ran, tmp_path):
     (tmp_path / "turn.csv").write_text("time_s,motor_speed_rpm,supply_voltage_V\n0,0,24\n1,2000,24\n2,2000,24\n")
-    _, out, err = ends(
-        mmrjax("simulate --robot", of_kind(tmp_path, "bench"), "--profile", "turn.csv", "--out", "run"), code=0
-    )
-    course = rows_of(tmp_path / "run/history.csv")
-    assert (
-        "demanded_motor_speed_rpm" in course[0]
-        and "slope_deg" not in course[0]
-        and "winding_temperature_C" not in course[0]
-    )
+    out, folder = ran("simulate --profile turn.csv --robot", of_kind(tmp_path, "bench"))
+    (first, *_) = rows_of(folder / "history.csv")
+    assert "demanded_motor_speed_rpm" in first and not {"slope_deg", "winding_temperature_C"} & set(first)
     # Energy of the windings is known, their temperature is not; a shaft has neither tracks nor a distance.
     assert not re.search(r"\d m\b|distance|°C|track", out) and "friction of the load" in out
-    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
 # --- what is imposed where nothing is stated -----------------------------------------------------------------------
@@ -186,24 +172,15 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_path):
+def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(ran, tmp_path):
     rig = of_kind(tmp_path, "wheeled", speed=True)
-    _, out, err = ends(
-        mmrjax("sweep --robot", rig, "--motor-speeds", "1000,-1000", "--slopes", "0,5", "--out", "run"), code=0
-    )
-    table = rows_of(tmp_path / "run/runs.csv")
-    assert len(table) == 4 and {row["payload_kg"] for row in table} == {"0"}
-    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+    _, folder = ran("sweep --motor-speeds 1000,-1000 --slopes 0,5 --robot", rig)
+    assert [row["payload_kg"] for row in rows_of(folder / "runs.csv")] == ["0"] * 4
 
 
 @pytest.mark.slow
-def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
-    rig = of_kind(tmp_path, "bench", speed=True)
-    _, out, _ = ends(
-        mmrjax("sweep --robot", rig, "--motor-speeds", "600,1200", "--zarr", "--export", "csv", "--out", "run"),
-        code=0,
-    )
-    assert words_of_others(out, *left_in(tmp_path / "run")) == []
+def test_a_sweep_into_a_store_knows_what_is_imposed(ran, tmp_path):
+    ran("sweep --motor-speeds 600,1200 --zarr --export csv --robot", of_kind(tmp_path, "bench", speed=True))
 
 
 # --- measured tables ----------------------------------------------------------------------------------------------
@@ -305,12 +282,10 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
 
 
 @pytest.mark.slow
-def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
+def test_compare_shows_a_vehicles_conditions(ran, rover):
     rig, data = rover
-    _, out, err = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
-    shown = (tmp_path / "compared/figures/errors.svg").read_text()
+    shown = (ran("compare", data, "--robot", rig)[1] / "figures/errors.svg").read_text()
     assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
-    assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
 
 
 # --- sensitivity --------------------------------------------------------------------------------------------------
@@ -318,13 +293,12 @@ def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bench", "wheeled"])
-def test_sensitivity_takes_what_a_rig_has(mmrjax, tmp_path, kind):
+def test_sensitivity_takes_what_a_rig_has(ran, tmp_path, kind):
     rig = of_kind(tmp_path, kind, speed=kind == "bench")
-    where = ["--motor-speeds", "1000,3000"] if kind == "bench" else ["--voltages", "12,24", "--slopes", "0,5"]
-    _, out, err = ends(mmrjax("sensitivity --method local --robot", rig, *where, "--out", "run"), code=0)
-    assert "next runs, of" in out and "the operating points" in out
+    where = "--motor-speeds 1000,3000" if kind == "bench" else "--voltages 12,24 --slopes 0,5"
+    out, _ = ran(f"sensitivity --method local {where} --robot", rig)
+    assert "operating points" in out
     assert ("steepest slope" in out) == (kind == "wheeled")
-    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
 # --- the pieces ---------------------------------------------------------------------------------------------------

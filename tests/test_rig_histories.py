@@ -1,7 +1,6 @@
 """Histories of rigs: an imposed speed with a delay, and beginnings that are measured or free, given back."""
 
 import contextlib
-import csv
 import dataclasses
 
 import equinox as eqx
@@ -12,8 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
-from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.linearization import balance_probe
@@ -25,7 +23,7 @@ from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.signals import State
-from tests.commands import ends, read_rig, read_table, text_file
+from tests.commands import csv_text, ends, read_rig, read_table, refused, rows, with_columns
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -33,21 +31,23 @@ base = "none"
 imposed = "{imposed}"
 channels = [{channels}]
 start = "{start}"
+{top}
 [motor]
 resistance = 3.0
 torque_constant = 0.05
 inertia = 2e-6
 friction_coulomb = 2e-3
+{motor}
 [gearbox]
 ratio = 16
 efficiency_load = 0.8
 """
 BENCH = """
 [rig]
-delay = "0 ± 0.05"
+{rig}
 [bench]
 load = "shaft"
-inertia = 0.02
+inertia = {inertia}
 loss_coulomb = "0.2 ± 50 %"
 loss_viscous = 0.01
 """
@@ -59,17 +59,25 @@ loss_coulomb = "0.05 ± 50 %"
 loss_viscous = 0.01
 torque_gravity = "0.6 ± 20 %"
 """
+USUAL = {
+    "imposed": "voltage", "start": "rest", "rig": 'delay = "0 ± 0.05"', "inertia": 0.02, "top": "", "motor": "",
+}  # fmt: skip
 OPTIONS = {"model": "drive", "starts": 4, "blocks": False, "profiles": False}
+
+
+def drive(folder, *shown, load=BENCH, **changed):
+    """A drive that shows these channels, with its load, read from its file."""
+    channels = ", ".join(f'"{name}"' for name in shown)
+    return read_rig(folder, (DRIVE + load).format(channels=channels, **USUAL | changed))
 
 
 def written(tmp_path, robot, columns, sd, readings=0.0):
     """A table of readings with their sds [the columns' units]."""
     rows = len(columns["time_s"])
     readings = np.broadcast_to(readings, (rows, len(sd)))
-    names = [*columns, *(n for c in robot.channels for n in (c.column, c.sd_column))]
-    cells = [*columns.values(), *(x for k in range(len(sd)) for x in (readings[:, k], np.full(rows, sd[k])))]
-    lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
-    return read_table(tmp_path, "\n".join(lines), robot, "table.csv")
+    for k, channel in enumerate(robot.channels):
+        columns = columns | {channel.column: readings[:, k], channel.sd_column: np.full(rows, sd[k])}
+    return read_table(tmp_path, csv_text(columns), robot, "table.csv")
 
 
 def history(tmp_path, robot, truth, columns, sd, seed):
@@ -84,10 +92,7 @@ def history(tmp_path, robot, truth, columns, sd, seed):
 def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     """Where a speed is imposed a run begins at it, and what moves with the shafts at what the robot makes of it."""
     cart = '[cart]\nload = "linear"\nmass_kg = 3.0\nlead_mm = 5.0\n'
-    robot, times = (
-        read_rig(tmp_path, DRIVE.format(imposed="motor_speed", channels='"speed"', start="rest") + cart),
-        jnp.array([0.0, 0.1, 0.2]),
-    )
+    robot, times = drive(tmp_path, "speed", load=cart, imposed="motor_speed"), jnp.array([0.0, 0.1, 0.2])
     given = Conditions(motor_speed=100.0, motor_acceleration=0.0)
     names = ("cart.radius", "gearbox.ratio")
     values = {p.name: float(p.value) for p in params.walk_parameters(robot) if p.name in names}
@@ -108,7 +113,7 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
 
 @pytest.mark.parametrize("duty", [False, True])
 @pytest.mark.parametrize(
-    ("load", "shown", "stated", "said"),
+    "load, shown, stated, said",
     [
         (BENCH, "motor_current", "", "motor_current_A: got 1 A"),
         (BENCH, "motor_speed", "", "motor_speed_rpm: got 1 rpm"),
@@ -120,46 +125,22 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
 )
 def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, load, shown, stated, said, duty):
     """Of a log that goes both ways: a speed, and a current that nothing but the voltage drives."""
-    robot, t = (
-        read_rig(tmp_path, DRIVE.format(imposed="voltage", channels=f'"{shown}"', start="rest") + stated + load),
-        np.arange(0, 2, 0.02),
-    )
+    robot, t = drive(tmp_path, shown, load=stated + load), np.arange(0, 2, 0.02)
     way = np.where(t < 1, 1.0, -1.0)
     driven = {"supply_voltage_V": 12.0, "duty": way / 2} if duty else {"supply_voltage_V": 6 * way}
     columns = {"time_s": t, **driven, channels.find_channel(shown).column: np.abs(way)}
-    cells = np.stack(np.broadcast_arrays(*columns.values()), 1)
-    np.savetxt(tmp_path / "log.csv", cells, delimiter=",", header=",".join(columns), comments="")
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    text = csv_text(dict(zip(columns, np.broadcast_arrays(*columns.values()), strict=True)))
+    runs = read_table(tmp_path, text, robot)
     nothing = noise.Noise(*(None for _ in dataclasses.fields(noise.Noise)))
     cure = rf"expected negative readings in reverse; or set \[instruments.{shown}\] signed = false"
     bridge = duty and shown == "total_current"  # which turns the supply's current back
-    refused = pytest.raises(BadData, match=rf"{said} at -6 V; {cure}")
-    with refused if said and not bridge else contextlib.nullcontext():
+    with refused(rf"{said} at -6 V; {cure}") if said and not bridge else contextlib.nullcontext():
         assert Histories.check(runs, nothing) == []
-
-
-@pytest.mark.nightly
-def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
-    robot = read_rig(
-        tmp_path, DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
-    )
-    truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
-    t = np.arange(0, 4, 0.03)
-    speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / quantities.RPM
-    runs = history(tmp_path, robot, truth, {"time_s": t, "motor_speed_rpm": speed}, [0.01], 1)
-    found = calibrate(runs, robot, **OPTIONS)
-    delay, friction = found.parameters["rig.delay"], found.parameters["bench.loss_coulomb"]
-    assert abs(delay.value - 0.03) < 4 * delay.sd < 4e-3
-    assert abs(friction.value - 0.26) < 4 * friction.sd < 0.02
 
 
 @pytest.mark.slow
 def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
-    robot = read_rig(
-        tmp_path,
-        DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed", "output_angle"', start="free")
-        + ARM,
-    )
+    robot = drive(tmp_path, "total_current", "motor_speed", "output_angle", load=ARM, start="free")
     begins = RunStarts(
         {"begin_a": RunStart(motor_speed=30.0, angle=0.3), "begin_b": RunStart(motor_speed=-20.0, angle=0.1)}
     )
@@ -186,29 +167,23 @@ def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
 
 def test_beginnings_are_measured_by_the_first_samples(tmp_path):
     """A line through five samples, whatever channel shows the speed. Only free ones are free."""
-    path = tmp_path / "rig.toml"
+    lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
+    lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
     for start in ("measured", "free"):
-        robot = robot_file.load_robot(
-            text_file(
-                path, DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM
-            )
-        )
-        table = tmp_path / "table.csv"
-        lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
-        lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
-        runs = records.read_runs(text_file(table, "\n".join(lines)), robot=robot)
+        robot = drive(tmp_path, "output_speed", "output_angle", load=ARM, start=start)
+        runs = read_table(tmp_path, "\n".join(lines), robot)
         kind = observers.observer_kind(runs)
         known = noise.noise_from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
         begun = kind.with_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
-        assert float(begin.motor_speed) == pytest.approx(60 * quantities.RPM * 16, rel=1e-9)
-        assert float(begin.angle) == pytest.approx(np.radians(30), abs=0.002)
+        assert begin.motor_speed == pytest.approx(60 * quantities.RPM * 16, rel=1e-9)
+        assert begin.angle == pytest.approx(np.radians(30), abs=0.002)
         assert bool(priors.initial_state_names(begun)) == (start == "free")
 
 
 def test_a_robot_at_rest_has_no_beginnings(tmp_path):
-    robot = read_rig(tmp_path, DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + ARM)
+    robot = drive(tmp_path, "motor_speed", load=ARM)
     assert robot.rig.begins is None and jnp.asarray(robot.rig.delay) == 0
 
 
@@ -245,9 +220,7 @@ def test_a_delay_reads_the_run_of_each_row_and_takes_memory_by_rows():
 
 def imposed_speed(tmp_path, runs, filled=written):
     """A rig whose motor's speed is imposed over time, and the table of so many runs of it, whatever it reads."""
-    path = tmp_path / "rig.toml"
-    text = DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
-    robot = robot_file.load_robot(text_file(path, text.replace('delay = "0 ± 0.05"', "delay = 0.0")))
+    robot = drive(tmp_path, "total_current", imposed="motor_speed", start="measured", rig="delay = 0.0")
     t = np.tile(np.arange(0, 1, 0.05), runs)
     run = np.repeat(np.arange(runs), 20)
     speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / quantities.RPM
@@ -278,7 +251,7 @@ def test_curves_of_a_drive_that_reverses_count_along_its_travel(tmp_path):
     robot, runs = imposed_speed(tmp_path, 2)
     speed = np.repeat(np.linspace(-400, 400, 20)[None], 2, 0)
     speed[1] = -speed[0]
-    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed.ravel() / quantities.RPM})
+    runs = with_columns(runs, motor_speed_rpm=speed.ravel() / quantities.RPM)
     observer = observers.observer_kind(runs).of(runs, robot)
     columns = {**runs.columns, "total_current_A": np.sign(speed.ravel()) + speed.ravel() / 100}
     bases = observer.bases(columns, np.ones(len(runs), bool), robot)
@@ -330,8 +303,7 @@ def test_every_row_of_an_imposed_speed_has_the_acceleration_of_the_motion_there(
 def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
     imposed_speed(tmp_path, 2, lambda path, robot, *told: history(path, robot, robot, *told, 3))
     ends(mmrjax("compare table.csv --robot rig.toml --no-report --out found"), code=0)
-    with (tmp_path / "found/comparison.csv").open(encoding="utf-8") as file:
-        table = list(csv.DictReader(file))
+    table = rows(tmp_path / "found/comparison.csv")
     error = [float(r["simulated_total_current_A"]) - float(r["total_current_A"]) for r in table]
     assert len(table) == 40 and np.std(error) == pytest.approx(0.01, rel=0.4) and table[20]["run_id"] == "1"
     assert table[21]["time_s"] == "0.05"
@@ -346,14 +318,11 @@ def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
 
 
 @pytest.mark.parametrize(
-    ("stated", "free"), [("", True), ("0.0", True), ('"0 ± 0.05"', True), ("0.03", True), ('"0 ± 0"', False)]
+    "stated, free",
+    [("", True), ("delay = 0.0", True), (USUAL["rig"], True), ("delay = 0.03", True), ('delay = "0 ± 0"', False)],
 )
 def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, free):
-    path = tmp_path / "rig.toml"
-    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
-    robot = robot_file.load_robot(
-        text_file(path, text.replace('delay = "0 ± 0.05"', f"delay = {stated}" if stated else ""))
-    )
+    robot = drive(tmp_path, "motor_speed", rig=stated)
     names = priors.loop_parameter_names(robot, ("bench",), *observers.Histories.free())
     assert ("rig.delay" in names) == free and "motor.inertia" in names
     of_settled = priors.loop_parameter_names(robot, ("bench",), *observers.KINDS[1].free())
@@ -363,17 +332,11 @@ def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, fre
 @pytest.mark.slow
 def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, monkeypatch):
     """A second of a voltage at 50 Hz, against steps that stay short after each change."""
-    path = tmp_path / "rig.toml"
-    text = DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed"', start="rest") + BENCH
-    robot = robot_file.load_robot(
-        text_file(
-            path, text.replace('delay = "0 ± 0.05"', "delay = 0.0").replace("inertia = 0.02", "inertia = 0.002")
-        )
-    )
+    robot = drive(tmp_path, "total_current", "motor_speed", rig="delay = 0.0", inertia=0.002)
     t = np.arange(0, 1, 0.02)
     volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
-    rows = [f"{a:.2f},{b:.4f},0,0" for a, b in zip(t, volts, strict=True)]
-    runs = read_table(tmp_path, "time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows), robot)
+    driven = {"time_s": t, "supply_voltage_V": volts, "total_current_A": 0 * t, "motor_speed_rpm": 0 * t}
+    runs = read_table(tmp_path, csv_text(driven), robot)
     made = observers.observer_kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
     monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
@@ -389,7 +352,7 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
 def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
     """Two a sample, 10 ms at most: readings follow at once from the speed, but what effects remember."""
     robot, runs = imposed_speed(tmp_path, 2)  # at 20 Hz
-    runs = dataclasses.replace(runs, columns={**runs.columns, "time_s": runs["time_s"] / faster})
+    runs = with_columns(runs, time_s=runs["time_s"] / faster)
     times = np.asarray(Histories.of(runs, robot).times)
     steps = np.diff(times, axis=1)
     late = (steps > 0) & (times[:, :-1] > 4.5 * step)
@@ -401,16 +364,15 @@ def test_a_log_of_an_imposed_speed_soon_has_even_steps(tmp_path, faster, step):
 def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
     """Of a current from a higher speed on and earlier. By the rates of an angle where no speed is shown, all along where
     neither is. Without a backlash the moment of rest is found within a step, which may be as long as elsewhere."""
-    text = DRIVE.format(imposed=imposed, channels='"motor_speed", "output_angle"', start="rest") + BENCH
-    text = text.replace('delay = "0 ± 0.05"', "delay = 0.02")
-    (tmp_path / "stiff.toml").write_text(text)
-    (tmp_path / "rig.toml").write_text(text + "backlash = 0.01\n")
-    robot, stiff = (robot_file.load_robot(str(tmp_path / name)) for name in ("rig.toml", "stiff.toml"))
+    robot, stiff = (
+        drive(tmp_path, "motor_speed", "output_angle", load=BENCH + more, imposed=imposed, rig="delay = 0.02")
+        for more in ("backlash = 0.01\n", "")
+    )
     t, column = np.arange(0, 2, 0.02), {"voltage": "supply_voltage_V", "motor_current": "motor_current_A"}[imposed]
     speed = 2000 * np.clip((1.5 - t) / 0.3, -1, 1) * np.minimum(t / 0.2, 1)  # through rest at 1.5 s
     angle = np.cumsum(speed) * 0.02 * 6
-    rows = [f"{a:.2f},{8 if a < 1.2 else -8},{s:.1f},{x:.2f}" for a, s, x in zip(t, speed, angle, strict=True)]
-    runs = read_table(tmp_path, f"time_s,{column},motor_speed_rpm,output_angle_deg\n" + "\n".join(rows), robot)
+    shown = {"motor_speed_rpm": speed, "output_angle_deg": angle}
+    runs = read_table(tmp_path, csv_text({"time_s": t, column: np.where(t < 1.2, 8, -8), **shown}), robot)
 
     def longest(runs, begin, end, robot=robot):
         times = np.asarray(Histories.of(runs, robot).times)[0]
@@ -421,19 +383,18 @@ def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
     # from 0.07 s before a tenth of the largest speed on; of a current from 0.1 s before three tenths
     begin, end = {"voltage": (1.4, 1.54), "motor_current": (1.32, 1.6)}[imposed]
     none = np.full(len(t), np.nan)
-    by_angle = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": none})
+    by_angle = with_columns(runs, motor_speed_rpm=none)
     for shown in (runs, by_angle):
         assert longest(shown, begin, end) == pytest.approx(fine) and longest(shown, begin - 0.06, end) > 2 * fine
         assert longest(shown, 0.6, 1.2) == longest(shown, 1.7, 1.98) == pytest.approx(usual)
-    hidden = dataclasses.replace(by_angle, columns={**by_angle.columns, "output_angle_deg": none})
+    hidden = with_columns(by_angle, output_angle_deg=none)
     assert longest(hidden, 0.6, 1.2) == pytest.approx(fine)
     assert longest(hidden, 0.6, 1.98, stiff) == longest(runs, begin, end, stiff) == pytest.approx(usual)
 
 
 def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     """The means of all steps make up the integral of the broken line. Nothing else than what is imposed is on lines."""
-    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
-    robot = read_rig(tmp_path, text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
+    robot = drive(tmp_path, "motor_speed", top='between_rows = "linear"')
     runs = read_table(
         tmp_path,
         "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n",
@@ -457,17 +418,15 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
 @pytest.mark.slow
 def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
     """A ramp of 50 rows a second: on lines it is a ramp of finer rows. Held it is late by half a row."""
-    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH.replace(
-        '"0 ± 0.05"', '"0 ± 0"'
-    )
-    text = text.replace("inertia = 0.02", "inertia = 0.002")
 
     def shown(word, step):
-        robot = read_rig(tmp_path, text.replace('start = "rest"', f'start = "rest"\nbetween_rows = "{word}"'))
+        held = {"rig": 'delay = "0 ± 0"', "inertia": 0.002}
+        robot = drive(tmp_path, "motor_speed", top=f'between_rows = "{word}"', **held)
         t = np.arange(0, 0.8 + 1e-9, step)
         volts = np.interp(t, [0, 0.3, 0.5, 0.8], [2.0, 14.0, 14.0, -5.0])
-        rows = [f"{a:.4f},{b:.6f},0" for a, b in zip(t, volts, strict=True)]
-        runs = read_table(tmp_path, "time_s,supply_voltage_V,motor_speed_rpm\n" + "\n".join(rows), robot)
+        runs = read_table(
+            tmp_path, csv_text({"time_s": t, "supply_voltage_V": volts, "motor_speed_rpm": 0 * t}), robot
+        )
         made = observers.observer_kind(runs).of(runs, robot)
         reading = np.asarray(made(robot).reading)[:, 0]
         return reading[:: round(0.02 / step)]
@@ -478,15 +437,9 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
 
 
 def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
-    path = tmp_path / "rig.toml"
-    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
-    with pytest.raises(BadConfiguration, match=r"rig.toml, between_rows: got spline; .*allowed: held, linear"):
-        robot_file.load_robot(
-            text_file(path, text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "spline"'))
-        )
-    robot = robot_file.load_robot(
-        text_file(path, text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
-    )
+    with refused(r"rig.toml, between_rows: got spline; .*allowed: held, linear", BadConfiguration):
+        drive(tmp_path, "motor_speed", top='between_rows = "spline"')
+    robot = drive(tmp_path, "motor_speed", top='between_rows = "linear"')
     robot_file.write_robot(robot, tmp_path / "robot.toml")
     assert robot_file.load_robot(str(tmp_path / "robot.toml")).rig.between_rows == robot.rig.between_rows == "linear"
 
@@ -494,8 +447,7 @@ def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
 def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
     """L / R of 3.3 ms, a shaft so heavy that it stands: the current's closed form at the end of steps of 20, 10 and 5 ms
     after a start and a jump, within one, and its derivative by the resistance."""
-    text = DRIVE.format(imposed="voltage", channels='"motor_current"', start="rest") + BENCH
-    robot = read_rig(tmp_path, text.replace("[gearbox]", "inductance = 0.01\n[gearbox]").replace("0.02", "1e3"))
+    robot = drive(tmp_path, "motor_current", motor="inductance = 0.01", inertia=1e3)
     times = jnp.array([0.0, 0.02, 0.03, 0.035, 0.04, 0.04])  # the last instant begins a step, as the observer has it
     driven = Conditions(voltage=np.array([6.0, 6.0, 9.0, 9.0, 9.0, 9.0]))
 
@@ -522,12 +474,7 @@ THROUGH_REST = ("bench.inertia", "bench.loss_coulomb", "motor.friction_coulomb")
 @pytest.fixture(scope="module")
 def through_rest(tmp_path_factory):
     """Derivatives of the speeds of a run by shares of its parameters, and differences of steps without end."""
-    robot = robot_file.read_robot(
-        text_file(
-            tmp_path_factory.mktemp("rig") / "robot.toml",
-            DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH,
-        )
-    )
+    robot = drive(tmp_path_factory.mktemp("rig"), "motor_current", "motor_speed")
     every = np.arange(0, 1.2, 0.02)
     values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 

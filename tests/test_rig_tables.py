@@ -1,6 +1,5 @@
 """Tables of rigs: which columns a robot's file asks for, other units, surfaces, directions, and their refusals."""
 
-import dataclasses
 import functools
 import re
 
@@ -10,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from calibration.data import configuration_tables, inferred_facts, rig_facts, robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData, three_digits
+from calibration.data.input_errors import BadConfiguration, three_digits
 from calibration.inference import bases, blocks, checks, noise, observers, priors
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
@@ -24,7 +23,7 @@ from mmrjax.model.rig import Instrument, Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STALLED
-from tests.commands import csv_text, read_rig, read_table, text_file
+from tests.commands import csv_text, read_rig, read_table, refused, text_file, with_columns
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -246,7 +245,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(
-    ("column", "cells"),
+    "column, cells",
     [
         ("time_s", ("1764072000.25", "1764072000.5", "1764072001.5")),
         ("time_ms", ("1764072000250", "1764072000500", "1764072001500")),
@@ -266,7 +265,7 @@ def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
     assert any(f"{column} is a time of day, counted from the first row of each run" in note for note in runs.notes)
     usual = read(tmp_path, "time_s,supply_voltage_V,total_current_A\n0,12,0.4\n6,12,0.4\n7,12,0.4\n", robot)
     assert usual["time_s"] == pytest.approx([0, 6, 7]) and usual.notes == ()
-    with pytest.raises(BadData, match=r"row 2, time_s: got 25\.11\.2026 12:00; .*expected a number"):
+    with refused(r"row 2, time_s: got 25\.11\.2026 12:00; .*expected a number"):
         read(tmp_path, "time_s,supply_voltage_V,total_current_A\n5,12,0.4\n25.11.2026 12:00,12,0.4\n", robot)
 
 
@@ -285,7 +284,7 @@ def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
         "time_min begins at 60, and counts" in n for n in runs.notes
     )
     late = "time_s,supply_voltage_V,total_current_A\n60,12,0.4\n-1,12,0.4\n"
-    with pytest.raises(BadData, match=r"row 2, time_s: got -1; expected 0 to 1e\+06"):
+    with refused(r"row 2, time_s: got -1; expected 0 to 1e\+06"):
         read(tmp_path, late, bench("voltage"))
 
 
@@ -296,12 +295,12 @@ def test_a_load_that_drives_its_motors_takes_voltage_from_their_back_emf(tmp_pat
     header = "motor_speed_rpm,motor_voltage_V,motor_current_A\n"
     runs = read(tmp_path, f"{header}-900,-2.11,1.3\n-100,0.7,0.6\n900,5.5,0.4\n", robot)
     assert runs["motor_voltage_V"] == pytest.approx([-2.11, 0.7, 5.5])
-    with pytest.raises(BadData, match=r"row 1, motor_voltage_V: got -2.11 at .* of -900, too small"):
+    with refused(r"row 1, motor_voltage_V: got -2.11 at .* of -900, too small"):
         read(tmp_path, f"{header}-900,-2.11,-0.4\n900,5.5,0.4\n", robot)
     unread = bench(shown=("output_torque", "motor_voltage"), load=winch)
     header = "motor_speed_rpm,motor_voltage_V,output_torque_Nm\n"
     assert len(read(tmp_path, f"{header}-900,-2.11,2\n900,5.5,2\n1800,11,2\n", unread)) == 3
-    with pytest.raises(BadData, match=r"row 1, motor_voltage_V: got -2.11 at"):
+    with refused(r"row 1, motor_voltage_V: got -2.11 at"):
         read(tmp_path, f"{header}-900,-2.11,2\n900,2,2\n1800,11,2\n", unread)
 
 
@@ -318,9 +317,7 @@ def test_a_unit_in_a_columns_name_is_converted_or_refused(tmp_path):
         text = TORQUE.replace("output_torque_kNm", shown)
         for stated in (("output_torque_kNm", shown), ("output_torque_Nm", shown, 1e3)):
             assert read(tmp_path, text, of_torque(*stated))["output_torque_Nm"] == pytest.approx([4.0])
-        with pytest.raises(
-            BadData, match=r"states kNm in its name, and is read in Nm; state \[columns\] output_torque_kNm"
-        ):
+        with refused(r"states kNm in its name, and is read in Nm; state \[columns\] output_torque_kNm"):
             read(tmp_path, text, of_torque(shown=shown))
 
 
@@ -336,12 +333,11 @@ def test_comment_lines_above_the_header_are_passed_over(tmp_path, above):
         assert read(tmp_path, above + text, bench())["total_current_A"].tolist() == [0.4]
 
 
-@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+@pytest.mark.parametrize("case", REFUSED)
 def test_bad_tables_of_rigs_are_refused_in_one_sentence(tmp_path, case):
     make, text, sentence = REFUSED[case]
-    with pytest.raises(BadData, match=sentence) as refusal:
+    with refused(sentence):
         read(tmp_path, text, make())
-    assert "\n" not in str(refusal.value)
 
 
 def test_a_slope_of_nothing_on_a_bench_is_let_pass(tmp_path):
@@ -396,7 +392,7 @@ def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_p
     assert runs.conditions(apart).adhesion == pytest.approx(1.0)
     again = read(tmp_path, ON, apart)  # without a column configuration
     assert again.configurations(apart).tolist() == [0, 0, 0, 1, 1, 1]
-    with pytest.raises(BadData, match="configuration is missing, and the robot has rig-felt, rig-tiles"):
+    with refused("configuration is missing, and the robot has rig-felt, rig-tiles"):
         read(tmp_path, ON.replace("felt", "sand"), apart)
 
 
@@ -429,8 +425,7 @@ def test_one_surface_alone_and_a_robot_without_the_others_stay_as_they_are(tmp_p
 
 def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(robot):
     runs = records.read_runs("measured").where(np.arange(4))
-    columns = {**runs.columns, "surface": np.array(["linoleum", "linoleum", "sand", "sand"])}
-    runs = dataclasses.replace(runs, columns=columns)
+    runs = with_columns(runs, surface=np.array(["linoleum", "linoleum", "sand", "sand"]))
     apart = configuration_tables.with_surface_configurations(robot, runs)
     assert apart.configurations.names == ("6T2A", "4W2T", "6T2A-sand") and apart.rig.surfaces == (
         ("6T2A-sand", "6T2A"),
@@ -495,9 +490,7 @@ def test_a_gear_ratio_upside_down_is_said(tmp_path):
     runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=np.array([6.0, 9, 12, 24])),
                     {"supply_voltage_V": [6, 9, 12, 24]})  # fmt: skip
     assert check_ranges(runs, robot) == []
-    with pytest.raises(
-        BadData, match=r"about 17 times for one turn of the output, but gearbox.ratio is 0.0625: is it ups"
-    ):
+    with refused(r"about 17 times for one turn of the output, but gearbox.ratio is 0.0625: is it ups"):
         check_ranges(runs, params.replace(robot, {"gearbox.ratio": 1 / 16.0}))
 
 
@@ -510,8 +503,8 @@ def test_a_slow_speed_where_the_stated_friction_holds_the_robot_is_no_matter_of_
     conditions = Conditions(np.zeros(4, int), motor_current=columns["motor_current_A"])
     light = {"motor.friction_coulomb": 4e-4, "rig.loss_coulomb": 0.04, "rig.loss_viscous": 0.004}
     runs = measured(tmp_path, robot, conditions, columns, light)
-    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] / 60})
-    assert np.all(np.asarray(steady_batch(robot, conditions).status) == STALLED)
+    runs = with_columns(runs, motor_speed_rpm=runs["motor_speed_rpm"] / 60)
+    assert np.all(steady_batch(robot, conditions).status == STALLED)
     assert check_ranges(runs, robot) == []
 
 
@@ -520,11 +513,8 @@ def test_an_arm_has_no_steady_state(tmp_path):
     runs = read(
         tmp_path, "supply_voltage_V,motor_speed_rpm\n" + "".join(f"{v},{v * 100}\n" for v in range(4, 14)), robot
     )
-    with pytest.raises(
-        BadConfiguration, match=r"rig has a gravity torque that depends on its angle, .*; use --model drive"
-    ) as refusal:
+    with refused(r"rig has a gravity torque that depends on its angle, .*; use --model drive", BadConfiguration):
         calibrate(runs, robot, noise="motor_speed=1%")
-    assert "\n" not in str(refusal.value)
 
 
 def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
@@ -549,7 +539,7 @@ def test_curves_of_runs_both_ways_count_along_the_travel(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("readings", "step"),
+    "readings, step",
     [
         (0.026 * np.array([1, 3, 8, 2, 11, 4, 17, 9, 9]), 0.026),
         (0.1 + 0.026 * np.array([1, 3, 8, 2, 11, 4, 17, 9]), 0.026),  # of a meter with an offset
@@ -590,7 +580,7 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     sds = [noise.noise_from_table(records.read_runs(path, robot=r), size).sd for r in (free, stated)]
     assert_allclose(sds[0], sds[1], rtol=1e-9)
     assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
-    with pytest.raises(BadData, match="negative in reverse; or signed = false"):
+    with refused("negative in reverse; or signed = false"):
         records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))
     assert records.read_runs(text_file(path, signed), robot=free).layout.instruments[0].signed is True
@@ -624,8 +614,8 @@ quantum = "free"
     speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
     robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
     truth = steady_batch(robot_there, Conditions(motor_speed=speeds * quantities.RPM)).reading["total_current"]
-    assert float(truth[0]) < 0  # without a table it is shown with its sign
-    read = np.round(np.abs(np.asarray(truth)) / 0.004) * 0.004
+    assert truth[0] < 0  # without a table it is shown with its sign
+    read = np.round(np.abs(truth) / 0.004) * 0.004
     path = tmp_path / "t.csv"
     rows = "".join(f"{n:g},{i:.3f},0.002\n" for n, i in zip(speeds, read, strict=True))
     found = calibrate(
@@ -675,7 +665,7 @@ def motor_table(resistance, constant, friction, voltages):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("numbers", "voltages"), [
+@pytest.mark.parametrize("numbers, voltages", [
     ((4.1, 0.83, 0.05), [150, 220, 310, -310]), ((0.14, 0.0021, 2e-4), [2, 6, 11.6]),
 ])  # fmt: skip
 def test_motors_far_from_the_packaged_one_are_read_without_a_doubt(tmp_path, numbers, voltages):
@@ -684,7 +674,7 @@ def test_motors_far_from_the_packaged_one_are_read_without_a_doubt(tmp_path, num
     assert len(runs) == len(voltages) and rig_facts.doubtful_speed(runs, rig) == ""
 
 
-@pytest.mark.parametrize(("column", "factor"), [("motor_speed_rpm", 60.0), ("supply_voltage_V", 1000.0)])
+@pytest.mark.parametrize("column, factor", [("motor_speed_rpm", 60.0), ("supply_voltage_V", 1000.0)])
 def test_a_speed_that_the_constant_cannot_give_is_doubted_with_its_number(tmp_path, column, factor):
     rig = read_rig(tmp_path, MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
     table = motor_table(0.4, 0.05, 0.01, [6, 9])
@@ -698,5 +688,5 @@ def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):
     table = motor_table(0.4, 0.05, 0.01, [*range(3, 25, 3), *range(-3, -25, -3)])
     drag = table["motor_current_A"] + 4e-5 * table["motor_speed_rpm"]  # churning
     assert len(records.read_runs({**table, "motor_current_A": drag + 0.4}, rig)) == 16
-    with pytest.raises(BadData, match="expected readings with their signs"):
+    with refused("expected readings with their signs"):
         records.read_runs({**table, "motor_current_A": np.abs(drag)}, rig)

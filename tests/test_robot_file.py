@@ -7,7 +7,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
-from tests.commands import read_rig, text_file
+from tests.commands import read_rig, refused, text_file
 
 
 def values(robot):
@@ -23,16 +23,8 @@ def test_robot_written_and_read_is_the_same(tmp_path, name):
 
 
 def test_file_states_only_what_differs(tmp_path):
-    robot, base = (
-        values(
-            read_rig(
-                tmp_path,
-                'base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n',
-                "mine.toml",
-            )
-        ),
-        values(paper_robots.sm1()),
-    )
+    text = 'base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n'
+    robot, base = values(read_rig(tmp_path, text)), values(paper_robots.sm1())
     assert robot.pop("motor.resistance") == 0.9 and robot.pop("effects.series_resistance.amplitude") == 0.3
     assert base.pop("motor.resistance") == 0.611 and robot == base
 
@@ -75,37 +67,32 @@ dynamic = 0.5
 
 @pytest.mark.parametrize("text", [ROVER, CRAWLER], ids=["rover", "crawler"])
 def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
-    robot = read_rig(tmp_path, text, "mine.toml")
+    robot = read_rig(tmp_path, text)
     robot_file.write_robot(robot, tmp_path / "again.toml")
     again = robot_file.read_robot(tmp_path / "again.toml")
     assert eqx.tree_equal(robot, again)
-    assert (again.configurations.names, again.sides, again.battery.cells) == (
-        robot.configurations.names,
-        robot.sides,
-        robot.battery.cells,
-    )
     assert [(e.name, e.configurations) for e in again.effects] == [(e.name, e.configurations) for e in robot.effects]
 
 
 def test_like_starts_from_that_configuration(tmp_path):
-    robot, base = read_rig(tmp_path, ROVER, "mine.toml"), paper_robots.nominal()
+    robot, base = read_rig(tmp_path, ROVER), paper_robots.nominal()
     assert robot.configurations.names == ("rover", "6T2A") and robot.sides == 4 and robot.battery.cells == 4
     rover, wheeled = robot.configurations["rover"], base.configurations["4W2T"]
-    assert float(rover.mass) == 6.0 and float(rover.ground.friction.static) == 0.6
-    assert float(rover.on_tracks) == 0.0 and float(rover.radius) == float(wheeled.radius)
+    assert rover.mass == 6.0 and rover.ground.friction.static == 0.6
+    assert rover.on_tracks == 0.0 and rover.radius == wheeled.radius
     assert [e.configurations for e in robot.effects] == [("rover",), ()]
 
 
 def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
-    crawler = read_rig(tmp_path, CRAWLER, "mine.toml").configurations["crawler-2"]
-    assert float(crawler.on_tracks) == 1.0
-    assert float(crawler.track.guide_friction) == 0.20 and float(crawler.ground.friction.speed_static) == 0.02
+    crawler = read_rig(tmp_path, CRAWLER).configurations["crawler-2"]
+    assert crawler.on_tracks == 1.0
+    assert crawler.track.guide_friction == 0.20 and crawler.ground.friction.speed_static == 0.02
 
 
 REFUSED = {
     "misspelt table": (
         "[motr]\nresistance = 1",
-        r"mine\.toml, motr\.resistance: no such parameter; did you mean motor\.resistance",
+        r"rig\.toml, motr\.resistance: no such parameter; did you mean motor\.resistance",
     ),
     "misspelt key": (
         "[motor]\nresistanc = 1",
@@ -175,6 +162,36 @@ REFUSED = {
         "configurations = ['4W2T']\n[tracked]\nmass = 12",
         r"tracked\.mass: no such parameter; the robot has battery, motor, gearbox, 4W2T",
     ),
+    "a switch as a number": (
+        "[gearbox]\nmesh_theory = 1",
+        r"mesh_theory: got 1; expected true or false \(efficiency",
+    ),
+    "a switch as a word": ("[driver]\nreturns_current = 'no'", r"returns_current: got 'no'; expected true or false"),
+    "no such decay": (
+        "[driver]\ndecay = 'coast'",
+        r"driver\.decay: got 'coast'; expected slow or fast \(between pulses",
+    ),
+    "decays": ("[driver]\ndecay = ['fast']", r"driver\.decay: got \['fast'\]; expected slow or fast"),
+    "negative rating": (
+        "[gearbox]\ntorque_limit = -1",
+        r"gearbox\.torque_limit: got -1; expected a number, 0\.001 to",
+    ),
+    "rating with its meaning": (
+        "[motor]\nvoltage_limit = -3",
+        r"motor\.voltage_limit: got -3; expected a number, 0\.1 to 1000 V \(highest",
+    ),
+    "rating as a word": (
+        "[motor]\nspeed_limit = 'fast'",
+        r"motor\.speed_limit: got 'fast'; expected a number, 1 to 1",
+    ),
+    "cut off while it is charged": (
+        "[battery]\nvoltage_cutoff = 4.5",
+        r"battery\.voltage_cutoff: got 4\.5; expected less than voltage_charge, 4\.2 V",
+    ),
+    "rating as a boolean": (
+        "[battery]\ncurrent_charge = true",
+        r"battery\.current_charge: got True; expected a number",
+    ),
     "not TOML": ("motor = [", r"not a readable TOML file"),
     "friction speeds reversed": (
         "[6T2A.ground.friction]\nspeed_static = 0.5\nspeed_dynamic = 0.1",
@@ -183,12 +200,11 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+@pytest.mark.parametrize("case", REFUSED)
 def test_bad_robots_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
-    with pytest.raises(BadConfiguration, match=sentence) as refusal:
-        read_rig(tmp_path, text, "mine.toml")
-    assert refusal.value.exit_code == 2
+    with refused(sentence, BadConfiguration):
+        read_rig(tmp_path, text)
 
 
 def test_ratings_are_stated_written_and_checked(tmp_path):
@@ -201,12 +217,6 @@ def test_ratings_are_stated_written_and_checked(tmp_path):
     assert robot_file.read_robot(tmp_path / "again.toml").motor == robot.motor
     robot_file.write_robot(paper_robots.nominal(), tmp_path / "nominal.toml")
     assert "voltage_limit" not in (tmp_path / "nominal.toml").read_text()
-    with pytest.raises(
-        BadConfiguration, match=r"motor.voltage_limit: got -3; expected a number, 0.1 to 1000 V \(highest"
-    ):
-        robot_file.change_robot(robot, {"motor.voltage_limit": -3}, where="--set")
-    with pytest.raises(BadConfiguration, match=r"motor.speed_limit: got 'fast'; expected a number, 1 to 1"):
-        robot_file.change_robot(robot, {"motor.speed_limit": "fast"}, where="mine.toml")
 
 
 def test_robot_file_knows_what_it_states(tmp_path):
@@ -257,7 +267,7 @@ def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
     robot = robot_file.change_robot(
         paper_robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := [])
     )
-    assert quiet == [] and float(robot.battery.voltage_empty) == float(paper_robots.nominal().battery.voltage_empty)
+    assert quiet == [] and robot.battery.voltage_empty == paper_robots.nominal().battery.voltage_empty
 
 
 def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):

@@ -13,7 +13,7 @@ from calibration.data import writing
 from calibration.data.input_errors import BadConfiguration
 from sweeps.commands.rig_new import write_new_rig
 from sweeps.store import RunFolder, lock_text
-from tests.commands import read_json
+from tests.commands import read_json, refused
 
 LOOP, SWEEP = {"command": "loop", "seed": 1}, {"command": "sweep", "seed": 1}
 
@@ -54,9 +54,7 @@ def test_force_replaces_no_folder_that_is_none_of_ours(tmp_path, manifest):
     else:
         (folder / "manifest.json").write_bytes(manifest.encode("latin1"))
     before = names(tmp_path)
-    with pytest.raises(
-        BadConfiguration, match="thesis.txt" if manifest is None else "--force replaces only run folders"
-    ):
+    with refused("thesis.txt" if manifest is None else "--force replaces only run folders", BadConfiguration):
         finished(tmp_path / "x", force=True)
     assert names(tmp_path) == before
 
@@ -66,40 +64,32 @@ FOREIGN = [
     ("lock", "theirs"),
     ("lock", '{"schema": "theirs/1"}'),
     ("chunks/base.stage", ""),
+    (None, "a link to ours"),
 ]
 
 
-@pytest.mark.parametrize(("name", "text"), FOREIGN)
+@pytest.mark.parametrize("name, text", FOREIGN)
 @pytest.mark.parametrize("force", [False, True])
 def test_a_foreign_partial_folder_is_left_alone(tmp_path, name, text, force):
-    file = tmp_path / "x.partial" / name
-    file.parent.mkdir(parents=True)
-    file.write_text(text)
-    (tmp_path / "x.partial/thesis.txt").write_text("years of work")
+    partial = tmp_path / "x.partial"
+    if name is None:
+        partial.symlink_to(interrupted(tmp_path / "y"))
+    else:
+        (partial / name).parent.mkdir(parents=True)
+        (partial / name).write_text(text)
+        (partial / "thesis.txt").write_text("years of work")
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match=r"x\.partial was not created by mmrjax"):
+    with refused(r"x\.partial was not created by mmrjax", BadConfiguration):
         RunFolder(tmp_path / "x", LOOP, force=force)
     assert names(tmp_path) == before
 
 
-def test_a_partial_folder_that_is_a_link_is_left_alone(tmp_path):
-    partial = interrupted(tmp_path / "y")
-    (tmp_path / "x.partial").symlink_to(partial)
-    with pytest.raises(BadConfiguration, match="not created by mmrjax"):
-        RunFolder(tmp_path / "x", SWEEP, force=True)
-    assert (partial / "chunks/base.stage").is_file()
-
-
 def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     partial = interrupted(tmp_path / "x")
-    with pytest.raises(
-        BadConfiguration, match=r"x\.partial contains an interrupted loop; choose another path or --force"
-    ):
+    with refused(r"x\.partial contains an interrupted loop; choose another path or --force", BadConfiguration):
         RunFolder(tmp_path / "x", SWEEP)
     other = LOOP | {"seed": 2}
-    with pytest.raises(
-        BadConfiguration, match=r"x\.partial contains interrupted work of another configuration.*--force"
-    ):
+    with refused(r"x\.partial contains interrupted work of another configuration.*--force", BadConfiguration):
         RunFolder(tmp_path / "x", other)
     assert (partial / "chunks/base.stage").is_file()
     RunFolder(tmp_path / "x", other, force=True).close()
@@ -117,7 +107,7 @@ def test_a_foreign_file_in_our_partial_folder_is_left_alone(tmp_path, place, ide
     partial = interrupted(tmp_path / "x")
     (partial / place).write_text("years of work")
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match=rf"x\.partial contains {place}, which its command did not write"):
+    with refused(rf"x\.partial contains {place}, which its command did not write", BadConfiguration):
         RunFolder(tmp_path / "x", identity, force=True)
     assert names(tmp_path) == before
 
@@ -127,10 +117,10 @@ def test_a_forged_mark_costs_no_file(tmp_path):
     partial.mkdir()
     (partial / "thesis.txt").write_text("years of work")
     (partial / "lock").write_text(lock_text("loop"))
-    with pytest.raises(BadConfiguration, match=r"thesis\.txt, which its command did not write"):
+    with refused(r"thesis\.txt, which its command did not write", BadConfiguration):
         finished(tmp_path / "x")
     (partial / "lock").write_text(json.dumps(json.loads(lock_text("loop")) | {"foreign": []}))
-    with pytest.raises(BadConfiguration, match="or --force to start again"):
+    with refused("or --force to start again", BadConfiguration):
         finished(tmp_path / "x")
     assert (partial / "thesis.txt").is_file()
 
@@ -141,7 +131,7 @@ def test_a_foreign_file_that_comes_during_the_run_is_not_listed_as_ours(tmp_path
         folder.write_text("robot.toml", "")
         folder.finish({})
     assert read_json(tmp_path / "x/manifest.json")["contents"] == ["manifest.json", "robot.toml"]
-    with pytest.raises(BadConfiguration, match=r"--force would delete notes\.txt"):
+    with refused(r"--force would delete notes\.txt", BadConfiguration):
         finished(tmp_path / "x", force=True)
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "y", LOOP) as folder:
         (folder.partial / "notes.txt").write_text("years of work")
@@ -149,17 +139,20 @@ def test_a_foreign_file_that_comes_during_the_run_is_not_listed_as_ours(tmp_path
     assert (tmp_path / "y.partial/notes.txt").is_file()
 
 
-def test_a_folder_killed_while_its_results_were_written_is_taken_up(tmp_path):
+def test_a_folder_killed_while_its_results_or_its_mark_were_written_is_taken_up(tmp_path):
     folder = RunFolder(tmp_path / "x", LOOP)
     folder.write_text("rows.csv", "")
     folder.close()
     finished(tmp_path / "x")
     assert names(tmp_path / "x") == ["manifest.json", "robot.toml", "rows.csv"]
+    (tmp_path / "y.partial").mkdir()
+    (tmp_path / "y.partial/lock").touch()
+    assert names(finished(tmp_path / "y")) == ["manifest.json", "robot.toml"]
 
 
 def test_a_refusal_keeps_the_work_that_was_taken_up(tmp_path):
     partial = interrupted(tmp_path / "x")
-    with pytest.raises(BadConfiguration, match="refused"), RunFolder(tmp_path / "x", LOOP):
+    with refused("refused", BadConfiguration), RunFolder(tmp_path / "x", LOOP):
         raise BadConfiguration("refused")
     assert (partial / "chunks/base.stage").is_file()
 
@@ -172,7 +165,7 @@ def test_a_full_disk_leaves_a_file_as_it_was(tmp_path, there):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
     try:
-        with pytest.raises(BadConfiguration, match=r"rig\.toml: cannot be written"):
+        with refused(r"rig\.toml: cannot be written", BadConfiguration):
             write_new_rig(file, "tracked", force=True)
         with pytest.raises(OSError, match=r"rig\.toml"):
             writing.write_table(file, {"x": np.arange(1000)})
@@ -192,26 +185,19 @@ def test_writing_follows_links_keeps_modes_and_writes_to_pipes(tmp_path):
     assert not Path("/dev/null").is_file()
 
 
-def test_a_folder_killed_before_its_mark_was_written_is_taken_up(tmp_path):
-    (tmp_path / "x.partial").mkdir()
-    (tmp_path / "x.partial/lock").touch()
-    finished(tmp_path / "x")
-    assert names(tmp_path) == ["x", "x/manifest.json", "x/robot.toml"]
-
-
 def test_a_second_process_is_refused_at_once_and_disturbs_nothing(tmp_path):
     with RunFolder(tmp_path / "x", LOOP) as first:
         first.stage("base", lambda: 1)
         before = names(tmp_path)
         for identity in (LOOP, LOOP | {"seed": 2}, SWEEP):
-            with pytest.raises(BadConfiguration, match=r"(another process is using|contains an interrupted loop)"):
+            with refused(r"(another process is using|contains an interrupted loop)", BadConfiguration):
                 RunFolder(tmp_path / "x", identity)
-            with pytest.raises(BadConfiguration, match=r"another process is using \S*x\.partial; wait for it"):
+            with refused(r"another process is using \S*x\.partial; wait for it", BadConfiguration):
                 RunFolder(tmp_path / "x", identity, force=True)
         assert names(tmp_path) == before
         first.write_text("robot.toml", "")
         first.finish({})
-    with pytest.raises(BadConfiguration, match="x exists already"):
+    with refused("x exists already", BadConfiguration):
         RunFolder(tmp_path / "x", LOOP)
     assert names(tmp_path) == ["x", "x/manifest.json", "x/robot.toml"]
 

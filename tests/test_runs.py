@@ -13,7 +13,7 @@ from calibration.data.named_arrays import NamedArrays
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from sweeps.pages.comparison_figures import time_overlay
-from tests.commands import read_table, text_file
+from tests.commands import read_table, refused, text_file
 
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
@@ -49,7 +49,7 @@ def test_conditions_are_those_of_the_robot(tmp_path, robot):
 def test_a_configuration_that_the_robot_lacks_is_refused_with_those_it_has(tmp_path, robot):
     runs = read(tmp_path, f"{HEADER}\n{ROW}\n{ROW.replace('6T2A', '6T2')}\n")
     says = r"runs\.csv row 2, configuration: got 6T2; expected one of these; did you mean 6T2A\? allowed: 6T2A, 4W2T"
-    with pytest.raises(BadData, match=says):
+    with refused(says):
         runs.conditions(robot)
 
 
@@ -59,7 +59,7 @@ def test_columns_without_a_name_are_nothing_or_called_by_their_place(tmp_path):
         runs = read(tmp_path, text)
         assert runs.unknown == () and set(runs.columns) == set(plain.columns)
     assert read(tmp_path, f",{HEADER}\n7,{ROW}\n").unknown == ("column 1",)
-    with pytest.raises(BadData, match=r"row 1: got 10 cells; the header has 8 columns"):
+    with refused(r"row 1: got 10 cells; the header has 8 columns"):
         read(tmp_path, f"{HEADER}\n{ROW},,9\n")
 
 
@@ -87,7 +87,7 @@ def test_cells_of_a_sound_table_are_read_at_once(tmp_path, monkeypatch):
     assert runs["payload_kg"].tolist() == [0, 0] and runs["configuration"].tolist() == ["6T2A"] * 2
     assert_array_equal(runs["speed_mm_s"], [400, np.nan])
     assert not looked_at
-    with pytest.raises(BadData, match=r"row 2: refused; .*; and 12 more$"):
+    with refused(r"row 2: refused; .*; and 12 more$"):
         read(tmp_path, "\n".join([f"{HEADER},speed_sd_mm_s", f"{ROW},4", *[f"{ROW},0"] * 20]))
     assert len(looked_at) == 8
 
@@ -119,7 +119,7 @@ def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "values", "says"),
+    "column, values, says",
     [
         ("slope_percent", [0.0, 101.0], "log.bag row 2, slope_percent: got 101; expected -100 to 100"),
         ("payload_kg", [0, 400], "log.bag row 2, payload_kg: got 400; expected 0 to 300"),
@@ -129,7 +129,7 @@ def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
     ],
 )
 def test_arrays_out_of_range_are_refused_with_their_row(column, values, says):
-    with pytest.raises(BadData, match=says):
+    with refused(says):
         records.runs_of_arrays(of_arrays(ARRAYS | {column: values}))
 
 
@@ -145,7 +145,7 @@ def test_a_unit_that_a_source_states_has_to_be_its_columns():
         if not says:
             assert len(records.runs_of_arrays(arrays)) == 2
             continue
-        with pytest.raises(BadData, match=says):
+        with refused(says):
             records.runs_of_arrays(arrays)
 
 
@@ -154,7 +154,7 @@ def test_a_clock_of_numbers_counts_from_the_first_row_of_its_run():
     columns = {name: np.resize(values, 5) for name, values in ARRAYS.items()} | {
         "configuration": ["6T2A"] * 5, "run_id": np.array([1, 1, 2, 1, 2]), "time_s": time,
     }  # fmt: skip
-    with pytest.raises(BadData, match=r"log.bag row 3, time_s: got 1700000000; is it in us\? .* expected 0 to 1e"):
+    with refused(r"log.bag row 3, time_s: got 1700000000; is it in us\? .* expected 0 to 1e"):
         records.runs_of_arrays(of_arrays(columns))
     found = records.runs_of_arrays(of_arrays(columns | {"time_s": np.where(time < 1e6, 1.7e9 + time, time)}))
     assert found["time_s"].tolist() == [0.0, 2.5, 0.0, 0.25, 0.125] and found["run_id"].tolist() == list("11212")
@@ -168,7 +168,7 @@ def test_unknown_columns_are_reported_and_kept_out(tmp_path):
 def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path, robot):
     path = text_file(tmp_path / "runs.csv", "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,15,0,5\n")
     assert records.read_runs(path, measured=False).conditions(robot).total_mass is None
-    with pytest.raises(BadData, match="column total_mass_kg is missing"):
+    with refused("column total_mass_kg is missing"):
         records.read_runs(path)
 
 
@@ -188,14 +188,6 @@ REFUSED = {
     "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg is present 2 times"),
     "extra cell": (f"{HEADER}\n{ROW},7", r"row 1: got 9 cells; the header has 8"),
     "missing cell": (f"{HEADER}\n{ROW}\n6T2A,15", r"row 2: got 2 cells"),
-    "slope of 95": (
-        f"{HEADER}\n{ROW.replace(',5,', ',95,')}",
-        r"row 1, slope_deg: got 95; is it in percent\? then name the column slope_percent; expected -45 to 45",
-    ),
-    "speed in m/s is a number, mass negative is not": (
-        f"{HEADER}\n{ROW.replace('13.1', '-13.1')}",
-        r"row 1, total_mass_kg: got -13\.1; expected 0\.1 to 500",
-    ),
     "zero voltage everywhere": (
         f"{HEADER}\n6T2A,0,13.1,0,5,0,0,0",
         r"supply_voltage_V is 0 in every row, so nothing drives the motors; expected rows with a command",
@@ -203,19 +195,6 @@ REFUSED = {
     "zero voltage of one that runs": (
         f"{HEADER}\n{ROW}\n{ROW.replace(',15,', ',0,')}",
         r"row 2, motor_speed_rpm: got 4800 although supply_voltage_V is 0; give the command that drives it, or remove the row",
-    ),
-    "NaN of a condition": (f"{HEADER}\n{ROW.replace(',5,', ',NaN,')}", r"row 1, slope_deg: got NaN; expected -45 to"),
-    "NA of what is imposed": (f"{HEADER}\n{ROW.replace('15', 'NA')}", r"supply_voltage_V: got NA; expected a number"),
-    "a number with an underscore": (f"{HEADER}\n{ROW.replace('4800', '48_00')}", r"got 48_00; .*expected a number"),
-    "infinity": (f"{HEADER}\n{ROW.replace('4800', 'inf')}", r"motor_speed_rpm: got inf"),
-    "no number": (
-        f"{HEADER}\n{ROW.replace('4800', 'fast')}",
-        r"motor_speed_rpm: got fast; expected a number, -1e\+06",
-    ),
-    "empty condition": (f"{HEADER}\n{ROW.replace(',5,', ',,')}", r"row 1, slope_deg: got an empty cell; expected a"),
-    "no configuration": (
-        f"{HEADER}\n{ROW.replace('6T2A', '')}",
-        r"configuration: got an empty cell; expected the name of one of the robot's configurations",
     ),
     "unknown surface": (
         f"{HEADER},surface\n{ROW},ice",
@@ -253,13 +232,11 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+@pytest.mark.parametrize("case", REFUSED)
 def test_bad_tables_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
-    with pytest.raises(BadData, match=sentence) as refusal:
+    with refused(sentence):
         read(tmp_path, text)
-    assert "\n" not in str(refusal.value)
-    assert refusal.value.exit_code == 4
 
 
 # --- as spreadsheets and people write them -----------------------------------------------------------
@@ -278,7 +255,7 @@ def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
     assert usual.notes == ()
 
 
-@pytest.mark.parametrize(("encoding", "said"), [("utf-16", "is read as UTF-16"), ("cp1252", "read as Windows-1252")])
+@pytest.mark.parametrize("encoding, said", [("utf-16", "is read as UTF-16"), ("cp1252", "read as Windows-1252")])
 def test_tables_in_other_encodings_are_read_and_said(tmp_path, encoding, said):
     text = f"{HEADER},Öl [µm]\n{ROW},1\n"
     usual = read(tmp_path, text)
@@ -292,7 +269,7 @@ def test_tables_in_other_encodings_are_read_and_said(tmp_path, encoding, said):
 def test_bytes_that_are_no_text_are_refused(tmp_path):
     for content in (b"\x89PNG\r\n\0\0\xff", b"\xff\xfea\0b"):
         (tmp_path / "runs.csv").write_bytes(content)
-        with pytest.raises(BadData, match=r"runs\.csv: cannot be read as a text file \(.*; save it as CSV in UTF-8"):
+        with refused(r"runs\.csv: cannot be read as a text file \(.*; save it as CSV in UTF-8"):
             records.read_runs(tmp_path / "runs.csv")
 
 
@@ -312,7 +289,7 @@ def test_copies_of_rows_are_said(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "cell", "says"),
+    "column, cell, says",
     [
         (
             "supply_voltage_V",
@@ -341,12 +318,20 @@ def test_copies_of_rows_are_said(tmp_path):
         ("slope_deg", "5 furlongs", "write only the number, in deg; expected a number, -45 to 45"),
         ("slope_deg", "nan", "got nan; expected -45 to 45"),
         ("motor_speed_rpm", "--", "leave the cell empty if there is no reading; expected a number"),
+        ("slope_deg", "95", r"got 95; is it in percent\? then name the column slope_percent; expected -45 to 45"),
+        ("slope_deg", "", "got an empty cell; expected a"),
+        ("total_mass_kg", "-13.1", r"got -13\.1; expected 0\.1 to 500"),
+        ("supply_voltage_V", "NA", "got NA; expected a number"),
+        ("motor_speed_rpm", "48_00", "got 48_00; .*expected a number"),
+        ("motor_speed_rpm", "inf", "got inf"),
+        ("motor_speed_rpm", "fast", r"got fast; expected a number, -1e\+06"),
+        ("configuration", "", "got an empty cell; expected the name of one of the robot's configurations"),
         ("motor_speed_rpm", "1e9", r"got 1e9; expected -1e\+06 to 1e\+06"),
     ],
 )
-def test_units_and_words_in_cells_get_a_hint(tmp_path, column, cell, says):
+def test_a_cell_that_cannot_be_is_refused_with_a_hint(tmp_path, column, cell, says):
     row = dict(zip(HEADER.split(","), ROW.split(","), strict=True)) | {column: cell}
-    with pytest.raises(BadData, match=rf"^runs\.csv row 1, {column}: .*{says}"):
+    with refused(rf"^runs\.csv row 1, {column}: .*{says}"):
         read(tmp_path, f"{HEADER}\n{','.join(row.values())}\n")
 
 
@@ -357,7 +342,7 @@ def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
     said = str(error.value)
     assert said.startswith("runs.csv row 2, motor_speed_rpm: got fast; expected a number")
     assert said.index("; also row 4, supply_voltage_V: got -50000") < said.index("; row 4, total_current_A: got inf")
-    with pytest.raises(BadData, match=r"expected .* 1e\+06; also row 2, motor_speed_rpm: got fast; row 3"):
+    with refused(r"expected .* 1e\+06; also row 2, motor_speed_rpm: got fast; row 3"):
         read(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 3]))
 
 

@@ -21,7 +21,7 @@ from mmrjax.fidelities.steady import results_of_rows
 from mmrjax.model import paper_robots, params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
-from tests.commands import read_rig, read_table
+from tests.commands import read_rig, read_table, refused
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -96,7 +96,7 @@ def test_a_mass_that_was_weighed_is_off_by_no_more_than_that_of_the_packaged_rob
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize(("kind", "imposed"), RIGS)
+@pytest.mark.parametrize("kind, imposed", RIGS)
 def test_every_effect_of_a_rigs_size_is_read_again_as_it_was_written(tmp_path, kind, imposed):
     robot, _, library = rig(kind, imposed, tmp_path)
     off_library = 0
@@ -132,7 +132,7 @@ def test_effects_of_turns_of_a_rigs_size_are_read_again_as_they_were_written(tmp
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize(("kind", "imposed"), RIGS)
+@pytest.mark.parametrize("kind, imposed", RIGS)
 def test_an_instrument_is_off_by_no_more_than_a_share_of_what_it_shows(tmp_path, kind, imposed):
     robot, runs, library = rig(kind, imposed, tmp_path)
     size = dict(zip(runs.layout.measured_columns, np.sqrt(np.nanmean(runs.measured() ** 2, 0)), strict=True))
@@ -191,7 +191,7 @@ def test_one_class_for_the_same_factors():
 
 @pytest.mark.parametrize("stated", ["3", "[1, 2]", "[1, 2, 0]", '[1, 2, "x"]'])
 def test_factors_are_three_positive_numbers(tmp_path, stated):
-    with pytest.raises(BadConfiguration, match=r"effects\.churning\.scaled: got .* expected three factors above 0"):
+    with refused(r"effects\.churning\.scaled: got .* expected three factors above 0", BadConfiguration):
         read_rig(tmp_path, f"[effects.churning]\nscaled = {stated}\namplitude = 0.0\n", "robot.toml")
 
 

@@ -14,7 +14,7 @@ from calibration.discovery import candidates, log_simulation, log_stages, search
 from calibration.discovery.active_set import candidate_space
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.loop_notes import MissedChannel
-from calibration.discovery.result import EffectRanking, RankedEffect
+from calibration.discovery.result import EffectRanking, EffectScore
 from calibration.discovery.settings import settings_for
 from calibration.inference.blocks import predict_unseen
 from calibration.inference.observers import Histories
@@ -45,12 +45,12 @@ def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_it
     ]  # fmt: skip
     z = np.linspace(-0.4, 0.5, len(space.coordinates))
     mine = problem.coordinates.with_effects(indices[0]).robot(problem.base, jnp.asarray(z))
-    every = space.coordinates.with_effects(space.library.indices(("brush_drop", "")))
+    every = space.coordinates.with_effects(space.coordinates.indices(("brush_drop", "")))
     whole = every.robot(space.equipped.base, jnp.asarray(z))
     (one,) = (e for e in mine.effects if e.name == "brush_drop")
     (other,) = (e for e in whole.effects if e.name == "brush_drop")
     assert float(one.amplitude) == float(other.amplitude) != 0
-    assert float(mine.motor.resistance) == float(whole.motor.resistance)
+    assert mine.motor.resistance == whole.motor.resistance
 
 
 def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
@@ -86,9 +86,9 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
 
 RANKING = EffectRanking(
     True, 0.002, 9.0,
-    (RankedEffect("churning", "loss torque that changes with speed", "N·m", 412.0, 0.0123, 0.0004),
-     RankedEffect("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05),
-     RankedEffect("bending_loss", "loss torque that changes with speed", "N·m", 430.0, -0.01, 0.001, True)),
+    (EffectScore("churning", "track", 412.0, 0.0123, 1.0, 0.0004, "loss torque that changes with speed", "N·m"),
+     EffectScore("brush_drop", "electrical", 4.0, 0.1, 1.0, 0.05, "voltage drop that changes with current", "V"),
+     EffectScore("bending_loss", "track", 430.0, -0.01, 1.0, 0.001, "loss torque that changes with speed", "N·m", True)),
 )  # fmt: skip
 
 
@@ -276,7 +276,7 @@ def linear(space):
 def test_linear_readings_are_those_of_the_simulation_at_and_near_the_fit(space, linear):
     z, problem = linear
     near = z + 1e-4 * np.linspace(-1, 1, space.free)
-    counts = np.asarray(space.weight) > 0
+    counts = space.weight > 0
     for at, atol in ((z, 1e-10), (near, 1e-6)):
         simulated = np.asarray(space.bare.observe.at(space.bare, at)[2].reading)
         changed = np.max(np.abs(simulated), 0)
@@ -293,7 +293,7 @@ def test_linear_readings_change_with_a_small_amplitude_as_the_simulation_does(sp
     def change(space):
         fits = [space.fit_of(active, np.where(np.arange(len(some)) < len(z), some, x)) for x in (some, 0.0)]
         with_effect, without = (problem.observe.at(problem, z, sets)[2].reading for problem, z, sets in fits)
-        return np.asarray(with_effect - without)[np.asarray(space.weight) > 0]
+        return np.asarray(with_effect - without)[space.weight > 0]
 
     linear_change, simulated = change(table), change(space)
     assert np.abs(simulated).max() > 0
@@ -313,7 +313,7 @@ def test_a_row_without_weight_does_not_change_a_linear_fit(space, linear):
 
 
 @pytest.mark.parametrize(
-    ("remain", "room", "chosen"),
+    "remain, room, chosen",
     [((False, False), "", "b"), ((True, False), "", "a c"), ((True, True), "", "a c"), ((False,), "ac", "a")],
 )
 def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, chosen, monkeypatch):
@@ -341,7 +341,7 @@ def test_the_smallest_set_that_a_simulation_confirms_is_proposed(remain, room, c
     assert " ".join(best.effects) == chosen
 
 
-@pytest.mark.parametrize(("cost", "chosen"), [(4.0, "a c"), (1e6, "a")])
+@pytest.mark.parametrize("cost, chosen", [(4.0, "a c"), (1e6, "a")])
 def test_windows_propose_no_larger_set_whose_simulation_leaves_more(cost, chosen, monkeypatch):
     """Windows of EMPS found a second effect, whose simulation left 2000 times as much as the first alone."""
     small, large = (

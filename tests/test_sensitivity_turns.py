@@ -1,7 +1,5 @@
 """Sensitivity of turns: which outputs and inputs they have, and what is refused."""
 
-import csv
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +14,14 @@ from mmrjax.derived import turning_figures
 from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.commands import sensitivity as room
-from tests.commands import ends
+from tests.commands import ends, refused, rows
 
 ROBOT = paper_robots.nominal()
 TURNS = ROBOT.showing_turns()
 
 
-def names(rows):
-    return [row.name for row in rows]
+def names(outputs):
+    return [output.name for output in outputs]
 
 
 def test_turns_have_outputs_of_both_sides_of_the_yaw_and_of_the_radius():
@@ -35,14 +33,14 @@ def test_turns_have_outputs_of_both_sides_of_the_yaw_and_of_the_radius():
 
 @pytest.mark.parametrize("name", ["yaw_rate", "motor_current_left", "turning_radius"])
 def test_outputs_of_turns_are_refused_of_straight_travel_with_what_turns_it(name):
-    with pytest.raises(BadConfiguration, match=f"{name}: the robot travels straight; .* --vary duty_left=0.2:0.8"):
+    with refused(f"{name}: the robot travels straight; .* --vary duty_left=0.2:0.8", BadConfiguration):
         chosen_outputs((name,), ROBOT)
     assert names(chosen_outputs((name,), TURNS, turns=True)) == [name]
 
 
 @pytest.mark.parametrize("name", ["start", "peak_current", "steepest_slope"])
 def test_outputs_of_straight_travel_are_refused_of_turns(name):
-    with pytest.raises(BadConfiguration, match=f"--outputs {name}: only for straight travel"):
+    with refused(f"--outputs {name}: only for straight travel", BadConfiguration):
         chosen_outputs((name,), TURNS, turns=True)
 
 
@@ -67,7 +65,7 @@ def test_radius_is_that_of_the_centre_of_mass():
     ).T
     assert_allclose(turning_figures.turning_radius(ahead, aside, rate), [0.5, -0.6, -0.6, 0.05, np.inf])
     slope = jax.grad(lambda v: turning_figures.turning_radius(v, 0.0, 2.0))(0.3)
-    assert float(slope) == pytest.approx(0.5) and np.isfinite(
+    assert slope == pytest.approx(0.5) and np.isfinite(
         jax.grad(lambda w: turning_figures.turning_radius(0.3, 0.0, w))(0.0)
     )
 
@@ -84,11 +82,11 @@ def test_radius_of_a_run_and_its_derivative():
     found = mm.simulate(ROBOT, asked).reading
     moves = np.hypot(found["speed"], found["lateral_speed"])
     at = next(p.value for p in params.walk_parameters(ROBOT) if p.name == "6T2A.turning.lateral")
-    assert float(of(jnp.asarray(at))) == pytest.approx(float(moves / found["yaw_rate"]), rel=1e-9)
+    assert of(jnp.asarray(at)) == pytest.approx(float(moves / found["yaw_rate"]), rel=1e-9)
     exact = jax.jit(jax.grad(of))(jnp.asarray(at))
     jitted = jax.jit(of)
     difference = (jitted(jnp.asarray(at + 1e-6)) - jitted(jnp.asarray(at - 1e-6))) / 2e-6
-    assert float(exact) == pytest.approx(float(difference), rel=1e-5)
+    assert exact == pytest.approx(float(difference), rel=1e-5)
 
 
 @pytest.mark.slow
@@ -96,5 +94,4 @@ def test_the_yaw_rate_of_a_turn_is_studied(mmrjax, tmp_path):
     told = "--configurations", "6T2A", "--voltages", "24", "--payloads", "0", "--vary", "duty_left=0.4:0.8"
     more = "--method", "local", "--outputs", "yaw_rate,turning_radius", "--no-report", "--out", str(tmp_path / "s")
     ends(mmrjax("sensitivity", *told, *more), "yaw rate", "turning radius", code=0)
-    with (tmp_path / "s/points.csv").open() as file:
-        assert any(row["input"] == "6T2A.turning.lateral" for row in csv.DictReader(file))
+    assert any(row["input"] == "6T2A.turning.lateral" for row in rows(tmp_path / "s/points.csv"))

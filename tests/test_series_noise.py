@@ -15,6 +15,7 @@ from calibration.inference import noise, series_noise
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.time_histories import Histories
 from mmrjax.model import channels, quantities
+from tests.commands import with_columns
 
 SLOPES = np.arange(0.0, 21.0, 5.0)
 
@@ -70,12 +71,11 @@ def test_curvature_makes_it_larger_and_a_wrong_reading_does_not():
     at = np.array([2.0])
     clean = found(table(0.05))[0].sd(at)
     runs = table(0.05)
-    bent = {**runs.columns, "total_current_A": runs["total_current_A"] + 0.02 * runs["slope_deg"] ** 2}
-    assert found(dataclasses.replace(runs, columns=bent))[0].sd(at) > 3 * clean
+    bent = with_columns(runs, total_current_A=runs["total_current_A"] + 0.02 * runs["slope_deg"] ** 2)
+    assert found(bent)[0].sd(at) > 3 * clean
     current = runs["total_current_A"].copy()
     current[7] += 5.0
-    wrong = dataclasses.replace(runs, columns={**runs.columns, "total_current_A": current})
-    assert found(wrong)[0].sd(at) < 2 * clean
+    assert found(with_columns(runs, total_current_A=current))[0].sd(at) < 2 * clean
 
 
 def test_uneven_steps_and_repeats_count_as_they_are():
@@ -93,8 +93,7 @@ def test_uneven_steps_and_repeats_count_as_they_are():
 
 def test_a_display_shows_nothing_finer_than_its_step():
     runs = table(1e-4)
-    rounded = {**runs.columns, "total_current_A": np.round(runs["total_current_A"] / 0.05) * 0.05}
-    shown = found(dataclasses.replace(runs, columns=rounded))[0]
+    shown = found(with_columns(runs, total_current_A=np.round(runs["total_current_A"] / 0.05) * 0.05))[0]
     assert np.all(shown.sd(np.array([0.5, 6.0])) >= 0.05 / np.sqrt(12) * 0.999)
     smooth = found(table(0.0, slopes=np.arange(5.0)))[0]  # as simulated
     assert np.all(smooth.sd(np.array([0.5, 6.0])) >= series_noise.FLOOR * np.array([0.5, 6.0]))
@@ -148,7 +147,7 @@ def test_an_sd_in_per_cent_has_a_part_that_does_not_depend_on_the_reading(stated
     runs = table(0.0)
     current, random = np.linspace(0.01, 10, len(runs)), np.random.default_rng(0)
     alone = {name: random.random(len(runs)) for name in ("slope_deg", "payload_kg")}
-    runs = dataclasses.replace(runs, columns={**runs.columns, **alone, "total_current_A": current})
+    runs = with_columns(runs, **alone, total_current_A=current)
     with np.errstate(invalid="ignore"):
         sd = noise.infer_noise(runs, SettledRuns.sizes(runs), stated).sd[:, 0]
     assert_allclose(sd, 0.02 * np.maximum(current, 0.2 * np.sqrt(np.mean(current**2))))
@@ -169,7 +168,7 @@ def test_readings_of_motors_at_rest_do_not_tell_the_noise_of_those_that_turn():
     runs = table(0.05, slopes=np.linspace(0, 20, 121), payloads=(0.0,), volts=(15.0,))
     turning = np.maximum(600 - 57 * runs["slope_deg"], 0.0)
     speed = turning + np.where(turning > 0, 3.0, 0.0) * np.random.default_rng(4).standard_normal(121)
-    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed})
+    runs = with_columns(runs, motor_speed_rpm=speed)
     _, motor, _ = found(runs)
     assert_allclose(motor.sd(quantities.RPM * np.array([30.0, 600.0])) / quantities.RPM, 3.0, rtol=0.35)
 

@@ -14,6 +14,7 @@ from calibration.discovery.candidates import fit_base
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import Histories, settled_ends, time_histories
 from mmrjax.effects import BY_NAME
+from tests.commands import with_columns
 
 #: An analyst who knows nothing of the ground but what the nominal robot's file says (0.32 and 0.38, 20 mm/s).
 ANALYST = Analyst(
@@ -55,7 +56,7 @@ def is_global(adhesion, creep, seed=3):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("adhesion", "creep"),
+    "adhesion, creep",
     [
         ((0.2, 0.25), 0.005),
         ((0.35, 0.9), 0.01),  # a friction of wheels that rises until it slides has a valley of its own, 8 above
@@ -112,14 +113,14 @@ def test_a_reading_that_still_changes_has_no_settled_end(gripping):
     mine = runs["run_id"] == "start4"
     current = runs["total_current_A"].copy()
     current[mine] += 2.0 * runs["time_s"][mine]  # 2 A/s
-    changed = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
+    changed = with_columns(runs, total_current_A=current)
     before, after = (settled_ends.settled_ends_of_runs(ANALYST.space(r).bare).mean for r in (runs, changed))
     assert np.isfinite(before[4, 0]) and np.isnan(after[4, 0])
     assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))
 
 
 @pytest.mark.parametrize(
-    ("configurations", "regression", "tries"), [(1, True, (4, 2)), (2, True, (96, 8)), (1, False, (96, 8))]
+    "configurations, regression, tries", [(1, True, (4, 2)), (2, True, (96, 8)), (1, False, (96, 8))]
 )
 def test_beside_the_regression_of_one_configuration_few_searches_are_tried(
     monkeypatch, configurations, regression, tries

@@ -161,8 +161,8 @@ def test_the_beginning_of_a_history_has_derivatives():
 def test_an_instrument_without_sign_shows_magnitude():
     rig = Rig(instruments=(Instrument("total_current", signed=False),))
     signed, plain = (steady_batch(r, Conditions(motor_speed=SPEEDS)).total_current for r in (bench(), bench(rig)))
-    assert_allclose(plain, np.abs(np.asarray(signed)), rtol=1e-12)
-    assert (np.asarray(signed) < 0).any()
+    assert_allclose(plain, np.abs(signed), rtol=1e-12)
+    assert (signed < 0).any()
 
 
 def test_power_of_a_shaft_adds_up():
@@ -186,10 +186,8 @@ def test_loads_state_what_they_can_do(robot):
     )
     assert load.mass == 0 and load.on_tracks == 0 and load.speed_grip == np.inf  # nothing slides
     assert chassis.torque_constant == chassis.torque_gravity == 0 and not chassis.has_two_bodies
-    assert float(load.torque_weight(5.0, 0.1)) == pytest.approx(0.5)  # whatever a vehicle's mass and slope
-    assert float(chassis.torque_weight(5.0, 0.1)) == pytest.approx(
-        5.0 * 9.80665 * np.sin(0.1) * float(chassis.radius)
-    )
+    assert load.torque_weight(5.0, 0.1) == pytest.approx(0.5)  # whatever a vehicle's mass and slope
+    assert chassis.torque_weight(5.0, 0.1) == pytest.approx(5.0 * 9.80665 * np.sin(0.1) * float(chassis.radius))
     assert vehicle.shows_travel and not bench(Rig(channels=("total_current",))).shows_travel
 
 

@@ -1,7 +1,5 @@
 """`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
 
-import csv
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -14,7 +12,7 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import energy
 from mmrjax.model.signals import STATUSES
 from sweeps.commands.missions import select_course_rows
-from tests.commands import ends, read_json, text_file
+from tests.commands import columns_of, ends, read_json, text_file
 
 #: Up a slope, to a stop, and back; twice.
 MISSION = """\
@@ -48,19 +46,6 @@ def tmp_path(tmp_path_factory):
     return folder
 
 
-def rows(path):
-    with path.open() as stream:
-        table = list(csv.DictReader(stream))
-
-    def cell(text):
-        try:
-            return float(text) if text else np.nan
-        except ValueError:
-            return text
-
-    return {name: np.array([cell(row[name]) for row in table]) for name in table[0]}
-
-
 @pytest.fixture
 def done(mmrjax, tmp_path):
     """The folder of one mission on the battery, made once."""
@@ -75,7 +60,7 @@ def done(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_segments_add_up_to_the_mission(done):
-    segments, table = rows(done / "segments.csv"), rows(done / "runs.csv")
+    segments, table = columns_of(done / "segments.csv"), columns_of(done / "runs.csv")
     assert list(segments["cycle"]) == [1] * 7 + [2] * 7 and list(segments["segment"]) == [*range(1, 8)] * 2
     assert list(segments["mode"][:7]) == ["speed"] * 3 + ["brake"] + ["speed"] * 2 + ["brake"]
     for column in ("duration_s", "distance_m", "energy_Wh", *(f"energy_to_{name}_Wh" for name in energy.SINKS)):
@@ -88,7 +73,7 @@ def test_segments_add_up_to_the_mission(done):
 
 @pytest.mark.slow
 def test_history_follows_the_demand_and_holds_each_segments_peak(done):
-    history, segments = rows(done / "history.csv"), rows(done / "segments.csv")
+    history, segments = columns_of(done / "history.csv"), columns_of(done / "segments.csv")
     assert (np.diff(history["time_s"]) > 0).all() and history["time_s"][-1] == pytest.approx(10)
     cruise = (history["segment"] == 2) & (history["time_s"] % 5 > 1)
     assert_allclose(history["speed_mm_s"][cruise], 300, rtol=0.01)
@@ -120,7 +105,7 @@ def test_runs_of_a_file_follow_the_same_profile(mmrjax, tmp_path):
         result["missions"][0]["energy_Wh"] > 1.5 * result["missions"][1]["energy_Wh"]
     )  # tracks cost more than wheels
     assert result["missions"][0]["state_of_charge"] is None
-    assert list(rows(folder / "segments.csv")["run_id"]) == ["a"] * 14 + ["b"] * 14
+    assert list(columns_of(folder / "segments.csv")["run_id"]) == ["a"] * 14 + ["b"] * 14
     assert Tables((folder / "report.html").read_text()).tables["runs"][0][1].startswith("a: 6T2A")
 
 
@@ -132,11 +117,8 @@ def test_battery_that_ends_in_the_mission_is_said(mmrjax, tmp_path):
     assert result["status"] == "battery_empty" and 2 < result["duration_s"] < 5
     assert result["endurance_s"] == pytest.approx(result["duration_s"])
     assert result["state_of_charge"] == pytest.approx(0, abs=1e-6)
-    segments = rows(tmp_path / "empty/segments.csv")
+    segments = columns_of(tmp_path / "empty/segments.csv")
     assert len(segments["status"]) < 7 and segments["status"][-1] == "battery_empty"
-
-
-# --- what is refused ------------------------------------------------------------------------------------------------
 
 
 # --- rows of the history --------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import json
 import os
 import sqlite3
 import sys
+import zipfile
 
 import numpy as np
 import pandas as pd
@@ -16,10 +17,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.data import contents, delimited, input_files, profiles, robot_file, terrains
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
+from calibration.data.named_arrays import column_numbers
 from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import Clock, Signal, find_signal
 from sweeps.commands import inspect as command
-from tests.commands import text_file
+from tests.commands import refused, text_file
 
 RIG = """
 base = "none"
@@ -160,12 +162,12 @@ def test_samples_that_are_recorded_late_are_sorted_by_their_stamps():
     assert_array_equal(values["late"], 10 * np.arange(8.0))
     assert found.tolist() == list(range(8)) and "1 sample of c arrived late" in notes[0]
     back = Signal("back", 60, lambda: np.zeros(60), clock=Clock("c", lambda: np.tile(np.arange(30.0), 2), "s"))
-    with pytest.raises(BadData, match="log, c: goes back from 29 to 0 s at sample 31"):
+    with refused("log, c: goes back from 29 to 0 s at sample 31"):
         one_clock.signals_on_one_grid("log", {"back": back}, lambda c: False, lambda c: True, "")
 
 
 @pytest.mark.parametrize(
-    ("stamps", "unit"),
+    "stamps, unit",
     [
         (np.arange(50) * 0.01, "s"), (np.arange(50) * 10, "ms"), (np.arange(50) * 10_000, "us"),
         (np.arange(50) * 10**7, "ns"), (1.7e9 + np.arange(50), "s"), (1_700_000_000_000 + np.arange(50), "ms"),
@@ -206,14 +208,14 @@ def test_a_missing_topic_is_named_with_the_nearest(tmp_path, robot):
 def test_a_unit_that_a_source_states_is_not_read_as_another(tmp_path, robot):
     samples.ros2(tmp_path / "bag", samples.fast(), samples.slow())
     columns = {"supply_voltage_V": "/volts.data", "motor_speed_rpm": "/joint_states.velocity[2]"}
-    with pytest.raises(BadData, match=r"states rad_s in the source, and is read in rpm"):
+    with refused(r"states rad_s in the source, and is read in rpm"):
         records.read_runs(tmp_path / "bag", robot, columns=columns)
 
 
 def test_signals_are_named_by_the_end_of_their_path_and_by_their_place(tmp_path, robot):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
     assert find_signal(opened(tmp_path / "log.h5").signals, "volts", "log.h5").path == "/drive/volts"
-    with pytest.raises(BadData, match=r"log.h5, t: the name fits 2 signals, /drive/t, /encoder/t"):
+    with refused(r"log.h5, t: the name fits 2 signals, /drive/t, /encoder/t"):
         find_signal(opened(tmp_path / "log.h5").signals, "t", "log.h5")
     below = records.read_runs(f"{tmp_path / 'log.h5'}::/drive", robot, columns=COLUMNS)
     assert len(below) == 200 and not below.has("motor_speed_rpm")
@@ -233,16 +235,10 @@ def test_a_long_csv_file_is_read_as_a_short_one(tmp_path, monkeypatch):
     long = delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
     assert isinstance(long.values[1], np.ndarray) and long.header == short.header and long.digest == short.digest
     for mine, theirs in zip(long.values, short.values, strict=True):
-        assert_array_equal(delimited_numbers(mine), delimited_numbers(theirs))
+        assert_array_equal(column_numbers(mine), column_numbers(theirs))
     assert list(long.values[4]) == short.values[4]
-    with pytest.raises(BadData, match="row 4: got 2 cells; the header has 5 columns"):
+    with refused("row 4: got 2 cells; the header has 5 columns"):
         delimited.read_csv_columns(text_file(tmp_path / "log.csv", text + "1,2\n"), "log.csv")
-
-
-def delimited_numbers(raw):
-    from calibration.data.named_arrays import column_numbers
-
-    return column_numbers(raw)
 
 
 # --- bad input --------------------------------------------------------------------------------------
@@ -256,9 +252,8 @@ def _cut(path, share=0.6):
 def test_a_cut_table_is_refused_in_one_sentence(tmp_path, robot, file):
     TABLES[file](tmp_path / file, samples.table())
     _cut(tmp_path / file)
-    with pytest.raises(BadData, match=rf"^{file}.*cannot be read as .*; it may be cut off") as refusal:
+    with refused(rf"^{file}(?!.{{450}}).*cannot be read as .*; it may be cut off"):
         records.read_runs(tmp_path / file, robot, columns=COLUMNS)
-    assert "\n" not in str(refusal.value) and len(str(refusal.value)) < 450
 
 
 @pytest.mark.parametrize("file", ["log.h5", "log.mf4", "log.ulg", "log.bag", "mcap"])
@@ -270,34 +265,34 @@ def test_a_cut_log_is_refused_in_one_sentence(tmp_path, robot, file):
         file = "mcap.mcap"
     _cut(tmp_path / file, 0.3 if file == "log.bag" else 0.61)
     before = set(os.listdir(tmp_path))
-    with pytest.raises(BadData, match=rf"^{file}") as refusal:
+    with refused(f"^{file}"):
         records.read_runs(
             tmp_path / file,
             robot,
             columns={"supply_voltage_V": volts, "total_current_A": amps, "motor_speed_rpm": rpm},
         )
-    assert "\n" not in str(refusal.value) and set(os.listdir(tmp_path)) == before
+    assert set(os.listdir(tmp_path)) == before
 
 
-def _other_length(path):
-    np.savez(path, **{**samples.table(), "rpm": np.zeros(7)})
-
-
-def _objects(path):
-    np.savez(path, **{**samples.table(), "rpm": np.array([{}] * 200, object)})
+def _with_speeds(path, speeds):
+    np.savez(path, **{**samples.table(), "rpm": speeds})
 
 
 def _outside(path):
-    import zipfile
-
     np.savez(path, **samples.table())
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("../../rpm.npy", b"")
 
 
 BAD_ARCHIVES = {
-    "another length": (_other_length, "rpm: has 7 values, and .* has 200; expected equal lengths"),
-    "objects": (_objects, "rpm: holds objects; expected numbers or words"),
+    "another length": (
+        lambda path: _with_speeds(path, np.zeros(7)),
+        "rpm: has 7 values, and .* has 200; expected equal lengths",
+    ),
+    "objects": (
+        lambda path: _with_speeds(path, np.array([{}] * 200, object)),
+        "rpm: holds objects; expected numbers or words",
+    ),
     "a path outside": (_outside, "../../rpm.npy: is a path that points outside the archive"),
 }
 
@@ -306,7 +301,7 @@ BAD_ARCHIVES = {
 def test_an_array_that_cannot_be_is_refused_by_its_name(tmp_path, robot, case):
     write, says = BAD_ARCHIVES[case]
     write(tmp_path / "log.npz")
-    with pytest.raises(BadData, match=says):
+    with refused(says):
         records.read_runs(tmp_path / "log.npz", robot, columns=COLUMNS)
 
 
@@ -315,7 +310,7 @@ def test_values_that_a_library_cannot_read_are_refused_by_their_signal(tmp_path,
     content = bytearray((tmp_path / "log.parquet").read_bytes())
     content[40:400] = bytes(360)  # within the first column's pages; the list of columns at the end is sound
     (tmp_path / "log.parquet").write_bytes(content)
-    with pytest.raises(BadData, match=r"log.parquet, t: cannot be read as a Parquet file .* damaged"):
+    with refused(r"log.parquet, t: cannot be read as a Parquet file .* damaged"):
         records.read_runs(tmp_path / "log.parquet", robot, columns=COLUMNS)
 
 
@@ -324,11 +319,11 @@ def test_a_link_to_another_file_is_not_followed(tmp_path, robot):
 
     with h5py.File(tmp_path / "log.h5", "w") as file:
         file["volts"] = h5py.ExternalLink("/etc/passwd", "/")
-    with pytest.raises(BadData, match=r"volts: is a link to another file, /etc/passwd"):
+    with refused(r"volts: is a link to another file, /etc/passwd"):
         records.read_runs(tmp_path / "log.h5", robot)
     samples.ros2(tmp_path / "bag", samples.fast(0.1), samples.slow(0.1))
     (tmp_path / "bag/more.db3").symlink_to("/etc/passwd")
-    with pytest.raises(BadData, match=r"bag, more.db3: is a link that points outside the bag"):
+    with refused(r"bag, more.db3: is a link that points outside the bag"):
         records.read_runs(tmp_path / "bag", robot)
 
 
@@ -352,7 +347,7 @@ def test_a_topic_of_two_types_or_without_definition_is_refused_where_it_is_read(
     kinds = {s.path: s.refused for s in opened(tmp_path / "bag").signals}
     assert "messages of type mine/msg/Own, which the bag does not define; record it as MCAP" in kinds["/own"]
     assert "types std_msgs/msg/Float32 and std_msgs/msg/Float64; expected one type" in kinds["/volts"]
-    with pytest.raises(BadData, match=r"bag, /volts: has messages of types"):
+    with refused(r"bag, /volts: has messages of types"):
         records.read_runs(tmp_path / "bag", robot, columns={"supply_voltage_V": "/volts"})
 
 
@@ -360,21 +355,21 @@ def test_an_array_that_changes_its_length_is_refused_with_its_message(tmp_path):
     fast, slow = samples.fast(0.2), samples.slow(0.2)
     samples.ros2(tmp_path / "bag", fast, slow, lose=True)
     signal = find_signal(opened(tmp_path / "bag").signals, "/joint_states.velocity[0]", "bag")
-    with pytest.raises(BadData, match=r"/joint_states.*: message \d has fewer elements than the first"):
+    with refused(r"/joint_states.*: message \d has fewer elements than the first"):
         signal.load()
 
 
 def test_a_library_that_is_missing_is_named_with_the_extra(tmp_path, robot, monkeypatch):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(BadData, match=r"reading it needs h5py, which is not installed: pip install mmrjax\[logs\]"):
+    with refused(r"reading it needs h5py, which is not installed: pip install mmrjax\[logs\]"):
         records.read_runs(tmp_path / "log.h5", robot)
 
 
 def test_a_recording_larger_than_memory_is_refused_before_it_is_read(tmp_path, robot, monkeypatch):
     samples.parquet(tmp_path / "log.parquet", samples.table())
     monkeypatch.setattr(input_files, "available_memory", lambda: 1e4)
-    with pytest.raises(BadData, match="GB of memory are free"):
+    with refused("GB of memory are free"):
         records.read_runs(tmp_path / "log.parquet", robot, columns=COLUMNS)
     monkeypatch.setattr(input_files, "available_memory", lambda: 1e3)
     assert "memory are free" in contents.inspect_source(tmp_path / "log.parquet").signals[0].refused
@@ -415,14 +410,14 @@ def test_inspect_prints_what_contents_finds(tmp_path, capsys):
 def test_contents_of_an_empty_file_are_an_error_and_empty_cells_are_missing(tmp_path):
     (tmp_path / "log.csv").write_text("t,amps\n0,\n1,\n")
     assert [s.missing for s in contents.inspect_source(tmp_path / "log.csv").signals] == [0, 2]
-    with pytest.raises(BadData, match="the file is empty"):
+    with refused("the file is empty"):
         contents.inspect_source(text_file(tmp_path / "log.csv", ""))
 
 
 def test_a_bags_folder_without_its_metadata_is_named(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag/bag_0.mcap").touch()
-    with pytest.raises(BadData, match=r"without metadata\.yaml; .* as .*bag_0\.mcap"):
+    with refused(r"without metadata\.yaml; .* as .*bag_0\.mcap"):
         contents.inspect_source(tmp_path / "bag")
 
 

@@ -1,5 +1,6 @@
 """Stages in files: what is read is what was written, to the bit, and no file runs code or names what it may not."""
 
+import contextlib
 import dataclasses
 import os
 import pickle
@@ -176,10 +177,6 @@ def test_effects_are_those_of_the_file_that_is_read_and_not_of_bytes_beside_it(t
     )
     assert os.path.exists(importlib.util.cache_from_source(str(file)))
     file.write_text(OWN)
-    before = os.getcwd()
-    os.chdir(tmp_path)
-    try:
+    with contextlib.chdir(tmp_path):
         (mine,) = effect_file.read_effect_file(file)
-    finally:
-        os.chdir(before)
     assert mine.name == "mine" and not (tmp_path / "harmed").exists()

@@ -88,7 +88,7 @@ def looks(request):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "truth"), [({"lead": 0.8}, NOMINAL + 0.8), ({"resistance": 1.3}, 1.3)], ids=["leads", "winding"]
+    "wrong, truth", [({"lead": 0.8}, NOMINAL + 0.8), ({"resistance": 1.3}, 1.3)], ids=["leads", "winding"]
 )
 def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     analyst, grid = looks

@@ -83,8 +83,8 @@ def test_steady_downhill_gearbox_never_gives_power(robot):
     slopes = np.linspace(-0.25, 0.0, 26)
     answer = steady_batch(robot, Conditions(voltage=24.0, slope_deg=np.degrees(slopes), configuration=1))
     assert set(names(answer)) == {"converged"}
-    assert (np.asarray(answer.power_motor) >= np.asarray(answer.power_gear)).all()
-    assert (np.asarray(answer.power_gear) < 0).any()  # the robot does overhaul its drive
+    assert (answer.power_motor >= answer.power_gear).all()
+    assert (answer.power_gear < 0).any()  # the robot does overhaul its drive
     assert (np.diff(answer.total_current) > 0).all()
 
 
@@ -96,7 +96,7 @@ def one(robot, **conditions):
 
 
 @pytest.mark.parametrize(
-    ("conditions", "status"),
+    "conditions, status",
     [
         (dict(), "converged"),
         (dict(voltage=[0.5], slope_deg=np.degrees(0.1)), "stalled"),
@@ -130,7 +130,7 @@ def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
     load = 0.350 + r * m * paper.G * (0.2 * 0.3 * np.cos(alpha) + 0.06 * np.cos(alpha) + np.sin(alpha))
     voltage = 0.611 * (load / (48 * 0.74) + 0.0027 + 0.0003) / 0.0259
     below, above = (one(robot, voltage=[voltage * k], slope_deg=5.0) for k in (0.9999, 1.0001))
-    assert float(below.motor_speed) == 0.0 < float(above.motor_speed)
+    assert below.motor_speed == 0.0 < above.motor_speed
     assert STATUSES[int(below.status)] == "stalled"
 
 
@@ -142,9 +142,9 @@ def test_steady_stands_until_shafts_and_robot_are_faster_than_rest(robot):
     answer = steady_batch(robot, runs)
     slow = np.minimum(np.asarray(answer.speed), np.asarray(answer.theoretical_speed)) < 2e-3
     assert slow.any() and not slow.all()
-    assert (np.asarray(answer.status) == np.where(slow, STATUSES.index("stalled"), 0)).all()
+    assert (answer.status == np.where(slow, STATUSES.index("stalled"), 0)).all()
     ends = drive_batch(robot, runs, jnp.asarray([0.0, 30.0])).result
-    agree = np.asarray(answer.status) == np.asarray(ends.status)
+    agree = answer.status == ends.status
     assert agree.sum() >= len(voltages) - 2  # but for the edge itself
     moving = ~slow & agree
     assert_allclose(ends.speed[moving], answer.speed[moving], rtol=1e-3)
@@ -152,7 +152,7 @@ def test_steady_stands_until_shafts_and_robot_are_faster_than_rest(robot):
 
 
 @pytest.mark.parametrize(
-    ("conditions", "flags"),
+    "conditions, flags",
     [
         (dict(voltage=[15.0], configuration=1), set()),
         (dict(voltage=[24.0], configuration=1), {"gearbox_overspeed"}),

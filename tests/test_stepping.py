@@ -46,7 +46,7 @@ def test_states_hold_numbers_in_si_units_and_rates_are_those_of_drive(robot):
         sizes = jnp.asarray(drive.drive_units(one))
         y = jnp.stack([jnp.asarray(x, float) for x in (3.0, 500.0, 0.4, 1.5, 0.0, *state.memory.values())]) / sizes
         wanted = drive.state_of_unknowns(one, rates_of_unknowns(one, conditions, y))
-        assert float(found.distance) == 0.4 and float(found.current) != 0
+        assert found.distance == 0.4 and float(found.current) != 0
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
             assert_allclose(a, b, rtol=1e-12)
 
@@ -154,7 +154,7 @@ def test_derivatives_of_a_step_are_differences(kind, robot, bench):
     (speed, _), slope = mapped(state, duties, conditions)
     h = 1e-5
     ahead, behind = (mm.step(one, state, 0.9 + d, DT, conditions).speed_motor for d in (h, -h))
-    assert (np.asarray(slope) > 0).all()
+    assert (slope > 0).all()
     assert_allclose(slope[1], (ahead - behind) / (2 * h), rtol=1e-5)
     with jax.enable_x64(False):
         (rough, _), rough_slope = mapped(mm.initial_state(one, conditions), jnp.asarray([0.3, 0.9]), conditions)
@@ -166,7 +166,7 @@ def test_a_robot_rolls_at_first_as_steady_travels(robot):
     conditions = RUNS["wheeled"]
     state = mm.initial_state(robot, conditions, rolling=True)
     rate = mm.rates(robot, state, None, conditions)
-    assert float(state.speed) > 0.3 and abs(float(rate.speed)) < 1e-9 and abs(float(rate.speed_motor)) < 1e-6
+    assert state.speed > 0.3 and abs(rate.speed) < 1e-9 and abs(rate.speed_motor) < 1e-6
 
 
 WRONG = {

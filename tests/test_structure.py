@@ -6,6 +6,7 @@ import graphlib
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import PurePosixPath
 
 import pytest
@@ -25,39 +26,18 @@ def walked(tree):
     return list(ast.walk(tree))
 
 
-def imports(tree, package):
-    """Names of imported modules with their lines, anywhere in a module of `package`."""
-    found = []
-    for node in walked(tree):
-        if isinstance(node, ast.Import):
-            found += [(alias.name, node.lineno) for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            if node.level:
-                parts = package.split(".")
-                base = ".".join(parts[: len(parts) - node.level + 1])
-                found.append((f"{base}.{node.module}" if node.module else base, node.lineno))
-            else:
-                found.append((node.module or "", node.lineno))
-        elif (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Name | ast.Attribute)
-            and getattr(node.func, "attr", getattr(node.func, "id", "")) in ("import_module", "__import__")
-            and ast.unparse(node.func) in ("importlib.import_module", "import_module", "__import__")
-            and node.args
-            and isinstance(node.args[0], ast.Constant)
-        ):
-            found.append((str(node.args[0].value), node.lineno))
-    return found
+@functools.cache
+def sources():
+    """Text of every module of the layers, by path."""
+    files = (file for layer in LAYERS for file in sorted((ROOT / layer).rglob("*.py")))
+    return {file.relative_to(ROOT).as_posix(): file.read_text(encoding="utf-8") for file in files}
 
 
-def names_imported(tree, package):
-    """As `imports`, with what is imported from a module too, `module.name`."""
-    found = imports(tree, package)
-    for node in walked(tree):
-        if isinstance(node, ast.ImportFrom):
-            ((module, _),) = imports(ast.Module([node], []), package)
-            found += [(f"{module}.{alias.name}", node.lineno) for alias in node.names]
-    return found
+def imported(node):
+    """Names that a statement imports: modules, or `module.name`. None if it is no import. No import is relative."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    return [f"{node.module}.{alias.name}" for alias in node.names] if isinstance(node, ast.ImportFrom) else []
 
 
 def prose(tree):
@@ -122,12 +102,11 @@ def balances_alone_sum_terms(path, tree):
 def figures_wait_for_the_page(path, tree):
     """A command imports figures and pages once it draws: they cost half a second before the answer."""
     if path.parent.as_posix() == "sweeps/commands":
-        head = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
-        rooms = {(".".join(name.split(".")[:3]), line) for name, line in names_imported(head, "sweeps.commands")}
-        for name, line in rooms:
-            drawn = name.startswith("sweeps.pages.") and not name.endswith("words")
-            if drawn or name == "sweeps.report.page_renderer":
-                yield line, f"imports {name} at its head"
+        for node in tree.body:
+            for name in {".".join(name.split(".")[:3]) for name in imported(node)}:
+                drawn = name.startswith("sweeps.pages.") and not name.endswith("words")
+                if drawn or name == "sweeps.report.page_renderer":
+                    yield node.lineno, f"imports {name} at its head"
 
 
 OBSERVERS = {"Histories", "SettledRuns"}
@@ -446,9 +425,7 @@ def breaches(path, source):
 
 
 def test_structure_holds():
-    files = [(file, file.relative_to(ROOT).as_posix()) for layer in LAYERS for file in (ROOT / layer).rglob("*.py")]
-    found = {path: made for file, path in files if (made := breaches(path, file.read_text(encoding="utf-8")))}
-    assert found == {}
+    assert {path: found for path, text in sources().items() if (found := breaches(path, text))} == {}
 
 
 #: What is found → path and source of a module that breaks a rule; several of one rule are told apart by a number.
@@ -568,14 +545,10 @@ def test_every_rule_is_broken_by_a_bad_module_and_none_by_a_good_one():
 
 
 def test_what_is_kept_is_there():
-    assert all((ROOT / path).exists() for path, _ in KEPT)
-    text = {path: (ROOT / path).read_text(encoding="utf-8") for path, _ in KEPT}
-    assert all(name in text[path] for path, name in KEPT)
+    assert [(path, name) for path, name in KEPT if name not in sources().get(path, "")] == []
 
 
 def test_front_door_loads_nothing_heavy():
-    if not (ROOT / "sweeps/cli.py").exists():
-        pytest.skip("no command line yet")
     code = "import sys, sweeps.cli; print(sorted({m.partition('.')[0] for m in sys.modules} & set(sys.argv[1:])))"
     heavy = sorted({*HEAVY, "numpy"})
     answer = subprocess.run(
@@ -592,17 +565,11 @@ INNER = {
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED = {
-    (
-        "loop_baselines",
-        "build_candidate_space",
-    ): "other ways to select effects, on the loop's own problem after its own preparation",
-    ("loop_baselines", "fit_base"): "the same",
-    (
-        "loop_findings",
-        "build_candidate_space",
-    ): "further runs, read by fits that the loop made after its own preparation",
-    ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
-    ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
+    ("loop_baselines", "build_candidate_space"),  # other ways to select effects, after the loop's own preparation
+    ("loop_baselines", "fit_base"),
+    ("loop_findings", "build_candidate_space"),  # further runs, read by fits that the loop made
+    ("track_table", "pose"),  # a function of its own by that name: rows of the paper through a resolved running gear
+    ("track_table", "with_table_mass"),  # the same rows, searched by members and not by `calibrate`
 }
 
 
@@ -612,11 +579,8 @@ SHARED_NAMES = {"__init__", "result", "base"}
 
 def test_modules_have_base_names_of_their_own():
     """Two modules of one name are told apart by their folders alone, which imports and messages leave out."""
-    files = [p for layer in LAYERS for p in (ROOT / layer).rglob("*.py") if p.stem not in SHARED_NAMES]
-    seen = {}
-    for path in files:
-        assert path.stem not in seen, f"{path.relative_to(ROOT)} and {seen[path.stem].relative_to(ROOT)}"
-        seen[path.stem] = path
+    names = Counter(PurePosixPath(path).stem for path in sources())
+    assert {name for name, count in names.items() if count > 1} <= SHARED_NAMES
 
 
 def inner_calls(source):
@@ -636,12 +600,12 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
         for _, name in inner_calls(file.read_text(encoding="utf-8"))
         if not file.stem.startswith("test_")
     }
-    assert found == set(CALLED)
+    assert found == CALLED
     shared = dict.fromkeys(("loop", "loop_series", "rigs", "rig_logs"), "campaign.looped")  # which takes the one way
     ways = shared | {"loop_baselines": "campaign.begun", "campaign": "calibration.discovery.loop_input.prepare_loop"}
     for campaign, name in ways.items():
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
-        assert name in {imported for imported, _ in names_imported(tree, "")}, campaign
+        assert name in {found for node in walked(tree) for found in imported(node)}, campaign
 
 
 def test_a_campaign_of_its_own_way_is_found():
@@ -654,55 +618,36 @@ def test_one_preparation_serves_all():
     """What fits or foresees calls `prepare_input`, and no other room does to a table what that does."""
     inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
     allowed = {"calibration/inference/preparation.py", "sweeps/commands/compare.py"}  # which fits nothing
-    found = {
-        path.relative_to(ROOT).as_posix()
-        for layer in ("calibration", "sweeps")
-        for path in (ROOT / layer).rglob("*.py")
-        for _, name in inner_calls(path.read_text(encoding="utf-8"))
-        if name in inner
+    calls = {
+        path: {name for _, name in inner_calls(text)} for path, text in sources().items() if "mmrjax/" not in path
     }
-    assert found == allowed
+    assert {path for path, names in calls.items() if names & inner} == allowed
     for room in ("inference/calibration", "inference/foresight", "discovery/loop_input"):
-        tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
-        calls = {_dotted(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
-        assert "prepare_input" in calls, room
+        assert "prepare_input(" in sources()[f"calibration/{room}.py"], room
 
 
-def statements(body, annotations=False):
-    """Statements at any depth of a body, either those for annotations alone, under `TYPE_CHECKING`, or all others."""
-    for node in body:
-        inner = [n for name in ("body", "handlers", "cases") for n in getattr(node, name, ())]
-        if isinstance(node, ast.If) and _dotted(node.test) == "TYPE_CHECKING":
-            yield from node.body if annotations else ()
-            inner = []
-        elif not annotations:
-            yield node
-        inner += [n for name in ("orelse", "finalbody") for n in getattr(node, name, ())]
-        yield from statements(inner, annotations)
+class WithoutAnnotations(ast.NodeTransformer):
+    """Takes away what is imported for annotations alone, under `TYPE_CHECKING`."""
+
+    def visit_If(self, node):
+        self.generic_visit(node)
+        return node.orelse if _dotted(node.test) == "TYPE_CHECKING" else node
 
 
-def circle(root):
+def circle(texts):
     """Modules that import one another in a circle, inside of functions too, as `graphlib` lists them. Empty: none.
 
-    Imports for annotations alone (under `TYPE_CHECKING`) are no part of it.
+    Imports for annotations alone are no part of it. What is imported from a package is its modules, and the package
+    itself only where one is none of them.
     """
-
-    files = {}
-    for file in (file for layer in LAYERS for file in sorted((root / layer).rglob("*.py"))):
-        parts = file.relative_to(root).with_suffix("").parts
-        files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    trees = {
+        path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): ast.parse(text)
+        for path, text in texts.items()
+    }
     graph = {}
-    for name, file in files.items():
-        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-        graph[name] = set()
-        for node in statements(ast.parse(file.read_text(encoding="utf-8")).body):
-            if not isinstance(node, ast.Import | ast.ImportFrom):
-                continue
-            imported = [module for module, _ in names_imported(ast.Module([node], []), package)]
-            whole, *each = [m for m in imported if m in files] or [""]
-            # What is imported from a package is its modules, and the package itself only where one is none of them.
-            only = isinstance(node, ast.ImportFrom) and len(each) == len(node.names) and whole == imported[0]
-            graph[name] |= {*each, *(() if only else [whole])} & set(files) - {name}
+    for module, tree in trees.items():
+        names = {name for node in ast.walk(WithoutAnnotations().visit(tree)) for name in imported(node)}
+        graph[module] = {name if name in trees else name.rpartition(".")[0] for name in names} & set(trees) - {module}
     try:
         graphlib.TopologicalSorter(graph).prepare()
     except graphlib.CycleError as error:
@@ -710,18 +655,16 @@ def circle(root):
     return []
 
 
-def test_no_module_imports_itself_by_way_of_others():
-    assert circle(ROOT) == []
-
-
 @pytest.mark.parametrize("found", [True, False])
-def test_a_circle_of_imports_is_found(found, tmp_path):
-    (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps/__init__.py").write_text("")
-    (tmp_path / "sweeps/a.py").write_text("def f():\n    from sweeps import b")
+def test_no_module_imports_itself_by_way_of_others(found):
+    assert circle(sources()) == []
     guard = "pass" if found else "if TYPE_CHECKING:\n    from sweeps.a import f"
-    (tmp_path / "sweeps/b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
-    assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
+    bad = {
+        "sweeps/__init__.py": "",
+        "sweeps/a.py": "def f():\n    from sweeps import b",
+        "sweeps/b.py": f"{guard}\n{'from sweeps.a import f' if found else ''}",
+    }
+    assert set(circle(bad)) == ({"sweeps.a", "sweeps.b"} if found else set())
 
 
 #: Most names of the project that a module imports. A module counts as one name, and so does each name of a module.
@@ -737,9 +680,9 @@ MORE_NAMES = {
     "calibration/discovery/discrepancy.py": 27,
     "calibration/discovery/mechanism.py": 32,
     # Observers join a kind of data with its fidelity and its solver; calibration and sizing join all steps of a fit.
-    "calibration/inference/calibration.py": 48,
+    "calibration/inference/calibration.py": 47,
     "calibration/inference/observers/settled.py": 49,
-    "calibration/inference/observers/time_histories.py": 52,
+    "calibration/inference/observers/time_histories.py": 53,
     "calibration/inference/observers/turns.py": 32,
     "calibration/sizing/sheet.py": 30,
     # Models join all parts of a robot in one set of equations.
@@ -754,23 +697,21 @@ MORE_NAMES = {
     "mmrjax/undercarriage/both_sides.py": 29,
     "mmrjax/undercarriage/half_robot.py": 44,
     # Commands read options and input, compute, write and report.
-    "sweeps/commands/climb.py": 36,
-    "sweeps/commands/compare.py": 27,
+    "sweeps/commands/climb.py": 35,
     "sweeps/commands/loop.py": 36,
     "sweeps/commands/loop_joints.py": 30,
     "sweeps/commands/missions.py": 33,
     "sweeps/commands/resonance.py": 36,
-    "sweeps/commands/rig_check.py": 48,
-    "sweeps/commands/sensitivity.py": 36,
-    "sweeps/commands/simulate.py": 37,
+    "sweeps/commands/rig_check.py": 47,
+    "sweeps/commands/sensitivity.py": 34,
+    "sweeps/commands/simulate.py": 36,
     "sweeps/commands/sweep.py": 49,
-    "sweeps/commands/turn.py": 28,
+    "sweeps/commands/turn.py": 27,
     "sweeps/inputs.py": 39,
     # Reports, stores and exports show every part of a result.
-    "sweeps/export/formats.py": 27,
     "sweeps/pages/history_figures.py": 26,
-    "sweeps/paper/report.py": 33,
-    "sweeps/points/axes.py": 28,
+    "sweeps/paper/report.py": 32,
+    "sweeps/points/axes.py": 27,
     "sweeps/points/run.py": 37,
     "sweeps/points/tasks.py": 33,
     "sweeps/points/zarr_store.py": 29,
@@ -783,96 +724,49 @@ MORE_NAMES = {
 }
 
 
-def crowded(root, allowed):
+def crowded(texts, allowed):
     """Modules with more imported names of the project than allowed, with their number."""
     found = {}
-    for path in (path for layer in LAYERS for path in sorted((root / layer).rglob("*.py"))):
-        names = {
-            f"{getattr(node, 'module', '')}.{alias.name}".strip(".")
-            for node in walked(ast.parse(path.read_text(encoding="utf-8")))
-            if isinstance(node, ast.Import | ast.ImportFrom)
-            for alias in node.names
-        }
-        place, count = path.relative_to(root).as_posix(), sum(name.partition(".")[0] in LAYERS for name in names)
-        found |= {place: count} if count > allowed.get(place, NAMES) else {}
+    for path, text in texts.items():
+        names = {name for node in walked(ast.parse(text)) for name in imported(node)}
+        count = sum(name.partition(".")[0] in LAYERS for name in names)
+        found |= {path: count} if count > allowed.get(path, NAMES) else {}
     return found
 
 
-def test_modules_import_few_names_of_the_project(tmp_path):
-    assert crowded(ROOT, MORE_NAMES) == {}
-    assert {*MORE_NAMES} <= {*crowded(ROOT, {})}, "no longer crowded"
-    (tmp_path / "sweeps").mkdir()
+def test_modules_import_few_names_of_the_project():
+    assert crowded(sources(), MORE_NAMES) == {}
+    assert {*MORE_NAMES} <= {*crowded(sources(), {})}, "no longer crowded"
     names = ", ".join(f"f{k}" for k in range(NAMES))
-    (tmp_path / "sweeps/few.py").write_text(f"import jax\nfrom sweeps.b import {names}")
-    (tmp_path / "sweeps/many.py").write_text(f"import sweeps.a\nfrom sweeps.b import {names}")
-    assert crowded(tmp_path, {}) == {"sweeps/many.py": NAMES + 1}
+    few, many = (f"import {other}\nfrom sweeps.b import {names}" for other in ("jax", "sweeps.a"))
+    assert crowded({"sweeps/few.py": few, "sweeps/many.py": many}, {}) == {"sweeps/many.py": NAMES + 1}
 
 
-#: Most modules that import what their annotations alone need.
-ANNOTATED = 15
-
-
-def annotated(root):
-    """Modules with imports for annotations alone, under `TYPE_CHECKING`."""
-    return [
-        path.relative_to(root).as_posix()
-        for layer in LAYERS
-        for path in sorted((root / layer).rglob("*.py"))
-        if any(
-            isinstance(node, ast.Import | ast.ImportFrom)
-            for node in statements(ast.parse(path.read_text(encoding="utf-8")).body, annotations=True)
-        )
-    ]
-
-
-def test_few_modules_import_for_annotations_alone(tmp_path):
+def test_few_modules_import_for_annotations_alone():
     """A type that two modules need of one another belongs below both."""
-    assert len(found := annotated(ROOT)) <= ANNOTATED, found
-    (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps/a.py").write_text("if TYPE_CHECKING:\n    from sweeps.b import f")
-    (tmp_path / "sweeps/b.py").write_text("if not TYPE_CHECKING:\n    from sweeps.a import f")
-    assert annotated(tmp_path) == ["sweeps/a.py"]
+    found = [path for path, text in sources().items() if "\nif TYPE_CHECKING:" in text]
+    assert len(found) <= 15, found
 
 
 def test_nobody_asks_what_a_load_is():
     """What a load can do it states. Which it is ask its balances, and what reads, writes and describes its file."""
-    found = {
-        path.relative_to(ROOT).as_posix()
-        for layer in LAYERS
-        for path in (ROOT / layer).rglob("*.py")
-        if {"Shaft", "Chassis"} & set(re.findall(r"\w+", text := path.read_text(encoding="utf-8")))
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"
-        if {"Shaft", "Chassis"} & {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
-    }
+    asked = re.compile(r"\bisinstance\([^()]*\b(?:Shaft|Chassis)\b")
+    found = {path for path, text in sources().items() if asked.search(text)}
     data = {f"calibration/data/{name}.py" for name in ("configuration_tables", "rig_facts", "robot_file")}
     assert found == {"mmrjax/model/balances.py", "sweeps/commands/rig_check.py", *data}
 
 
 def test_toml_is_read_in_one_place():
     """But for the comments at the top of a profile, each of which is a line of TOML."""
-    found = {
-        path.relative_to(ROOT).as_posix()
-        for layer in LAYERS
-        for path in (ROOT / layer).rglob("*.py")
-        if "tomllib" in (text := path.read_text(encoding="utf-8")) and "tomllib" in dict(imports(ast.parse(text), ""))
-    }
+    found = {path for path, text in sources().items() if "import tomllib" in text}
     assert found == {"calibration/data/input_files.py", "calibration/data/profiles.py"}
 
 
 def test_how_many_of_something_is_said_in_the_singular_where_it_is_one():
     """By `errors.count_noun`: what is of a larger number (`3 of {n} rows`), or cannot be one, may have its plural."""
     assert [count_noun(n, "row") for n in (0, 1, 2, 2000)] == ["0 rows", "1 row", "2 rows", "2,000 rows"]
-    unless, things = (
-        r"(?<!of )(?<!first )(?<!--runs: got )",
-        "runs|rows|cells|values|parameters|samples|lines|designs",
-    )
+    unless = r"(?<!of )(?<!first )(?<!--runs: got )"
+    things = "runs|rows|cells|values|parameters|samples|lines|designs"
     plural = re.compile(rf"{unless}\{{len\([^{{}}]*\)\}} (?:settled )?({things})\b")
-    found = [
-        f"{path.relative_to(ROOT)}: {line.strip()}"
-        for room in ("mmrjax", "calibration", "sweeps")
-        for path in sorted((ROOT / room).rglob("*.py"))
-        for line in path.read_text(encoding="utf-8").splitlines()
-        if plural.search(line)
-    ]
-    assert [line for line in found if "LONGEST" not in line and "if single else" not in line] == []
+    lines = [line for text in sources().values() for line in text.splitlines() if plural.search(line)]
+    assert [line for line in lines if "LONGEST" not in line and "if single else" not in line] == []

@@ -16,7 +16,7 @@ from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
 from sweeps.pages.sweep_figures import VariedQuantity, draw_grid_statuses
 from sweeps.points import axes, scale, tasks
-from tests.commands import ends, read_json
+from tests.commands import ends, read_json, refused
 
 ROBOT = nominal()
 
@@ -59,13 +59,12 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     of, varied, message = REFUSED[case]
-    with pytest.raises(BadConfiguration, match=message) as error:
+    with refused(message, BadConfiguration):
         axes.plan_design(Campaign(obstacle=Obstacle(**of), axes=varied), ROBOT, "map.toml")
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "kind", "kinds"),
+    "key, value, kind, kinds",
     [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
 )
 def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):

@@ -14,6 +14,7 @@ from sweeps.config_campaign import Campaign
 from sweeps.points import axes
 from sweeps.points import sampled_design as design
 from sweeps.points.sampled_design import Blocks, Design
+from tests.commands import refused
 
 SCIPY = {
     "uniform": ({"low": 2.0, "high": 6.0}, stats.uniform(2, 4)),
@@ -257,9 +258,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_designs_are_refused_with_place_value_and_choices(case, nominal):
     tables, message = BAD[case]
-    with pytest.raises(BadConfiguration, match=message) as refused:
+    with refused(message, BadConfiguration):
         planned(nominal, **tables)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("stated, values", [([False, True], [0, 1]), (True, [1]), ([0, 1], [0, 1])])
@@ -269,7 +269,7 @@ def test_battery_is_an_axis_of_truth_values_too(nominal, stated, values):
 
 def test_more_points_than_numbers_are_refused(nominal):
     many = {"start": 1.0, "stop": 2.0, "number": 4_000_000}
-    with pytest.raises(BadConfiguration, match=r"points; expected at most"):
+    with refused(r"points; expected at most", BadConfiguration):
         planned(nominal, axes={n: many for n in ("voltage", "payload", "slope_deg")})
-    with pytest.raises(BadConfiguration, match=r"number: got 20000000; expected a whole number from 1 to 10000000"):
+    with refused(r"number: got 20000000; expected a whole number from 1 to 10000000", BadConfiguration):
         planned(nominal, axes={"voltage": many | {"number": 20_000_000}})

@@ -4,27 +4,29 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from calibration.data import posterior_file as posteriors
 from calibration.data.input_errors import InputError
 from mmrjax.model import paper_robots, params
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes
 
-posteriors = pytest.importorskip("calibration.data.posterior_file")
-
 NAMES = ("motor.resistance", "motor.friction_coulomb")
 UNIFORM = {"distribution": "uniform", "low": 0, "high": 8}
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """A run folder with the posterior of two correlated parameters of the nominal robot."""
+def correlated_posterior():
+    """Of two parameters of the nominal robot."""
     value = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.nominal())}
     centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
-    found = posteriors.Posterior(
-        coordinates=NAMES, units=("Ω", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
+    return posteriors.Posterior(
+        coordinates=NAMES, units=("ohm", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
         spread=0.05 * centre, low=0.1 * centre, high=10 * centre, softness=none, kinds=(posteriors.NORMAL,) * 2,
     )  # fmt: skip
-    posteriors.write_posterior(found, tmp_path / posteriors.FILE)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    posteriors.write_posterior(correlated_posterior(), tmp_path / posteriors.FILE)
     return tmp_path
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data.posterior_file import NORMAL, Posterior
 from calibration.data.runs import Runs
 from mmrjax import fidelities
 from mmrjax.fidelities.steady import steady_batch
@@ -15,8 +14,8 @@ from sweeps import config
 from sweeps.points import run, scale
 from sweeps.points.sampled_design import DrawnSamples
 from sweeps.store import RunFolder
+from tests.test_sweep_posterior import NAMES, correlated_posterior
 
-NAMES = ("motor.resistance", "motor.friction_coulomb")
 DRAWS = 12
 
 
@@ -31,13 +30,8 @@ def runs(robot):
 
 
 @pytest.fixture(scope="module")
-def posterior(robot):
-    value = {p.name: float(p.value) for p in params.walk_parameters(robot)}
-    centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
-    return Posterior(
-        coordinates=NAMES, units=("ohm", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
-        spread=0.05 * centre, low=0.1 * centre, high=10 * centre, softness=none, kinds=(NORMAL,) * 2,
-    )  # fmt: skip
+def posterior():
+    return correlated_posterior()
 
 
 def chunked(chunk):

@@ -63,9 +63,9 @@ def test_rounded_nose_is_a_circle_that_touches_riser_and_tread():
     on = np.array(
         [[-0.0, 0.05], [0.05, 0.1], *[[0.02 - 0.02 * np.cos(a), 0.08 + 0.02 * np.sin(a)] for a in (0.4, 1.2)]]
     )
-    assert np.asarray(ground.distance(jnp.asarray(on))[0]) == pytest.approx(0, abs=1e-12)
-    corner = ground.corners[np.asarray(ground.corners[:, 1]) > -1]
-    assert np.asarray(corner) == pytest.approx(np.array([[0.02, 0.08]]))
+    assert ground.distance(jnp.asarray(on))[0] == pytest.approx(0, abs=1e-12)
+    corner = ground.corners[ground.corners[:, 1] > -1]
+    assert corner == pytest.approx(np.array([[0.02, 0.08]]))
 
 
 def test_only_convex_corners_are_corners():
@@ -79,11 +79,11 @@ def test_only_convex_corners_are_corners():
 def test_distance_of_points_on_an_edge_has_a_finite_derivative():
     ground = terrain.single_step(0.1)
     slope = jax.jacfwd(lambda p: ground.distance(p[None])[0][0])(jnp.array([-0.3, 0.0]))
-    assert np.isfinite(np.asarray(slope)).all()
+    assert np.isfinite(slope).all()
 
 
 @pytest.mark.parametrize(
-    ("x", "z", "message"),
+    "x, z, message",
     [
         ([0, 1, 0.5], [0, 0, 0], "x falls from 1 to 0.5 m at point 3"),
         ([0], [0], "two points or more"),
@@ -104,8 +104,8 @@ def lever():
 
 
 def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
-    assert float(lever().length) == pytest.approx(0.560, abs=5e-4)
-    assert float(lever().pitch) == pytest.approx(0.035, abs=5e-5)
+    assert lever().length == pytest.approx(0.560, abs=5e-4)
+    assert lever().pitch == pytest.approx(0.035, abs=5e-5)
 
 
 @pytest.mark.slow
@@ -119,8 +119,8 @@ def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model(robot):
     mine, rate = levers.grouser_tips(main, jnp.asarray(place))
     theirs = running_gear.tips_on_path(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))
     assert np.asarray(mine[:, 0]) - float(gear.wheelbase) / 2 == pytest.approx(np.asarray(theirs.forward), abs=1e-12)
-    assert np.asarray(mine[:, 1]) == pytest.approx(np.asarray(theirs.up), abs=1e-12)
-    assert np.asarray(rate) == pytest.approx(
+    assert mine[:, 1] == pytest.approx(np.asarray(theirs.up), abs=1e-12)
+    assert rate == pytest.approx(
         np.stack([theirs.rate_forward, theirs.rate_up], 1), abs=1e-10
     )  # fmt: skip
 
@@ -130,10 +130,10 @@ def test_points_project_on_the_belt_where_they_came_from_and_tips_move_as_they_s
     belt_ = lever()
     place = jnp.linspace(0, float(belt_.length), 500)[:-1]
     height, back = belt_.project(belt_.point(place) + 0.004 * belt_.normal(belt_.turned(place)))
-    assert np.asarray(height) == pytest.approx(0.004, abs=1e-12)
-    off = np.abs(np.asarray(back - place))
+    assert height == pytest.approx(0.004, abs=1e-12)
+    off = np.abs(back - place)
     assert np.minimum(off, float(belt_.length) - off) == pytest.approx(0, abs=1e-10)
     moved = (
         levers.grouser_tips(belt_, place[5:-5] + 1e-7)[0] - levers.grouser_tips(belt_, place[5:-5] - 1e-7)[0]
     ) / 2e-7
-    assert np.asarray(levers.grouser_tips(belt_, place[5:-5])[1]) == pytest.approx(np.asarray(moved), abs=1e-5)
+    assert levers.grouser_tips(belt_, place[5:-5])[1] == pytest.approx(np.asarray(moved), abs=1e-5)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from worlds import rigs
 
 from calibration.data import columns, input_files
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.unused_readings import FIRST, thin_rows
 from calibration.described import describe
@@ -22,6 +22,7 @@ from calibration.inference.observers import Histories, SettledRuns
 from mmrjax.model import paper_robots
 from sweeps.commands import rig_check
 from sweeps.report.terminal_renderer import print_document
+from tests.commands import refused, with_columns
 
 EVERY, ROWS = 0.01, 300
 
@@ -61,8 +62,7 @@ def test_rows_of_a_table_are_taken_evenly_over_its_conditions():
     slopes, volts = np.repeat([0.0, 5.0, 10.0], 1000), rng.uniform(10, 30, 3000)
     table = settled(log(1, 3000))
     mixed = rng.permutation(3000)
-    columns = table.columns | {"slope_deg": slopes[mixed], "supply_voltage_V": volts[mixed]}
-    table = dataclasses.replace(table, columns=columns)
+    table = with_columns(table, slope_deg=slopes[mixed], supply_voltage_V=volts[mixed])
     some = thin_rows(table, 300)
     assert 250 < len(some) <= 310 and some.whole is table
     for slope in (0.0, 5.0, 10.0):
@@ -81,9 +81,7 @@ def test_rows_of_a_table_are_taken_evenly_over_its_conditions():
 def test_more_settled_rows_than_memory_holds_are_refused(monkeypatch):
     table = settled(log(1, 3000))
     monkeypatch.setattr(input_files, "available_memory", lambda: 2e8)
-    with pytest.raises(
-        BadData, match=r"log.csv: 3,000 rows need 0.3 GB, and 0.2 GB of memory are free, enough for 2000 rows"
-    ):
+    with refused(r"log.csv: 3,000 rows need 0.3 GB, and 0.2 GB of memory are free, enough for 2000 rows"):
         thin_rows(table)
     assert len(thin_rows(table, 2000)) <= 2010
 
@@ -135,10 +133,10 @@ def test_what_drives_a_run_is_that_of_the_log(drive):
     )
     between = EVERY * (np.arange(ROWS - 1) + 0.5)
     assert_array_equal(held(few, between), held(every, between))
-    done = [float(np.asarray(o.conditions.voltage[0])[:-1] @ np.diff(np.asarray(o.times[0]))) for o in (every, few)]
+    done = [float(np.asarray(o.conditions.voltage[0])[:-1] @ np.diff(o.times[0])) for o in (every, few)]
     assert done[1] == pytest.approx(done[0], rel=1e-12)
     assert (held(alone, between) != held(every, between)).mean() > 0.05
-    steps = [int((np.diff(np.asarray(o.times)) > 0).sum()) for o in (every, few)]
+    steps = [int((np.diff(o.times) > 0).sum()) for o in (every, few)]
     assert steps[1] < (0.7 if drive == "a staircase" else 1.01) * steps[0] and len(few.run) == len(some) < 50
     assert_allclose(few.time, some["time_s"], atol=1e-12)
 
@@ -148,7 +146,7 @@ def test_a_slope_that_changes_between_readings_acts_from_its_row_on():
     whole = log(1)
     row = np.round(whole["time_s"] / EVERY).astype(int)
     time = EVERY * (row + np.where(row > 0, 0.2 * np.random.default_rng(7).random(ROWS)[row], 0.0))
-    whole = dataclasses.replace(whole, columns={**whole.columns, "time_s": time})
+    whole = with_columns(whole, time_s=time)
     read = set((thin_rows(whole, 40)["time_s"] / EVERY).astype(int))
     change = next(k for k in range(100, ROWS) if not read & {k - 1, k, k + 1})
     columns = {**whole.columns, "slope_deg": np.where(row < change, 0.0, 5.0)}
@@ -224,5 +222,5 @@ def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     wanted = thin_rows(runs, columns.ROWS if rows is None else rows)
     assert_array_equal(used["time_s"], wanted["time_s"])
     assert len(used) < len(runs) == len(used.whole) == len(thin_rows(used, 50).whole)
-    with pytest.raises(BadConfiguration, match="rows: got 0; expected 1 or more"):
+    with refused("rows: got 0; expected 1 or more", BadConfiguration):
         call(runs, paper_robots.nominal(), rows=0)

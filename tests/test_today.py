@@ -8,7 +8,6 @@ import pytest
 
 import mmrjax as api
 from calibration.data import robot_file
-from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import run_remarks
 from sweeps.pages import figure_style, history_figures, words
@@ -52,7 +51,7 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
 
 def test_a_cell_has_no_voltage_on_the_external_supply(robot):
     found = api.simulate(robot, api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
-    assert (np.asarray(found.voltage_cell) > 0).tolist() == [False, True]
+    assert (found.voltage_cell > 0).tolist() == [False, True]
     assert np.isnan(found.to_dict()["supply_voltage_V"]).tolist() == [False, True]
 
 
@@ -72,11 +71,6 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path, robot):
     assert row["winding_settled_C"] == "" and "winding_hot" in row["flags"]
     page = (tmp_path / "a/report.html").read_text()
     assert "none settles" in page and ">inf" not in page and "nan %" not in page
-
-
-def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance(robot):
-    motor = robot.motor
-    assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
 
 
 @pytest.mark.slow
@@ -152,26 +146,6 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path, robot):
         again = robot_file.read_robot(tmp_path / f"{k}.toml")
         assert (again.gearbox, again.driver, again.battery) == (given.gearbox, given.driver, given.battery)
     assert "current_limit = None" not in (tmp_path / "1.toml").read_text()
-
-
-@pytest.mark.parametrize(
-    ("values", "sentence"),
-    [
-        ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(efficiency"),
-        ({"driver.returns_current": "no"}, "driver.returns_current: got 'no'; expected true or false"),
-        ({"driver.decay": "coast"}, r"mine.toml, driver.decay: got 'coast'; expected slow or fast \(between pulses"),
-        ({"driver.decay": ["fast"]}, r"driver.decay: got \['fast'\]; expected slow or fast"),
-        ({"gearbox.torque_limit": -1}, "gearbox.torque_limit: got -1; expected a number, 0.001 to"),
-        (
-            {"battery.voltage_cutoff": 4.5},
-            "battery.voltage_cutoff: got 4.5; expected less than voltage_charge, 4.2 V",
-        ),
-        ({"battery.current_charge": True}, "battery.current_charge: got True; expected a number"),
-    ],
-)
-def test_bad_limits_and_switches_are_refused(values, sentence, robot):
-    with pytest.raises(BadConfiguration, match=sentence):
-        robot_file.change_robot(robot, values, where="mine.toml")
 
 
 def test_rated_limits_stand_in_the_report(robot):

@@ -30,8 +30,8 @@ def path(robot):
 
 
 def test_belt_is_840_mm_with_grousers_every_35(path):
-    assert float(path.length) == pytest.approx(0.840)
-    assert float(path.pitch) == pytest.approx(0.035)
+    assert path.length == pytest.approx(0.840)
+    assert path.pitch == pytest.approx(0.035)
     assert TEETH_BELT / GROUSERS == 7
 
 
@@ -54,12 +54,12 @@ def test_tip_is_continuous_round_the_whole_path(path):
     places = jnp.linspace(0.0, path.length, 8401)
     at = tips_on_path(path, places)
     for value in (at.forward, at.up):
-        assert float(jnp.max(jnp.abs(jnp.diff(value)))) < 1.2e-4 * 1.15  # 0.1 mm of belt moves a tip this far
-        assert float(value[0]) == pytest.approx(float(value[-1]), abs=1e-9)
+        assert jnp.max(jnp.abs(jnp.diff(value))) < 1.2e-4 * 1.15  # 0.1 mm of belt moves a tip this far
+        assert value[0] == pytest.approx(float(value[-1]), abs=1e-9)
     lower = (places > 0.02) & (places < 0.28)
     # sliding speed, support and compliance too, where the ground can be: no force may jump
     for value in (at.rate_forward, at.rate_up, at.guided, at.compliance):
-        assert float(jnp.max(jnp.abs(jnp.diff(value))[:3500])) < 0.02
+        assert jnp.max(jnp.abs(jnp.diff(value))[:3500]) < 0.02
     assert_allclose(at.up[lower], -(path.radius + path.gear.grouser_height))
 
 
@@ -77,7 +77,7 @@ def test_mesh_is_the_swing_of_a_polygon(path):
     slope = jax.vmap(jax.grad(lambda a: belt_travel(path.radius, a)[0]))(angle)
     assert_allclose(lever, slope, rtol=1e-12)
     apothem = float(path.radius) * np.cos(np.pi / 48)
-    assert float(lever.max() - lever.min()) == pytest.approx(float(path.radius) - apothem, rel=1e-3)
+    assert (lever.max() - lever.min()) == pytest.approx(float(path.radius) - apothem, rel=1e-3)
     assert pytest.approx(0.00107, rel=1e-2) == POLYGON
 
 
@@ -97,12 +97,12 @@ def test_runs_pull_as_their_energy_falls(path):
 
 def test_slack_run_pulls_nothing(path):
     at = belt_runs(path, jnp.asarray([0.5, 0.0]), jnp.zeros(2))
-    assert float(at.lower) == 0.0 and float(at.upper) > 100.0
+    assert at.lower == 0.0 and at.upper > 100.0
 
 
 def test_centrifugal_tension_is_mass_per_length_times_speed_squared(path):
     at = belt_runs(path, jnp.zeros(2), jnp.full(2, 25.0))
-    assert float(at.centrifugal) == pytest.approx(0.040 / 0.840 * (25.0 * float(path.radius)) ** 2)
+    assert at.centrifugal == pytest.approx(0.040 / 0.840 * (25.0 * float(path.radius)) ** 2)
 
 
 def test_tension_jumps_by_the_force_on_the_belt(path):
@@ -111,8 +111,8 @@ def test_tension_jumps_by_the_force_on_the_belt(path):
     along = tension_along(path, at, place, force, jnp.asarray([0.05, 0.15, 0.25, 0.6]))
     assert_allclose(jnp.diff(along)[:2], [7.0, 11.0], rtol=1e-9)
     lengths = jnp.asarray([0.1, 0.1, 0.1])
-    assert float(jnp.sum(along[:3] * lengths) / 0.3) == pytest.approx(float(at.lower))  # the mean is the run's
-    assert float(along[3]) == pytest.approx(float(at.upper))
+    assert (jnp.sum(along[:3] * lengths) / 0.3) == pytest.approx(float(at.lower))  # the mean is the run's
+    assert along[3] == pytest.approx(float(at.upper))
 
 
 def _posture(path, wheeled, robot):
@@ -131,7 +131,7 @@ def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     signals = balances.begin_signals(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
     signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0), speed_slip_terms=jnp.asarray(0.0))
     done = side_contacts.contact_forces(path, chassis, signals, at, q[1])
-    assert float(at.normal) > 10.0 and float(jnp.abs(done.traction)) > 0.1
+    assert at.normal > 10.0 and jnp.abs(done.traction) > 0.1
 
     def point(q):  # of each contact in the world
         now = side_contacts.compute_contacts(path, chassis, q, v)
@@ -169,4 +169,4 @@ def test_guides_and_pulleys_carry_the_normal_load(path, robot):
     loads = side_contacts.inner_loads(
         path, at, side_contacts.contact_forces(path, robot.configurations["6T2A"], signals, at, q[1])
     )
-    assert float(jnp.sum(loads.support) + loads.guide) == pytest.approx(float(at.normal))
+    assert (jnp.sum(loads.support) + loads.guide) == pytest.approx(float(at.normal))

@@ -75,7 +75,7 @@ def at():
 def forward(averages, commands, at):
     slope = jax.jit(jax.vmap(jax.jacfwd(averages, has_aux=True), in_axes=(None, 0)))
     jacobian, status = slope(at, commands)
-    assert (np.asarray(status) == CONVERGED).all()
+    assert (status == CONVERGED).all()
     return np.asarray(jacobian)
 
 

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from test_track_bad_input import SHAKING
 
-from mmrjax.fidelities.track import _simulate_batch, track_batch
+from mmrjax.fidelities.steady import steady
+from mmrjax.fidelities.track import PARTS, _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
@@ -39,8 +41,6 @@ def runs(robot):
     wheeled, slope, payload, voltage = np.array(RUNS, float).T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
     # Not through the door's check of the step, whose own compilation test_track_bad_input pays.
-    from mmrjax.fidelities.track import _simulate_batch
-
     return jax.tree.map(np.asarray, _simulate_batch(robot, commands, 1.5, 1e-4, 1e-3, False))
 
 
@@ -66,25 +66,14 @@ def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
 
 def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     """Set S of docs/explanation/vibration.md, guides recessed by 0.36 mm: it shakes and slides beyond V_s on 20°."""
-    shaking = params.replace(
-        robot,
-        {
-            "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
-            "6T2A.ground.friction.speed_static": 0.00961,
-            "6T2A.ground.friction.speed_dynamic": 0.0961,
-            "6T2A.track.guide_friction": 0.06, "running_gear.guide_recess": 3.648e-4,
-            "running_gear.contact_stiffness": 3.816e7,
-            "running_gear.contact_damping": 649.2, "running_gear.guide_gap": 0.01066,
-            "running_gear.centre_offset": 1.1e-4, "running_gear.payload_height": 0.0595,
-        },
-    )  # fmt: skip
+    shaking = params.replace(robot, SHAKING)
     commands = Conditions(voltage=[15.0, 15.0], slope_deg=[10.0, 20.0])
     answer = _simulate_batch(shaking, commands, 1.5, 1e-4, 1e-3, True)
     assert [STATUSES[s] for s in answer.result.status] == ["converged"] * 2
     slips = 1 << FLAGS.index("slips")
     assert [bool(f & slips) for f in np.asarray(answer.result.flags)] == [False, True]
     # the slip of the search that found this gear, at the step and at half and a quarter of it
-    assert_allclose(100 * np.asarray(answer.result.slip), [1.8, 5.04], atol=0.15)
+    assert_allclose(100 * answer.result.slip, [1.8, 5.04], atol=0.15)
 
 
 def test_too_steep_a_slope_slides_it_down(runs):
@@ -220,10 +209,6 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     What is left is ripple: friction is not linear in the load and the sliding speed that fluctuate.
     `drive` ends on `steady` (test_drive).
     """
-    from mmrjax.fidelities.steady import steady
-    from mmrjax.fidelities.track import _simulate_batch
-    from mmrjax.model import params
-
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
@@ -242,8 +227,6 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
 
 def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
-    from mmrjax.fidelities.track import _simulate_batch
-
     two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     twin = jax.tree.map(lambda x: x[::-1], two)
     a = _simulate_batch(robot, two, 0.05, 1e-4, 1e-3, False)
@@ -262,8 +245,6 @@ def test_batch_compiles_once(robot, compilations):
 
 def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
-    from mmrjax.fidelities.track import PARTS, _simulate_batch
-
     two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     shares = []
     whole = _simulate_batch(robot, two, 0.047, 1e-4, 1e-3, False)

@@ -36,7 +36,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
         assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field)
     assert_allclose(ours.opt.gravity, theirs.opt.gravity, rtol=1e-12, atol=1e-15)
-    assert float(ours.opt.timestep) == theirs.opt.timestep == STEP
+    assert ours.opt.timestep == theirs.opt.timestep == STEP
     assert [theirs.body(i + 1).name for i in range(3)] == ["chassis", "driving", "driven"]
 
 
@@ -45,9 +45,9 @@ def test_masses_make_up_the_robot(robot, name):
     run = Conditions(**RUNS[name])
     half = build_system(robot, run, STEP).half
     chassis = robot.chassis(run.configuration)
-    assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
-    assert float(2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
-    assert float(half.inertia) > 0
+    assert (half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
+    assert (2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
+    assert half.inertia > 0
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
         # the current is ours in both; its next value depends on this instant alone
         motion = type(after)(jnp.asarray(data.qpos), jnp.asarray(data.qvel), after.current, after.discharge)
     scale_q, scale_v = np.array([1.0, 0.05, 0.01, 25.0, 25.0]), np.array([1.0, 1.0, 1.0, 25.0, 25.0])
-    assert abs(float(end.q[0])) > 0.2  # it went somewhere
+    assert abs(end.q[0]) > 0.2  # it went somewhere
     assert np.max(np.abs(data.qpos - end.q) / scale_q) < 1e-6
     assert np.max(np.abs(data.qvel - end.v) / scale_v) < 1e-6
 

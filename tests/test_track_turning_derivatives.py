@@ -50,7 +50,7 @@ def found(request, robot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("which", "least"), [(0, 1e-3), (1, 1e-7)], ids=["averages", "path"])
+@pytest.mark.parametrize("which, least", [(0, 1e-3), (1, 1e-7)], ids=["averages", "path"])
 def test_derivatives_are_differences(found, which, least):
     """To 1e-4 of the largest that the same input has. Of the path along the run, of place and yaw each."""
     slopes, differences = found[0][which], found[1][which]

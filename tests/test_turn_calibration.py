@@ -7,21 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from test_turning import of_world as robot_of_world
 from worlds import turning as world
 from worlds import turns
 from worlds.turns import NOISE, SDS, SHOWN
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.input_errors import BadConfiguration
 from calibration.described import describe
 from calibration.inference import blocks, identifiability, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
 from calibration.inference.preparation import rows_to_fit
-from mmrjax.model import balances, channels
-from tests.commands import csv_text, ends, text_file
+from mmrjax.model import channels
+from tests.commands import csv_text, ends, refused, text_file, with_columns
 
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
 #: Duties of left and right side.
@@ -61,11 +62,7 @@ def robot(tmp_path_factory):
 @pytest.fixture(scope="module")
 def of_world(robot, tmp_path_factory):
     """Runs of the second implementation, narrower and with more lateral friction than the nominal robot."""
-    run = mm.Conditions("6T2A").resolved(robot)
-    chassis = robot.configurations["6T2A"]
-    height = float(balances.stance(robot, run, chassis, chassis.mass).height)
-    true = {"ratio": TRUE[LATERAL], "width": TRUE[WIDTH], "inertia": 0.23, "height": height, "nodes": 16}
-    other = world.paper_robot(**true)
+    other = robot_of_world(robot, "6T2A", ratio=TRUE[LATERAL], width=TRUE[WIDTH], inertia=0.23)
     found = [world.circling(other, world.Inputs(*duty, kind="duty", supply=33.0)) for duty in DUTIES]
     seen = np.array([[*f.I, *f.w, f.omega] for f in found]).T
     path = written(
@@ -127,7 +124,7 @@ def test_turns_are_held_out_by_how_sharp_they_are(of_world):
 
 @pytest.mark.parametrize("model", ["drive", "track"])
 def test_settled_turns_are_fitted_by_steady_alone(robot, of_world, model):
-    with pytest.raises(BadConfiguration, match="settled turns are fitted with --model steady"):
+    with refused("settled turns are fitted with --model steady", BadConfiguration):
         SettledTurns.of(of_world, robot, model)
 
 
@@ -153,8 +150,8 @@ def test_a_log_of_two_sides_is_fitted_at_its_settled_turns(log, robot):
     assert note.runs == 9 and f"settled runs (9, {note.lasts:.3g} s in all)" in describe(note)
     assert 0.5 < note.lasts / (9 * turns.HOLD * turns.EVERY) < 1
     rpm = 30 / np.pi  # a ratio of the sides' speeds that is also one of units
-    columns = {**runs.columns, "motor_speed_right_rpm": runs["motor_speed_left_rpm"] / rpm}
-    assert len(rows_to_fit(dataclasses.replace(runs, columns=columns), robot, 4000)[0]) == 9
+    runs = with_columns(runs, motor_speed_right_rpm=runs["motor_speed_left_rpm"] / rpm)
+    assert len(rows_to_fit(runs, robot, 4000)[0]) == 9
 
 
 def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp_path, mmrjax):
@@ -163,19 +160,15 @@ def test_a_log_with_too_few_turns_is_refused_with_what_to_record(log, robot, tmp
     few = runs.where(np.repeat([1, 1, 1, 0, 0, 0, 0, 0, 0], turns.HOLD) > 0)
     again = {name: np.tile(x, 4) for name, x in few.columns.items()}
     again["time_s"] = np.arange(len(again["time_s"])) * turns.EVERY
-    with pytest.raises(
-        BadData, match=r"settled runs \(12, .* s in all\) have too few operating points \(3\). Hold 6 or"
-    ):
+    with refused(r"settled runs \(12, .* s in all\) have only 3 operating points. Hold 6 or"):
         rows_to_fit(dataclasses.replace(few, columns=again), robot, 4000)
     short = runs.where(np.arange(len(runs)) % turns.HOLD < 8)
-    with pytest.raises(
-        BadData, match=r"the longest level has .*; give one command for straight travel, or hold each"
-    ):
+    with refused(r"the longest level has .*; give one command for straight travel, or hold each"):
         rows_to_fit(short, robot, 4000)
     table, file = turns.write(tmp_path, "clean", 3, form=turns.log)
     for command in ("loop", "calibrate"):
         run = mmrjax(command, str(table), "--robot", str(file), "--out", str(tmp_path / "out"))
-        ends(run, "too few operating points (3). Hold 6 or more different levels until all readings", code=4)
+        ends(run, "have only 3 operating points. Hold 6 or more levels until all readings", code=4)
         assert not [*tmp_path.glob("out*")]
 
 

@@ -16,6 +16,7 @@ from mmrjax.effects.base import THE_SIDE
 from sweeps import config, inputs
 from sweeps.report import page_renderer
 from sweeps.report.document import Document, Section
+from tests.commands import refused
 from tests.test_turn_effects import OF_SIDES, amplitude, with_amplitudes
 
 OWN = '''
@@ -109,7 +110,7 @@ def test_effects_of_a_file_say_that_they_are_of_one_side(tmp_path):
 
     of_side = 'driver = "the side"'
     for balance, term in (("ground", "signals.side"), ("yaw", "signals.normal"), ("lateral", "signals.normal")):
-        with pytest.raises(BadConfiguration, match=r"Own, driver: got '' for a term .* expected .the side."):
+        with refused(r"Own, driver: got '' for a term .* expected .the side.", BadConfiguration):
             read(balance, term)
         (own,) = read(balance, term, of_side)
         assert own(amplitude=1.0).unlike

@@ -33,9 +33,9 @@ def one_by_one(robot, row):
 
 def test_point_is_the_robot_and_conditions_that_its_values_state(variation):
     robot, conditions = variation.at(jnp.asarray(VALUES[1]), Conditions(payload=3.0))
-    assert float(robot.motor.resistance) == 0.9
+    assert robot.motor.resistance == 0.9
     assert float(robot.configurations["6T2A"].ground.friction.static) == 0.6
-    assert float(robot.motor.inductance) == float(variation.robot.motor.inductance)
+    assert robot.motor.inductance == variation.robot.motor.inductance
     assert (float(conditions.slope_deg), float(conditions.voltage), float(conditions.payload)) == (5.0, 33.0, 3.0)
 
 
@@ -43,7 +43,7 @@ def test_configuration_is_an_index_and_total_mass_may_be_none_before(robot):
     variation = Variation(robot, ("configuration", "total_mass"))
     _, conditions = variation.at(jnp.array([1.0, 12.5]), Conditions())
     assert int(conditions.configuration) == 1 and jnp.issubdtype(conditions.configuration.dtype, jnp.integer)
-    assert float(conditions.total_mass) == 12.5
+    assert conditions.total_mass == 12.5
     assert Variation(robot, ("total_mass",)).axes["total_mass"].value is None
 
 

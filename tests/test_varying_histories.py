@@ -10,10 +10,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import Analyst
 
-from calibration.data import runs as records
 from calibration.data.clock import applied_drive, course_of_each_row, intervals_by_run, rows_of_varying_runs
 from calibration.data.columns import DRIVEN
-from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.reach import reach_of_table
 from calibration.discovery.settings import settings_for
@@ -29,6 +27,7 @@ from mmrjax.missions.profile import MODES, profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import MM, RPM
+from tests.commands import read_table, refused, with_columns
 
 #: Four segments a run: supply voltage [V] and mode; and the slope [deg] of the run.
 SEGMENTS = (0.0, 0.42, 0.84, 1.26, 1.6)
@@ -36,7 +35,7 @@ STAIR = ((12.0, "voltage"), (24.0, "voltage"), (33.0, "voltage"), (18.0, "voltag
 REVERSAL = ((24.0, "voltage"), (24.0, "brake"), (-24.0, "voltage"), (15.0, "voltage")), 4.0
 COASTING = ((33.0, "voltage"), (33.0, "coast"), (-15.0, "voltage"), (24.0, "voltage")), -3.0
 COURSES = {"stair": STAIR, "reversal": REVERSAL, "coasting": COASTING}
-EVERY = 0.02
+TIMES = np.arange(1, 80) * 0.02
 SD = {"total_current_A": 0.05, "motor_speed_rpm": 15.0, "speed_mm_s": 4.0}
 #: What the robot that is measured has in place of the nominal values.
 TRUTH = {"motor.resistance": 0.68, "6T2A.track.loss_coulomb": 0.30, "6T2A.ground.rolling_resistance": 0.05}
@@ -44,6 +43,23 @@ NOMINAL = {p.name: float(p.value) for p in params.walk_parameters(paper_robots.n
 UNDECLARED = "series_resistance"
 #: Largest difference of a derivative from differences of runs, over its largest.
 DERIVATIVES, DIFFERENCE = 1e-6, 3e-6
+
+
+def table_of(names, readings):
+    """Histories of courses, with the readings that a function of segments, slope, and voltage and mode in time gives."""
+    parts, at = [], np.searchsorted(SEGMENTS, TIMES + 1e-9, side="right") - 1
+    for name in names:
+        rows, slope = COURSES[name]
+        volts, modes = (np.array([row[k] for row in rows])[at] for k in (0, 1))
+        constant = {"run_id": name, "configuration": "6T2A", "slope_deg": slope, "payload_kg": 2.0}
+        shown = dict(zip(SD, readings(rows, slope, volts, modes), strict=True))
+        parts.append(
+            {c: np.full(len(TIMES), x) for c, x in constant.items()}
+            | {"time_s": TIMES, "supply_voltage_V": volts, "mode": modes, **shown}
+        )
+    columns = {c: np.concatenate([p[c] for p in parts]) for c in parts[0]}
+    sds = zip(("total_current_sd_A", "motor_speed_sd_rpm", "speed_sd_mm_s"), SD.values(), strict=True)
+    return Runs("synthetic", columns | {c: np.full(len(columns["time_s"]), sd) for c, sd in sds})
 
 
 @pytest.fixture(scope="module")
@@ -62,45 +78,21 @@ def engine():
 
     def table(changes, names, seed=0):
         rng = np.random.default_rng(seed)
-        times = np.arange(1, 80) * EVERY
-        parts = []
-        for name in names:
-            rows, slope = COURSES[name]
-            modes = [MODES.index(m) for _, m in rows] + [0]
-            volts = [v for v, _ in rows] + [0.0]
-            values = {**TRUTH, f"effects.{UNDECLARED}.amplitude": 0.0, **changes}
-            kept = course(
-                {k: jnp.asarray(v) for k, v in values.items()}, jnp.asarray(modes), jnp.asarray(volts), slope
-            )
-            there = np.isfinite(np.asarray(kept.time))
-            at = np.searchsorted(SEGMENTS, times + 1e-9, side="right") - 1
-            driven = np.asarray(modes)[at] == 0
+        values = {**TRUTH, f"effects.{UNDECLARED}.amplitude": 0.0, **changes}
 
-            def seen(x, there=there, kept=kept):
-                return np.interp(times, np.asarray(kept.time)[there], np.asarray(x)[there])
+        def readings(rows, slope, volts, modes):
+            segments = jnp.asarray([MODES.index(m) for _, m in rows] + [0]), jnp.asarray([v for v, _ in rows] + [0.0])
+            kept = course({k: jnp.asarray(v) for k, v in values.items()}, *segments, slope)
+            there = np.isfinite(kept.time)
+            signals = kept.signals
+            shown = [
+                scale * np.interp(TIMES, np.asarray(kept.time)[there], np.asarray(x)[there])
+                for x, scale in ((signals.current, 2.0), (signals.speed_motor, 1 / RPM), (signals.speed, 1 / MM))
+            ]
+            shown[0] *= modes == "voltage"
+            return [x + sd * rng.standard_normal(len(TIMES)) for x, sd in zip(shown, SD.values(), strict=True)]
 
-            readings = {
-                "total_current_A": 2 * seen(kept.signals.current) * driven,
-                "motor_speed_rpm": seen(kept.signals.speed_motor) / RPM,
-                "speed_mm_s": seen(kept.signals.speed) / MM,
-            }
-            parts.append(
-                {
-                    "run_id": np.full(len(times), name),
-                    "time_s": times,
-                    "configuration": np.full(len(times), "6T2A"),
-                    "supply_voltage_V": np.asarray(volts)[at],
-                    "mode": np.asarray(MODES)[np.asarray(modes)[at]],
-                    "slope_deg": np.full(len(times), slope),
-                    "payload_kg": np.full(len(times), 2.0),
-                    **{c: x + SD[c] * rng.standard_normal(len(times)) for c, x in readings.items()},
-                }
-            )
-        columns = {c: np.concatenate([p[c] for p in parts]) for c in parts[0]}
-        sds = {"total_current_A": "total_current_sd_A", "motor_speed_rpm": "motor_speed_sd_rpm"}
-        sds["speed_mm_s"] = "speed_sd_mm_s"
-        columns |= {sds[c]: np.full(len(columns["time_s"]), sd) for c, sd in SD.items()}
-        return Runs("synthetic", columns)
+        return table_of(names, readings)
 
     return table
 
@@ -114,22 +106,14 @@ def simulated(engine):
 @pytest.fixture(scope="module")
 def runs():
     """The three courses with readings that approach those of their voltage within 50 ms, which no engine has to make."""
-    times, parts = np.arange(1, 80) * EVERY, []
-    at = np.searchsorted(SEGMENTS, times + 1e-9, side="right") - 1
-    for name, (rows, slope) in COURSES.items():
-        volts, modes = (np.array([row[k] for row in rows])[at] for k in (0, 1))
-        level, lag = np.where(modes == "voltage", volts, 0.0), np.zeros(len(times))
-        for k in range(1, len(times)):
-            lag[k] = lag[k - 1] + (level[k] - lag[k - 1]) * (1 - np.exp(-EVERY / 0.05))
-        parts.append({
-            "run_id": np.full(len(times), name), "time_s": times, "configuration": np.full(len(times), "6T2A"),
-            "supply_voltage_V": volts, "mode": modes, "slope_deg": np.full(len(times), slope),
-            "payload_kg": np.full(len(times), 2.0), "total_current_A": 2 + 0.1 * (level - lag) + 0.02 * level,
-            "motor_speed_rpm": 320.0 * lag, "speed_mm_s": 27.0 * lag,
-        })  # fmt: skip
-    columns = {c: np.concatenate([p[c] for p in parts]) for c in parts[0]}
-    sds = {"total_current_sd_A": 0.05, "motor_speed_sd_rpm": 15.0, "speed_sd_mm_s": 4.0}
-    return Runs("synthetic", columns | {c: np.full(len(columns["time_s"]), sd) for c, sd in sds.items()})
+
+    def readings(rows, slope, volts, modes):
+        level, lag = np.where(modes == "voltage", volts, 0.0), np.zeros(len(TIMES))
+        for k in range(1, len(TIMES)):
+            lag[k] = lag[k - 1] + (level[k] - lag[k - 1]) * (1 - np.exp(-0.02 / 0.05))
+        return 2 + 0.1 * (level - lag) + 0.02 * level, 320.0 * lag, 27.0 * lag
+
+    return table_of(COURSES, readings)
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +121,11 @@ def observer(runs):
     return Histories.of(runs, paper_robots.nominal())
 
 
+NOTHING = Noise(*(None for _ in dataclasses.fields(Noise)))
+
+
 def changed(runs, **columns):
-    return dataclasses.replace(runs, columns=runs.columns | columns)
+    return with_columns(runs, **columns)
 
 
 # --- a run
@@ -305,7 +292,7 @@ def test_ends_are_those_of_stretches_driven_forwards(runs):
 
 def test_reach_takes_what_the_motors_were_given(observer, robot):
     driven = observer.driven
-    assert driven.shape[0] > 4 and (np.asarray(driven.voltage) > 0).all() and (np.asarray(driven.duty) == 1).all()
+    assert driven.shape[0] > 4 and (driven.voltage > 0).all() and (driven.duty == 1).all()
     found = reach_of_table(robot, driven, ("speed",))
     assert found.voltages == (12.0, 15.0, 18.0, 24.0, 33.0) and found.used[0].slopes == (-4.0, -3.0, 0.0, 3.0, 4.0)
 
@@ -317,38 +304,15 @@ def test_conditions_that_change_between_many_levels_are_few(observer, runs, robo
     assert varying.times.shape[1] < 1.5 * observer.times.shape[1]  # changes of a thousandth need no short steps
 
 
-@pytest.mark.nightly
-def test_loop_finds_what_was_not_declared_on_a_stair(engine):
-    stairs = engine({**NOMINAL, f"effects.{UNDECLARED}.amplitude": 0.4}, ("stair", "reversal"))
-    analyst = Analyst(
-        dataclasses.replace(settings_for(Histories, 300), slots=1),
-        {n: BY_NAME[n] for n in ("rotating_inertia", UNDECLARED, "churning", "windage")},
-        {"6T2A.ground.friction.static": (0.32, 0.05)},
-    )
-    found = analyst.discover(stairs)
-    # nothing tells it from a winding's resistance that is not what its sheet says
-    assert found.verdict == "class" and [list(e.members) for e in found.effects] == [[UNDECLARED]]
-    assert list(found.effects[0].stated) == ["motor.resistance"]
-    amplitude = found.effects[0].parameters["amplitude"]
-    assert abs(amplitude.value - 0.4) < 4 * amplitude.sd and amplitude.sd < 0.05
-    assert {"mode", "supply_voltage_V"} <= set(found.rows_table())
-
-
 # --- files
 
 HEADER = "run_id,time_s,configuration,supply_voltage_V,payload_kg,slope_deg,speed_mm_s,total_mass_kg"
 
 
-def written(tmp_path, header, *rows):
-    path = tmp_path / "runs.csv"
-    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    return path
-
-
 def test_columns_of_the_driver_are_read(tmp_path, robot):
     rows = ("a,0,6T2A,24,0,0,0,11,0.5,voltage", "a,1,6T2A,-12,0,0,5,11,-1,voltage", "a,2,6T2A,0,0,0,5,11,,brake",
             "a,3,6T2A,24,0,0,5,11,,coast")  # fmt: skip
-    read = records.read_runs(written(tmp_path, f"{HEADER},duty,mode", *rows))
+    read = read_table(tmp_path, "\n".join([f"{HEADER},duty,mode", *rows]))
     found = read.conditions(robot)
     assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, -1, 1]
     assert found.voltage.tolist() == [24, -12, 0, 24] and applied_drive(read).tolist() == [12, 12, 0, 0]
@@ -356,7 +320,7 @@ def test_columns_of_the_driver_are_read(tmp_path, robot):
 
 
 @pytest.mark.parametrize(
-    ("header", "row", "says"),
+    "header, row, says",
     [
         (f"{HEADER},mode", "a,0,6T2A,24,0,0,0,11,reverse",
          r"row 1, mode: got reverse; expected one of these; .*voltage, brake, coast"),
@@ -370,36 +334,33 @@ def test_columns_of_the_driver_are_read(tmp_path, robot):
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_sentence(tmp_path, header, row, says):
-    with pytest.raises(BadData, match=says):
-        records.read_runs(written(tmp_path, header, row))
+    with refused(says):
+        read_table(tmp_path, f"{header}\n{row}")
 
 
 def test_what_cannot_change_within_a_run_is_refused(runs):
-    nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
     other = np.where(np.arange(len(runs)) % 2, "6T2A", "4W2T")
-    with pytest.raises(BadData, match=r"configuration: run coasting has several values; give each its own run_id"):
-        Histories.check(changed(runs, configuration=other), nothing)
+    with refused(r"configuration: run coasting has several values; give each its own run_id"):
+        Histories.check(changed(runs, configuration=other), NOTHING)
     mass = 11.5 + runs["payload_kg"] + 0.5 * (runs["time_s"] > 1)
-    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg apart from its payload"):
-        Histories.check(changed(runs, total_mass_kg=mass), nothing)
+    with refused(r"total_mass_kg: run coasting changes by 0.5 kg apart from its payload"):
+        Histories.check(changed(runs, total_mass_kg=mass), NOTHING)
     payload = runs["payload_kg"] + 3.0 * (runs["time_s"] > 1)
-    Histories.check(changed(runs, payload_kg=payload, total_mass_kg=11.5 + payload), nothing)
+    Histories.check(changed(runs, payload_kg=payload, total_mass_kg=11.5 + payload), NOTHING)
 
 
 def test_speeds_without_a_sign_are_refused_where_a_run_is_driven_backward(runs):
-    nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
-    with pytest.raises(BadData, match=r"motor_speed_rpm: got .* rpm at -15 V; expected negative readings"):
-        Histories.check(changed(runs, motor_speed_rpm=np.abs(runs["motor_speed_rpm"])), nothing)
+    with refused(r"motor_speed_rpm: got .* rpm at -15 V; expected negative readings"):
+        Histories.check(changed(runs, motor_speed_rpm=np.abs(runs["motor_speed_rpm"])), NOTHING)
 
 
 def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
     """Its inertia carries it through one stretch. Another shows that its speeds have a sign."""
-    nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
     back = np.flatnonzero(runs["supply_voltage_V"] * (runs["mode"] == "voltage") < 0)
     speed = runs["motor_speed_rpm"].copy()
     assert len(back) > 20 and speed[back].min() < -0.5 * speed.max()
     speed[back[5:]] = np.abs(speed[back[5:]])
-    Histories.check(changed(runs, motor_speed_rpm=speed), nothing)
+    Histories.check(changed(runs, motor_speed_rpm=speed), NOTHING)
 
 
 @pytest.mark.slow

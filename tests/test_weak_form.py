@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from test_log_kinds import carriage, servo, written
+from test_regression_verdicts import EVERY, SD, motor_log
 from worlds import logs
 
 from calibration.data import robot_file
@@ -18,41 +19,19 @@ from calibration.inference.observers import Histories
 from mmrjax.effects import BY_NAME, signal_effects
 from tests.commands import csv_text, motor_on_bench, read_rig, read_table
 
-STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
 TRUE = {"resistance": 0.9, "torque_constant": 0.042, "inertia": 2.4e-4}
 RIG = motor_on_bench("0.043 ± 10 %", "0.8 ± 20 %")
 NAMES = ("churning", "stribeck_track", "torque_constant_saturation", "series_resistance", "directional_friction")
 SETTINGS = settings_for(Histories, 250)
-SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
 
 
 def motor(seed=0, noise=(1.0, 1.0), quadratic=4e-8):
-    """U = k ω + R I + L dI/dt, J dω/dt = k I - M_0 sign ω - b ω - c ω|ω| of four runs under a staircase of voltage."""
-    rng, r, k, inertia = np.random.default_rng(seed), *TRUE.values()
-    rows, hold = 150, 50
-    volts = rng.uniform(6.0, 24.0, (4, rows // hold)) * np.array([[1.0], [1.0], [-1.0], [-1.0]])
-    current, speed, shown = np.zeros(4), np.zeros(4), []
-    for n in range(rows):
-        given = volts[:, n // hold]
-        shown.append((current, speed))
-        for _ in range(round(EVERY / STEP)):
-            settled = (given - k * speed) / r  # exact for the winding, whose time constant is two steps long
-            current = settled + (current - settled) * np.exp(-STEP * r / 4e-4)
-            dry = 0.02 * np.tanh(speed / 0.05)
-            torque = k * current - dry - 3e-5 * speed - quadratic * speed * abs(speed)
-            speed = speed + STEP * torque / inertia
-    current, speed = (np.array(x).T for x in zip(*shown, strict=True))
-    columns = {
-        "run_id": np.repeat(["a", "b", "c", "d"], rows),
-        "configuration": np.repeat(["bench"], 4 * rows),
-        "time_s": np.tile(np.arange(rows) * EVERY, 4),
-        "supply_voltage_V": np.repeat(volts, hold, 1).ravel(),
-        "motor_speed_rpm": (speed + noise[0] * SD[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
-        "motor_current_A": (current + noise[1] * SD[1] * rng.standard_normal(current.shape)).ravel(),
-        "slope_deg": np.zeros(4 * rows),
-        "payload_kg": np.zeros(4 * rows),
-    }
-    return columns
+    """Four runs under a staircase of voltage, of a motor that churns."""
+    rng = np.random.default_rng(seed)
+    volts = np.repeat(rng.uniform(6.0, 24.0, (4, 3)) * np.array([[1.0], [1.0], [-1.0], [-1.0]]), 50, 1)
+    return motor_log(
+        volts, lambda n, w: 0.02 * np.tanh(w / 0.05) + (3e-5 + quadratic * abs(w)) * w, rng, np.multiply(noise, SD)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +170,7 @@ def test_noise_of_simulated_states_is_not_that_of_readings(space):
     off, read = ((np.asarray(x.shown) - np.asarray(exact.shown))[moving] for x in (smooth, rows))
     for k in range(off.shape[1]):
         assert abs(np.corrcoef(off[:, k], read[:, k])[0, 1]) < 0.1
-    assert np.all(np.std(off, axis=0) < 0.05 * np.std(np.asarray(exact.shown), axis=0))
+    assert np.all(np.std(off, axis=0) < 0.05 * np.std(exact.shown, axis=0))
 
 
 def test_windows_hold_no_jump_and_readings_show_the_current_before_one(space, before, monkeypatch):

@@ -162,7 +162,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 
 
 @pytest.mark.parametrize(
-    ("kind", "rows"),
+    "kind, rows",
     [("progress_remark", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):
@@ -364,9 +364,9 @@ def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
 
 
 def test_what_would_measure_is_found_by_either_end_of_a_name():
-    assert table_words.would_measure("motor.inductance").startswith("a history of the starting current")
+    assert table_words.would_measure("motor.inductance").startswith("the starting current")
     assert re.search("faster than V_d", table_words.would_measure("6T2A.ground.friction.dynamic"))
-    assert table_words.would_measure("x.y") == "runs under conditions in which it has an effect"
+    assert table_words.would_measure("x.y") == "conditions in which it has an effect"
 
 
 def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(capsys):

@@ -88,7 +88,7 @@ def test_the_zero_of_every_meter_is_read_at_rest():
     shown = ("motor_speed", "motor_current", "position", "output_torque", "winding_temperature")
     said = {n: text for n, text in on(dataclasses.replace(BENCH, measured=shown)).items() if n.startswith("zero")}
     assert said == {
-        f"zero of {label}": f"Switch the motors off, with the shaft at rest and unloaded, and read the {label}"
+        f"zero of {label}": f"With the motors off and the shaft unloaded, read the {label}"
         for label in ("motor current", "output torque")
     }
 
@@ -119,7 +119,7 @@ def test_every_kind_of_runs_has_words():
 
 
 @pytest.mark.parametrize(
-    ("span", "count", "step"),
+    "span, count, step",
     [(17.178, 15, 1.0), (199.0, 15, 10.0), (12.0, 14, 1.0), (0.9, 15, 0.05), (3e4, 14, 2000.0)],
 )
 def test_steps_are_those_that_a_person_sets(span, count, step):

@@ -76,19 +76,17 @@ def test_logs_are_those_of_the_simulator_with_the_same_truth(tmp_path, imposed):
 
 
 @pytest.mark.slow
-def test_the_current_of_an_imposed_speed_is_that_of_the_motion_at_its_row(tmp_path):
-    """The speed is smooth between its rows. With slopes of lines from row to row it was off by 2.5 times its noise."""
-    case = logs.case(logs.rig(np.random.default_rng([3, 2]), "motor_speed", 0.02), "", 0.0, 1)
+@pytest.mark.parametrize(
+    "seed, imposed, every, share",
+    [
+        ([3, 2], "motor_speed", 0.02, 2),  # smooth between its rows: slopes of lines were off by 2.5 times the noise
+        ([41, 0, 1], "motor_current", 0.005, 3),  # with reversals: steps of 2.5 ms were off by 0.49 of the noise
+    ],
+)
+def test_motion_between_the_rows_of_a_log_is_followed_within_its_noise(tmp_path, seed, imposed, every, share):
+    case = logs.case(logs.rig(np.random.default_rng(seed), imposed, every), "", 0.0, 1)
     clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p])[0])
-    assert np.sqrt(np.mean((shown(tmp_path, case)[0] - clean) ** 2)) < ERROR / 2
-
-
-@pytest.mark.slow
-def test_reversals_of_a_log_are_followed_within_its_noise(tmp_path):
-    case = logs.case(logs.rig(np.random.default_rng([41, 0, 1]), "motor_current", 0.005), "", 0.0, 1)
-    clean = logs.whitened(case.rig, logs.histories(case.rig, [case.rig.p])[0])
-    # Steps of 2.5 ms were off by 0.49 and made the loop find what was not there.
-    assert np.sqrt(np.mean((shown(tmp_path, case)[0] - clean) ** 2)) < ERROR / 3
+    assert np.sqrt(np.mean((shown(tmp_path, case)[0] - clean) ** 2)) < ERROR / share
 
 
 def test_a_speed_that_still_rises_is_no_matter_of_units(tmp_path, monkeypatch):

@@ -55,7 +55,7 @@ def steady(w, *effects):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [k if k == "bench" else pytest.param(k, marks=pytest.mark.slow) for k in rigs.KINDS])
+@pytest.mark.parametrize("kind", rigs.KINDS)
 def test_readings_are_those_of_the_simulator(worlds, kind):
     """Rigs of every kind: voltage, duty or speed imposed, forward and backward, loads that drive the motor."""
     mine = [w for w in worlds if w.rig.kind == kind]
@@ -71,30 +71,26 @@ def test_readings_are_those_of_the_simulator(worlds, kind):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    "names", [("churning",), pytest.param(tuple(laws.RIGS), marks=pytest.mark.slow)], ids=["one", "every"]
-)
-def test_laws_are_those_of_the_library(worlds, names):
+@pytest.mark.parametrize("name", laws.RIGS)
+def test_law_is_that_of_the_library(worlds, name):
     """A library law in mmrjax shows what the world shows, to a thousandth of a rig's largest reading."""
     rng = np.random.default_rng(7)
-    with jax.enable_x64(True):
-        for name in names:
-            form = laws.RIGS[name]
-            fits = [w for w in worlds if name in w.applicable(laws.RIGS)]
-            w = next((w for w in fits if not w.rig.wide), fits[0])
-            law = form.at(w.scale())
-            term = dataclasses.replace(laws.draw(name, rng, law), amplitude=0.2 * law.size)
-            effect = BY_NAME[name]()
-            assert form.cls == name
-            assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
-            mine = [p.name for p in params.walk_parameters(effect) if p.name != "amplitude"]
-            shapes = dict(zip(mine, term.shapes.values(), strict=False))
-            values = {"amplitude": term.amplitude, **shapes}
-            effect = params.replace(effect, {k: jnp.asarray(v) for k, v in values.items()})
-            found, _ = steady(w, effect)
-            s, sound = rigs.solve(w.rig, w.conditions, w.constants, [term])
-            for k, channel in enumerate(w.rig.channels):
-                if channel == "output_torque" and term.law.balance == "gearbox":
-                    continue  # what a torque meter at the output shows is without the gear's own loss
-                size = np.abs(s.shown[k]).max()
-                assert_allclose(found[k][sound] / size, s.shown[k][sound] / size, atol=1e-6, err_msg=name)
+    form = laws.RIGS[name]
+    fits = [w for w in worlds if name in w.applicable(laws.RIGS)]
+    w = next((w for w in fits if not w.rig.wide), fits[0])
+    law = form.at(w.scale())
+    term = dataclasses.replace(laws.draw(name, rng, law), amplitude=0.2 * law.size)
+    effect = BY_NAME[name]()
+    assert form.cls == name
+    assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
+    mine = [p.name for p in params.walk_parameters(effect) if p.name != "amplitude"]
+    shapes = dict(zip(mine, term.shapes.values(), strict=False))
+    values = {"amplitude": term.amplitude, **shapes}
+    effect = params.replace(effect, {k: jnp.asarray(v) for k, v in values.items()})
+    found, _ = steady(w, effect)
+    s, sound = rigs.solve(w.rig, w.conditions, w.constants, [term])
+    for k, channel in enumerate(w.rig.channels):
+        if channel == "output_torque" and term.law.balance == "gearbox":
+            continue  # what a torque meter at the output shows is without the gear's own loss
+        size = np.abs(s.shown[k]).max()
+        assert_allclose(found[k][sound] / size, s.shown[k][sound] / size, atol=1e-6, err_msg=name)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -83,6 +84,10 @@ class ActiveSet(eqx.Module):
         values |= {f"effects.{n}.{s}": shapes[k] for k, (n, s) in pairs if s}
         return params.replace(self.base.robot(robot, base), values)
 
+    def indices(self, names: Sequence[str]) -> tuple[int, ...]:
+        """Index of each effect, -1 for an empty slot ("")."""
+        return tuple(self.names.index(name) if name else -1 for name in names)
+
     def with_effects(self, active: Sequence[int] | Array) -> ActiveSet:
         """Copy with these effects in the slots."""
         slots = active if isinstance(active, jax.Array) else np.asarray(active, int)  # avoids compiling a conversion
@@ -126,20 +131,23 @@ class ScoredLibrary:
     def __getitem__(self, name: str) -> Effect:
         return self.effects[self.names.index(name)]
 
-    def indices(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Index of each effect, -1 for an empty slot ("")."""
-        index_of_name = {n: k for k, n in enumerate(self.names)} | {"": -1}
-        return tuple(index_of_name[n] for n in names)
-
     def largest(self, instances: np.ndarray) -> np.ndarray:
         """Largest value among the instances of each effect, shape (effects,). Values must not be negative."""
         largest_scores = np.zeros(len(self))
         np.maximum.at(largest_scores, self.of, instances)
         return largest_scores
 
+    def instances(self, name: str) -> np.ndarray:
+        """Indices of the instances of an effect."""
+        return np.flatnonzero(self.of == self.names.index(name))
+
+    def columns(self, name: str, linear: Linearization) -> np.ndarray:
+        """Sensitivity of the readings to each instance of an effect at a fit, shape (readings, instances)."""
+        return np.asarray(linear.signatures)[:, self.instances(name)]
+
     def best_instance(self, name: str, single: np.ndarray) -> int:
         """Index of the instance of an effect that has the largest |score|."""
-        instances = np.flatnonzero(self.of == self.names.index(name))
+        instances = self.instances(name)
         return int(instances[np.argmax(np.abs(np.asarray(single)[instances]))])
 
 
@@ -211,25 +219,22 @@ class CandidateSpace:
         `room` and of the sets.
         """
         sets = [tuple(names) for names in sets]
-        if not self.bare.observe.long:
-            return self.equipped, [self.library.indices(names) for names in sets]
-        effects_to_place = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
-        library_indices = [k for k, n in enumerate(self.library.names) if n in effects_to_place]
-        names, all_coordinates = tuple(self.library.names[k] for k in library_indices), self.coordinates
-        value, spread, sd, low, high = (x[np.asarray(library_indices)] for x in all_coordinates.scales)
-        coordinates = dataclasses.replace(
-            all_coordinates,
-            sd=all_coordinates.sd[np.asarray(library_indices)],
-            scales=(value, spread, sd, low, high),
-            names=names,
-            shapes=tuple(all_coordinates.shapes[k] for k in library_indices),
-        )
-        robot = self.equipped.base
-        effect_names = {e.name for e in self.bare.base.effects} | effects_to_place
-        robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in effect_names))
-        index = {n: k for k, n in enumerate(names)} | {"": -1}
-        problem = dataclasses.replace(self.equipped, base=robot, coordinates=coordinates)
-        return problem, [tuple(index[n] for n in name_set) for name_set in sets]
+        problem, coordinates = self.equipped, self.coordinates
+        if self.bare.observe.long:
+            placed = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
+            kept = np.flatnonzero(np.isin(self.library.names, list(placed)))
+            scales: Any = tuple(x[kept] for x in coordinates.scales)
+            coordinates = dataclasses.replace(
+                coordinates,
+                sd=coordinates.sd[kept],
+                scales=scales,
+                names=tuple(coordinates.names[k] for k in kept),
+                shapes=tuple(coordinates.shapes[k] for k in kept),
+            )
+            placed |= {e.name for e in self.bare.base.effects}
+            robot = with_only(problem.base, placed)
+            problem = dataclasses.replace(problem, base=robot, coordinates=coordinates)
+        return problem, [coordinates.indices(names) for names in sets]
 
     def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
         """Problem, coordinates and indices of the effects for one fit.
@@ -246,6 +251,11 @@ class CandidateSpace:
         """Problem with these effects in its slots."""
         problem, (indices,) = self.problem_for_sets([active])
         return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(indices))
+
+
+def with_only(robot: Robot, names: Collection[str]) -> Robot:
+    """The robot with those of its effects that have these names."""
+    return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))
 
 
 def candidate_space(
@@ -302,37 +312,34 @@ def coordinate_groups(
     if not isinstance(coordinates, ActiveSet):
         return [posterior_of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
     p, slots = len(coordinates.base), coordinates.slots
-    parts, kept_places = [posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
+    base = posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))
+    rows: list[tuple[Any, ...]] = []
     for slot, name in enumerate(active):
         if not name:
             continue
-        effect = space.library[name]
-        amplitude = amplitude_of(effect)
+        amplitude, shape = amplitude_of(space.library[name]).spec, free_shape_parameter(space.library[name])
         sd = float(coordinates.sd[coordinates.names.index(name)])
-        of_amplitude = clipped_parameters(
-            (f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]])
-        )
-        parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
-        kept_places.append(p + slot)
-        shape = free_shape_parameter(effect)
-        if shape is None:
-            continue
-        value, spread, angle_sd, low, high = shape_scales(shape)
-        log = spread > 0
-        of_shape = clipped_parameters((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
-        bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
-        parts.append(
-            dataclasses.replace(
-                of_shape, mean=z[p + slots + slot, None], location=np.array([math.log(value) if log else value]),
-                spread=np.array([spread if log else angle_sd]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
-                kinds=(LOG if log else ANGLE,),
-            )
-        )  # fmt: skip
-        kept_places.append(p + slots + slot)
-    return parts, kept_places
+        rows.append((p + slot, f"effects.{name}.amplitude", amplitude, 0.0, sd, *amplitude.bounds, NORMAL))
+        if shape is not None:
+            at, named = p + slots + slot, f"effects.{name}.{shape.name}"
+            value, spread, angle_sd, low, high = shape_scales(shape)
+            if spread > 0:
+                ends = math.log(low) if low > 0 else -math.inf, math.log(high)
+                rows.append((at, named, shape.spec, math.log(value), spread, *ends, LOG))
+            else:
+                rows.append((at, named, shape.spec, value, angle_sd, -math.inf, math.inf, ANGLE))
+    if not rows:
+        return [base], list(range(p))
+    places, names, specs, *numbers, kinds = zip(*rows, strict=True)
+    location, spreads, lows, highs = np.array(numbers, float)
+    effects = dataclasses.replace(
+        clipped_parameters(names, specs, z[list(places)]),
+        location=location, spread=spreads, low=lows, high=highs, kinds=kinds,
+    )  # fmt: skip
+    return [base, effects], [*range(p), *places]
 
 
-def clipped_parameters(names: Names, specs: list[Spec], mean: np.ndarray) -> Posterior:
+def clipped_parameters(names: Names, specs: Sequence[Spec], mean: np.ndarray) -> Posterior:
     """Posterior of parameters that are their own coordinates, clipped at their bounds."""
     size = len(names)
     return Posterior(

@@ -55,14 +55,17 @@ class AdequacyTest:
         statistic = float(getattr(self.found, kind)) if found is None else found
         return statistic > self.threshold(kind) + self.settings.margins[kind]
 
+    def of(self, found: StrongestStatistics) -> AdequacyTest:
+        """The same test of other statistics."""
+        return dataclasses.replace(self, found=found)
+
     def confirmed(self, gain: float) -> AdequacyTest:
         """The test after a simulation: the scores of the strongest effect and of its pairs are reduced to the gain
         that the simulation confirms [σ²].
         """
         promised = float(self.found.single) ** 2
         pair = self.found.pair - max(promised - gain, 0.0)
-        bounded = dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair)
-        return dataclasses.replace(self, found=bounded)
+        return self.of(dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair))
 
     @property
     def p_value(self) -> float:

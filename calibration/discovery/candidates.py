@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,10 +58,8 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
     if not negative or space.bare.observe.long:
         return tuple(negative)
     power = _dissipated_power(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
-    if power is None:
-        return tuple(negative)
-    power_by_balance = dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
-    return tuple(n for n in negative if not _dissipates(power_by_balance.get(space.library[n].balance)))
+    by_balance = {} if power is None else dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
+    return tuple(n for n in negative if not _dissipates(by_balance.get(space.library[n].balance)))
 
 
 def _dissipates(power: np.ndarray | None) -> bool:
@@ -135,6 +134,11 @@ class Candidate:
         """Set of its effects, which identifies the candidate."""
         return frozenset(self.effects)
 
+    def with_effect(self, replaced: str, effect: str) -> Names:
+        """Its slots with one effect, or the first empty slot (""), replaced by another effect."""
+        k = self.active.index(replaced)
+        return (*self.active[:k], effect, *self.active[k + 1 :])
+
 
 def empty_slots(settings: Settings) -> Names:
     """Slots without effects."""
@@ -148,14 +152,13 @@ def fill_slots(effects: Sequence[str], settings: Settings) -> Names:
 
 def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settings: Settings) -> Candidate:
     """Candidate with the result of a fit and the plausibility of its amplitudes."""
-    amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
-    spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
-    amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
-    size = np.array(
-        [_relative_amplitude(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)]
+    amplitude, spread = (
+        np.where([bool(name) for name in active], settings.width * np.asarray(space.coordinates.parts(x)[1]), 0.0)
+        for x in (best.z, best.sd)
     )
-    near = np.array(
-        [_relative_amplitude(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)]
+    size, near = (
+        np.array([_relative_amplitude(space, n, a, settings) for n, a in zip(active, x, strict=True)])
+        for x in (amplitude, spread)
     )
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
     z, sd = np.asarray(best.z), np.asarray(best.sd)
@@ -167,7 +170,11 @@ def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settin
 
 
 def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
-    """Amplitude relative to the largest plausible one of its sign [-]. The amplitude is given in prior sds."""
+    """Amplitude relative to the largest plausible one of its sign [-]. The amplitude is given in prior sds. 0 for an
+    empty slot.
+    """
+    if not name:
+        return 0.0
     spec = amplitude_of(space.library[name]).spec
     unit = spec.prior_sd(0.0)
     bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / unit
@@ -189,6 +196,14 @@ class BaseFit:
     reading: np.ndarray
     space: CandidateSpace
     unusable: tuple[int, ...]
+
+
+def with_slots(best: Optimum, space: CandidateSpace, settings: Settings) -> Optimum:
+    """Optimum of the base with the coordinates of empty slots."""
+    empty = np.zeros(2 * settings.slots)
+    z, sd = np.append(best.z[: space.free], empty), np.append(best.sd[: space.free], empty + 1)
+    fit: dict[str, Any] = {"z": z, "sd": sd}
+    return dataclasses.replace(best, **fit)
 
 
 def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candidate | None = None) -> BaseFit:
@@ -214,16 +229,9 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
         unusable_rows = space.bare.observe.unreachable(np.asarray(observations.status[k])) & space.included
         if not unusable_rows.any():
-            slots = np.zeros(2 * settings.slots)
             best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
-            z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
-            best = dataclasses.replace(best, z=z, sd=sd)
-            return BaseFit(
-                candidate_of_fit(space, empty_slots(settings), best, settings),
-                np.asarray(observations.reading[k]),
-                space,
-                unusable,
-            )
+            fit = candidate_of_fit(space, empty_slots(settings), with_slots(best, space, settings), settings)
+            return BaseFit(fit, np.asarray(observations.reading[k]), space, unusable)
         unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(unusable_rows))}))
         space = space.without(unusable_rows)
         if space.included.sum() < FEWEST:
@@ -253,17 +261,15 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
     if near is not None and observe.long:
         starts, regression = near.z[None, : space.free], not near.simulated
         if regression:
-            doubted = np.abs(starts).max() > UNLIKELY
-            mean = [np.zeros(space.free)] if doubted else []
+            mean = [np.zeros(space.free)] * bool(np.abs(starts).max() > UNLIKELY)
             starts = scans.place_at_minimum(bare, np.stack([*starts, *mean]))
     else:
         starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
     rivals = regression or near is None or not observe.long  # a fit of the same runs has scanned them
 
     def search(starts: np.ndarray) -> tuple[Optimum, Observation]:
-        weights = np.repeat(space.weight[None], len(starts), 0)
-        search_inputs = jnp.asarray(starts), jnp.asarray(weights)
-        return jax.device_get(observe.search(bare, *search_inputs, rivals=rivals))
+        weights = jnp.asarray(np.repeat(space.weight[None], len(starts), 0))
+        return jax.device_get(observe.search(bare, jnp.asarray(starts), weights, rivals=rivals))
 
     optima = search(starts)
     if regression and len(starts) == 1 and not np.all(optima[0].converged):

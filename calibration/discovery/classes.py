@@ -13,7 +13,8 @@ from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
-from calibration.discovery.projection import explained_function, projection_factor
+from calibration.discovery.discrepancy import BaseCurve
+from calibration.discovery.projection import Projection
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
@@ -51,15 +52,10 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
     Args:
         jacobian, residual: Jacobian and residual of a fit, with the residuals of the priors last.
     """
-    half = projection_factor(jacobian)
-    prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
-    leverage = np.sum(half[:, prior_rows] ** 2, 0)
-    projected_residual = residual[prior_rows] - half[:, prior_rows].T @ (half @ residual)
-    free = np.maximum(1 - leverage, 1e-9)
-    is_visible = leverage < 1 - 1e-6
-    return np.where(is_visible, projected_residual**2 / free, 0.0), np.where(
-        is_visible, residual[prior_rows] / free, 0.0
-    )
+    fit, priors = Projection(jacobian, residual), slice(len(residual) - jacobian.shape[1], None)
+    leverage = np.sum(fit.half[:, priors] ** 2, 0)
+    free, is_visible = np.maximum(1 - leverage, 1e-9), leverage < 1 - 1e-6
+    return np.where(is_visible, fit.left[priors] ** 2 / free, 0.0), np.where(is_visible, residual[priors] / free, 0.0)
 
 
 def find_prior_shifts(
@@ -148,65 +144,54 @@ class Classes:
         ]
 
 
-def find_classes(
-    space: CandidateSpace,
-    base: Candidate,
-    best: Candidate,
-    ladder: tuple[Candidate, ...],
-    left: Diagnosis,
-    after: Diagnosis,
-    settings: Settings,
-) -> Classes:
+def find_classes(beside: BaseCurve, best: Candidate, ladder: tuple[Candidate, ...], after: Diagnosis) -> Classes:
     """Effects and stated values that explain the data as well as each effect of the best fit.
 
     Real losses need not have the exact form of a library effect. So an alternative may explain less than the effect
     by a share `settings.form` of its sigmas, or by `form_family` if it is of the same family.
 
     Args:
-        left: diagnosis of the base fit.
+        beside: the base fit with its diagnosis.
         after: diagnosis of the best fit.
     """
+    space, left, settings = beside.space, beside.left, beside.settings
     names, effect_of = space.library.names, space.library.of
     # Largest |cos| between the projected signatures of every two effects, over their shapes.
     cosine = np.zeros((len(names), len(names)))
     np.maximum.at(cosine, (effect_of[:, None], effect_of[None, :]), np.abs(np.asarray(left.scores.cosine)))
-    fewer = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, ladder)
-    gains = [2 * (c.cost - best.cost) for c in fewer]
-    requests: list[tuple[int, str, Names]] = []
-    for slot, name in enumerate(best.effects):
-        k = names.index(name)
-        for j in np.argsort(-cosine[k])[:TRIED]:
-            if cosine[k, j] > settings.alike and names[j] not in best.effects:
-                active = tuple(names[j] if s == slot else n for s, n in enumerate(best.active))
-                requests.append((slot, names[j], active))
+    one = len(best.effects) == 1
+    fewer = [beside.base] if one else refit_without_each(space, best, settings, ladder)
+    rivals: dict[tuple[str, str], Names] = {}
+    for name in best.effects:
+        parallel = cosine[names.index(name)]
+        for j in np.argsort(-parallel)[:TRIED]:
+            if parallel[j] > settings.alike and names[j] not in best.effects:
+                rivals[name, names[j]] = best.with_effect(name, names[j])
     fits = {c.key: c for c in ladder}
-    new = [active for _, _, active in requests if frozenset(n for n in active if n) not in fits]
+    new = [active for active in rivals.values() if frozenset(active) - {""} not in fits]
     fitted = fit_candidates(space, [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new], settings)
     fits |= {c.key: c for c in fitted}
-    members, stated_shifts, ammeter = [], [], []
-    jacobian, residual = map(np.asarray, (after.linear.jacobian, after.linear.residual))
-    for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
-        same = [name]
+    members, stated, families = [], [], []
+    for name, without in zip(best.effects, fewer, strict=True):
+        same, gain = [name], 2 * (without.cost - best.cost)
         family = space.library[name].family()
-        for s, other, active in requests:
-            rival = fits[frozenset(n for n in active if n)]
-            parallel = cosine[names.index(name), names.index(other)] > settings.parallel
+        for (replaced, other), active in rivals.items():
+            rival = fits[frozenset(active) - {""}]
             akin = space.library[other].family() == family
             limit = settings.tolerance(gain, akin)
-            limit = max(limit, settings.same_parallel) if parallel else limit
-            if s == slot and (rival.nearly if akin else rival.plausible) and 2 * (rival.cost - best.cost) <= limit:
+            if cosine[names.index(name), names.index(other)] > settings.parallel:
+                limit = max(limit, settings.same_parallel)
+            plausible = rival.nearly if akin else rival.plausible
+            if replaced == name and plausible and 2 * (rival.cost - best.cost) <= limit:
                 same.append(other)
         members.append(tuple(same))
-        column = jacobian[: after.linear.readings, space.free + slot, None]
-        rest = remove_effect(space, best, slot, jacobian, residual)
-        ammeter.append(ammeter_families(space, *rest, column, family, settings))
-        linear = left.linear if len(best.effects) == 1 else None
-        shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
-        stated_shifts.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
-    families = ((*families_of_members(space, same), *also) for same, also in zip(members, ammeter, strict=True))
-    return Classes(
-        tuple(members), tuple(stated_shifts), tuple(tuple(dict.fromkeys(f)) for f in families), (*ladder, *fitted)
-    )
+        fit = Projection.of(after.linear)
+        column = fit.jacobian[: after.linear.readings, space.free + best.active.index(name), None]
+        ammeter = ammeter_families(space, remove_effect(space, best, name, fit), column, family, settings)
+        families.append(tuple(dict.fromkeys((*families_of_members(space, same), *ammeter))))
+        shifts = find_prior_shifts(space, without, SURE * gain, settings, left.linear if one else None)
+        stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= settings.tolerance(gain)))
+    return Classes(tuple(members), tuple(stated), tuple(families), (*ladder, *fitted))
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:
@@ -214,21 +199,15 @@ def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:
     return tuple(dict.fromkeys(space.library[m].family() for m in members))
 
 
-def remove_effect(
-    space: CandidateSpace, best: Candidate, slot: int, jacobian: np.ndarray, residual: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian and residual of a fit after the effect in one slot is removed, to first order."""
-    k = space.free + slot
-    return np.delete(jacobian, [k, k + len(best.active)], 1), residual - jacobian[:, k] * best.z[k]
+def remove_effect(space: CandidateSpace, best: Candidate, effect: str, fit: Projection) -> Projection:
+    """Projection at a fit after one of its effects is removed, to first order."""
+    k = space.free + best.active.index(effect)
+    removed = np.delete(fit.jacobian, [k, k + len(best.active)], 1)
+    return Projection(removed, fit.residual - fit.jacobian[:, k] * best.z[k])
 
 
 def ammeter_families(
-    space: CandidateSpace,
-    jacobian: np.ndarray,
-    residual: np.ndarray,
-    columns: np.ndarray,
-    family: str,
-    settings: Settings,
+    space: CandidateSpace, fit: Projection, columns: np.ndarray, family: str, settings: Settings
 ) -> Names:
     """Families of ammeter errors that explain the data as well as these effects, by changing the current readings
     alone.
@@ -237,28 +216,25 @@ def ammeter_families(
     to torque can separate a loss from an ammeter error.
 
     Args:
-        jacobian, residual: Jacobian and residual of the fit without the effects.
+        fit: the fit without the effects.
         columns: change of the readings per unit of each effect.
         family: family of the effects.
     """
-    names = channels.channel_names(space.bare.channels)
     if space.bare.base.rig.imposed != "motor_speed":
         return ()
-    explained = explained_function(jacobian, residual)
-    most = explained(columns)[0]
+    names, most = channels.channel_names(space.bare.channels), fit.explained(columns)[0]
     least = most - settings.tolerance(most)
     driver = family.partition(" that ")[2].replace("with load", "with current")
+    of_channel = np.arange(len(columns)) % len(names)
     return tuple(
         f"{place_in_words(name)} that {driver}"
         for k, name in enumerate(names)
-        if name.endswith("current")
-        and explained(columns * (np.arange(len(columns)) % len(names) == k)[:, None])[0] >= least
+        if name.endswith("current") and fit.explained(columns * (of_channel == k)[:, None])[0] >= least
     )
 
 
 def errors_of_ammeters(space: CandidateSpace, families: Names) -> Names:
     """Those of the families after the first that are errors of an ammeter, for a `Mechanism`."""
     names = channels.channel_names(space.bare.channels)
-    return tuple(
-        f for f in families[1:] if f.startswith(tuple(place_in_words(n) for n in names if n.endswith("current")))
-    )
+    ammeters = tuple(place_in_words(name) for name in names if name.endswith("current"))
+    return tuple(f for f in families[1:] if f.startswith(ammeters))

@@ -18,13 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Names
-from calibration.discovery.active_set import ActiveSet, CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.active_set import ActiveSet, CandidateSpace, with_only
+from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.projection import BalanceError, Projection, balance_error_by_row
+from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import diagnose_fit, family_columns
+from calibration.discovery.settings import Settings
 from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -34,7 +35,7 @@ from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects import UNNAMED
-from mmrjax.effects.curve import PLACES
+from mmrjax.effects.curve import ORDINATES, PLACES
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
@@ -71,13 +72,13 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
     same_kind = [j for j in range(len(names)) if happens[j] == for_a_while]
-    k = max(same_kind, key=lambda j: deviate[j])
+    k = max(same_kind, key=deviate.__getitem__)
     # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
     lacks = [j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
-    k = max(lacks, key=lambda j: deviate[j]) if lacks else k
+    k = max(lacks, key=deviate.__getitem__) if lacks else k
     place = names[k][0]
     place_columns = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
-    j = k if for_a_while else max(place_columns, key=lambda j: deviate[j])
+    j = k if for_a_while else max(place_columns, key=deviate.__getitem__)
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
@@ -140,24 +141,18 @@ def refine_window(
         included: True for included rows, shape (rows,).
     """
     (x, way), included = linear.curve_variable(place, axis), linear.at_points(included)
-    levels, counts = np.unique(x[included], return_counts=True)
-    merged = -(-len(levels) // INSTANTS)
-    edges = levels[::merged]
+    levels = np.unique(x[included])
+    edges = levels[:: -(-len(levels) // INSTANTS)]
     index = np.searchsorted(edges, x, side="right") - 1
     shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
-    a, b = Projection(linear)(bases_room.place_signature(linear, place, way[:, None] * shapes))
-    sums = np.zeros((len(edges) + 1,) * 2)
-    sums[1:, 1:] = a.cumsum(0).cumsum(1)
-    pull = np.append(0.0, b.cumsum())
-    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(levels), merged)).cumsum())
+    a, b = Projection.of(linear)(bases_room.place_signature(linear, place, way[:, None] * shapes))
+    sums, pull = np.pad(a.cumsum(0).cumsum(1), ((1, 0), (1, 0))), np.append(0.0, b.cumsum())
+    rows = np.append(0, np.bincount(index[included], minlength=len(edges)).cumsum())
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
     rows_in_window = rows[last] - rows[first]
-    fair = (
-        (rows_in_window >= bases_room.FEWEST)
-        & (rows_in_window <= 0.5 * rows[-1])
-        & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
-    )
+    fair = (rows_in_window >= bases_room.FEWEST) & (rows_in_window <= 0.5 * rows[-1])
+    fair &= norm2 > 1e-9 * max(float(a.max()), 1e-300)
     gain = np.where(fair, (pull[last] - pull[first]) ** 2 / np.where(fair, norm2, 1.0), -np.inf)
     k = int(np.argmax(gain))
     inside = included & (index >= first[k]) & (index < last[k])
@@ -219,7 +214,6 @@ class Discrepancy:
     Attributes:
         balance, variable, unit: place and variable of the discrepancy, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
-        defect: error of the balance in each row, at the fit without the curve. None if single rows do not show it.
         grid: values of the variable for the curve [SI].
         curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty of the
             base, so it is wide if base parameters can replace the curve.
@@ -236,7 +230,6 @@ class Discrepancy:
     unit: str
     effect: str
     robot: Robot
-    defect: BalanceError | None
     grid: np.ndarray
     curve: np.ndarray
     sd: np.ndarray
@@ -258,7 +251,7 @@ def fit_discrepancy(
         base: fit without the curve.
         linear: linearization of that fit.
         balance: one of `bases.BALANCES`, or a channel.
-        variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
+        variable: one of `bases.VARIABLES`, or a window.
     """
     included = space.included
     at_base = fit_smooth_curve(linear, balance, variable, included)
@@ -279,8 +272,7 @@ def fit_discrepancy(
         variable=variable,
         unit=PLACES[balance][0],
         effect=at_base.effect,
-        robot=dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names)),
-        defect=balance_error_by_row(linear, balance) if space.bare.observe.rows_tell else None,
+        robot=with_only(robot, names),
         grid=grid,
         curve=values,
         sd=sd,
@@ -298,7 +290,7 @@ def diagnose_with_curve(space: CandidateSpace, found: Discrepancy, bases: Bases,
     """Diagnosis of the fit with a curve. Its critical values are those of the base (`left`)."""
     z, effects = jnp.asarray(found.z), space.library.scored
     linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases)
-    return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
+    return Diagnosis(linear, scores, left.test.of(strongest))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -316,6 +308,11 @@ class BaseCurve:
     base: Candidate
     left: Diagnosis
     bases: Bases
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the tests."""
+        return self.left.test.settings
 
     @functools.cached_property
     def where(self) -> DiscrepancyLocation:
@@ -350,9 +347,10 @@ def _problem_with_curve(space: CandidateSpace, base: Candidate, curve: SmoothCur
     problem = space.problem(base.active) if base.effects else space.bare
     # A curve of this name from an earlier round is replaced, because its parameters have the same names.
     other_effects = tuple(e for e in problem.base.effects if e.name != curve.effect)
-    added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
+    values = {"amplitude": curve.scale, "low": curve.low, "high": curve.high}
+    added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in values.items()})
     robot = dataclasses.replace(problem.base, effects=(*other_effects, added))
-    names = tuple(f"effects.{curve.effect}.{n}" for n in curve.ordinates)
+    names = tuple(f"effects.{curve.effect}.{n}" for n in ORDINATES)
     shaped = CurveCoordinates(problem.coordinates, jnp.asarray(curve.root), names)
     data = dataclasses.replace(problem.data, centre=jnp.zeros(len(shaped)))
     return dataclasses.replace(problem, base=robot, coordinates=shaped, data=data)

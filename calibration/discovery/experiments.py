@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -75,9 +76,8 @@ class PredictedReadings:
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives if all of these experiments are carried out [σ]."""
-        run_spans = predicted.reading_spans(self.experiments)
-        spans = [run_spans[e] for e in experiments]
-        columns = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
+        spans = predicted.reading_spans(self.experiments)
+        columns = np.concatenate([np.flatnonzero(self.exists[spans[e]]) + spans[e].start for e in experiments])
         d = self.value[a, columns] - self.value[b, columns]
         squares = [d @ np.linalg.solve(_covariance(self.half[x, columns], self.sd[columns]), d) for x in (a, b)]
         return float(np.sqrt(max(min(squares), 0.0)))
@@ -153,10 +153,10 @@ class Proposal:
     JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu=table")
     experiments: Names
     instruction: Remark
-    separates: Names
-    expected_sigma: float
-    settles: bool
-    table: tuple[RankedExperiment, ...]
+    separates: Names = ()
+    expected_sigma: float = 0.0
+    settles: bool = False
+    table: tuple[RankedExperiment, ...] = ()
 
     @property
     def name(self) -> str:
@@ -180,10 +180,10 @@ def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = Tru
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
     alternatives = {best.active: best}
-    for slot, members in enumerate(found.members):
-        for name in members[1:]:
-            active = tuple(name if s == slot else n for s, n in enumerate(best.active))
-            alternatives[active] = fitted[frozenset(n for n in active if n)]
+    for leader, *others in found.members:
+        for name in others:
+            active = best.with_effect(leader, name)
+            alternatives[active] = fitted[frozenset(active) - {""}]
     by_name = {" + ".join(c.effects): c for c in alternatives.values()}
     if stated:
         for shifts in found.stated:
@@ -260,27 +260,21 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
         ]
     )
     within = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
-    all_experiments, shown_channels = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
-    predictions, half = jax.device_get(
-        _predict_alternatives(
-            equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed
-        )
+    menu_experiments, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
+    batch = predicted.batch_experiments(menu_experiments, shown)
+    predictions, half = jax.tree.map(
+        lambda x: np.asarray(x)[: len(names)], _predict_alternatives(equipped, other, batch, active, z, informed)
     )
-    predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
-    experiments, possible_predictions = _possible_experiments(all_experiments, predictions, within, settings)
+    experiments, possible = _possible_experiments(menu_experiments, predictions, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
-    sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
-    value, half = (
-        np.nan_to_num(predictions.value[:, possible_predictions]),
-        np.nan_to_num(half[:, possible_predictions]),
-    )
-    return PredictedReadings(
-        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[possible_predictions], settings
-    )
+    sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
+    value, half = (np.nan_to_num(x[:, possible]) for x in (predictions.value, half))
+    exists = np.all(predictions.exists[:, possible], 0)
+    return PredictedReadings(tuple(names), experiments, value, half, sd, exists, settings)
 
 
 def _possible_experiments(
-    experiments: Sequence[menu.Experiment], found: predicted.MenuPrediction, within: Reach, settings: Settings
+    experiments: Sequence[menu.Experiment], found: predicted.MenuPrediction, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
     """Experiments of a menu that are possible and allowed, and a mask of their readings among all readings of the
     menu.
@@ -288,26 +282,25 @@ def _possible_experiments(
     Args:
         found: predictions for each alternative, the best fit first.
     """
-    runs = [e for e in experiments if isinstance(e, menu.ProposedRuns)]
-    ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
     possible_experiments: list[menu.Experiment] = []
-    possible_predictions: list[np.ndarray] = []
+    masks: list[np.ndarray] = []
+    end = 0
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.ProposedRuns):
-            span = slice(ends[e.name] - len(e.voltage), ends[e.name])
-            grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
+            span = slice(end, end := end + len(e.voltage))
+            steepest = math.inf if e.used is None else e.used.steepest
+            grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > steepest, menu.GRIP, np.inf)
             possible_runs = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
             if possible_runs.any():
-                hot, fast = np.asarray(found.temperature)[0, span], np.asarray(found.speed)[0, span]
-                e = menu.restrict_run(e, possible_runs, hot, fast, within)
+                hot, fast = (np.asarray(x)[0, span] for x in (found.temperature, found.speed))
+                e = menu.restrict_run(e, possible_runs, hot, fast)
             rows = np.repeat(possible_runs, len(e.channels))
-        if set(e.kinds) & set(settings.forbidden):
-            rows = np.zeros(len(rows), bool)
+        rows &= not {*e.kinds} & {*settings.forbidden}
         if rows.any():
             possible_experiments.append(e)
-        possible_predictions.append(rows)
-    return tuple(possible_experiments), np.concatenate(possible_predictions)
+        masks.append(rows)
+    return tuple(possible_experiments), np.concatenate(masks)
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -340,22 +333,19 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
     """Experiment that separates most pairs of alternatives, with a second one if that helps enough."""
     table = rank_experiments(seen)
     if not table:
-        return Proposal((NONE,), Remark("nothing_possible"), (), 0.0, False, ())
+        return Proposal((NONE,), Remark("nothing_possible"))
     plan = table[0]
-    (first,) = plan.experiments
-    rankings = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
+    rankings = (_rank_experiment(seen, plan.name, e.name) for e in seen.experiments if e.name != plan.name)
     more = max(rankings, key=_usefulness, default=plan)
     if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
-        return Proposal(
-            (NONE,), Remark("nothing_tells", names=seen.names, sigma=seen.settings.worth), (), 0.0, False, table
-        )
+        instruction = Remark("nothing_tells", names=seen.names, sigma=seen.settings.worth)
+        return Proposal((NONE,), instruction, table=table)
     by_name = {e.name: e for e in seen.experiments}
     instruction = Remark("carry_out", experiments=tuple(by_name[name] for name in plan.experiments))
-    return Proposal(
-        plan.experiments, instruction, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
-    )
+    settles = plan.smallest >= seen.settings.apart
+    return Proposal(plan.experiments, instruction, plan.separates, min(plan.told), settles, table)
 
 
 #: Number of runs in a series that covers the variable of a curve more densely, and of repeats that are averaged.
@@ -393,19 +383,12 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
     runs = space.bare.observe.number_of_included_runs(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     if sigma < settings.worth:
-        return Proposal((NONE,), Remark("too_weak", variable=variable, sigma=sigma), (), 0.0, False, ())
+        return Proposal((NONE,), Remark("too_weak", variable=variable, sigma=sigma))
     name = f"steady speeds for {variable}" if variable in bases.ORDERS else f"finer steps in {variable}"
     name = name if bases.window_from_name(variable) is None else "the same runs again"
     curve = f"curve of the {bases.place_in_words(where.place)} over {variable}"
-    return Proposal(
-        (name,), denser_runs_instruction(where.place, variable, within, where.by_duty), (curve,), sigma, False, ()
-    )
-
-
-def propose_nothing(space: CandidateSpace) -> Proposal:
-    """Proposal without experiments, because the menu has none for this kind of data."""
-    word = "goals of a controller" if space.bare.base.rig.follows_goal else space.bare.observe.word
-    return Proposal((NONE,), Remark("no_menu", word=word), (), 0.0, False, ())
+    instruction = denser_runs_instruction(where.place, variable, within, where.by_duty)
+    return Proposal((name,), instruction, (curve,), sigma)
 
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:

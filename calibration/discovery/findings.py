@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.discovery import adequacy, candidates, classes, projection, result, search
-from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.active_set import CandidateSpace, with_only
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
@@ -24,7 +24,6 @@ from calibration.inference import bases, linearization
 from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import amplitude_unit
-from mmrjax.effects import Effect
 from mmrjax.model import params
 from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
@@ -47,26 +46,26 @@ def found_effects(
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
     others = [base] if len(best.effects) == 1 else search.refit_without_each(space, best, settings, found.ladder)
-    gains = [2 * (c.cost - best.cost) for c in others]
     null, excess = np.asarray(test.null.single), candidates.excess_misfit(space, base)
     effects = []
-    for slot, members in enumerate(found.members):
-        effect = space.library[members[0]]
+    classes_of_effects = zip(found.members, found.stated, found.families, others, strict=True)
+    for slot, (members, stated, families, without) in enumerate(classes_of_effects):
+        effect, gain = space.library[members[0]], float(2 * (without.cost - best.cost))
         equation, _, source = (inspect.getdoc(type(effect)) or "").partition("Source:")
         effects.append(
             result.FoundEffect(
                 name=effect.name,
-                members={name: _class_member(space, best, found, slot, name) for name in members},
-                stated={s.name: _stated_value(space, best, s) for s in found.stated[slot]},
-                families=found.families[slot],
+                members={name: _class_member(space, best, found, members[0], name) for name in members},
+                stated={s.name: _stated_value(space, best, s) for s in stated},
+                families=families,
                 balance=effect.balance,
                 unit=BALANCES[effect.balance][0],
                 equation=" ".join(equation.split()),
                 source=" ".join(source.split()),
                 parameters=_effect_parameters(space, best, slot, settings),
-                p_value=search.single_p_value(gains[slot], null),
-                score=float(gains[slot]),
-                share=candidates.share_of_excess(excess, float(gains[slot])),
+                p_value=search.single_p_value(gain, null),
+                score=gain,
+                share=candidates.share_of_excess(excess, gain),
             )
         )
     return tuple(effects)
@@ -75,22 +74,17 @@ def found_effects(
 def _effect_parameters(
     space: CandidateSpace, best: Candidate, slot: int, settings: Settings
 ) -> dict[str, result.ParameterEstimate]:
-    effect, p = space.library[best.active[slot]], space.free
+    effect, k = space.library[best.active[slot]], space.free + slot
     amplitude, unit = linearization.amplitude_of(effect), amplitude_unit(effect)
-    sd = settings.width * best.sd[p + slot] * unit
+    fitted = float(best.amplitude[slot] * unit), float(settings.width * best.sd[k] * unit)
     held_names = held_by_prior(best.sd)
-    values = {
-        amplitude.name: result.ParameterEstimate(
-            float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
-        )
-    }
+    values = {amplitude.name: result.ParameterEstimate(*fitted, amplitude.spec.unit, bool(held_names[k]))}
     shape = linearization.free_shape_parameter(effect)
     if shape is not None:
-        k, scales = p + settings.slots + slot, linearization.shape_scales(shape)
-        value, slope = _shaped(scales, best.z[k])
-        values[shape.name] = result.ParameterEstimate(
-            float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held_names[k])
-        )
+        k += settings.slots
+        value, slope = _shaped(linearization.shape_scales(shape), best.z[k])
+        fitted = float(value), float(slope) * float(best.sd[k])
+        values[shape.name] = result.ParameterEstimate(*fitted, shape.spec.unit, bool(held_names[k]))
     return values
 
 
@@ -98,11 +92,11 @@ _shaped = jax.jit(jax.value_and_grad(linearization.shape_parameter_at, argnums=1
 
 
 def _class_member(
-    space: CandidateSpace, best: Candidate, found: classes.Classes, slot: int, name: str
+    space: CandidateSpace, best: Candidate, found: classes.Classes, leader: str, name: str
 ) -> result.ClassMember:
     """Result entry of an alternative effect of a class."""
-    active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
-    other = next(c for c in (best, *found.ladder) if c.key == active_names)
+    key = frozenset(best.with_effect(leader, name)) - {""}
+    other = next(c for c in (best, *found.ladder) if c.key == key)
     position = other.active.index(name)
     amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
     return result.ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
@@ -119,29 +113,24 @@ def unnamed_discrepancy(
     beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int
 ) -> result.UnnamedDiscrepancy:
     """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
-    curve, linear, lacks = beside.curve, beside.diagnosis.linear, None
+    curve, linear, lacks = beside.curve, beside.diagnosis.linear, {}
     happens = bases.window_from_name(where.variable)
     x, way = linear.curve_variable(curve.balance, where.variable if happens is None else happens.axis)
-    if curve.defect is not None:
-        lacks = projection.balance_error_by_row(linear, curve.balance)
-        turn = 2 * np.pi if where.variable in bases.ORDERS else None
-        lacks = projection.BalanceError(
-            np.interp(x, curve.grid, curve.curve, period=turn) + way * lacks.value, lacks.sd
-        )
+    if beside.space.bare.observe.rows_tell:
+        remains, sd = projection.balance_error_by_row(linear, curve.balance)
+        defect = np.interp(x, curve.grid, curve.curve) + way * remains
+        lacks = {"over": x[:rows], "defect": defect[:rows], "defect_sd": sd[:rows]}
     return result.UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=curve.unit,
         effect=curve.effect,
         p_value=p_value,
         score=float(curve.chi2[0] - curve.chi2[1]),
-        score_free_in_each_run=where.explained if where.variable in bases.ORDERS else None,
         at=curve.grid,
         value=curve.curve,
         sd=curve.sd,
-        over=None if lacks is None else x[:rows],
-        defect=None if lacks is None else lacks.value[:rows],
-        defect_sd=None if lacks is None else lacks.sd[:rows],
         proposal=curve.proposal,
+        **lacks,
     )
 
 
@@ -172,7 +161,7 @@ def listed_alternatives(
         cost: objective of the proposal [½σ²].
         best: the proposal, if it is a candidate.
     """
-    near: tuple[list[RejectedCandidate], list[RejectedCandidate]] = ([], [])
+    near: dict[bool, list[RejectedCandidate]] = {True: [], False: []}
     simpler = {best.key: cost} if best.key else {}
     for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
@@ -181,34 +170,34 @@ def listed_alternatives(
         if any(key < c.key and 2 * (x - c.cost) < settings.alternative for key, x in simpler.items()):
             continue
         simpler[c.key] = c.cost
-        near[0 if c.plausible else 1].append(_alternative(space, c, rise, settings))
-    plausible, ruled_out = (tuple(sorted(x, key=lambda a: a.rise_chi2)) for x in near)
+        near[c.plausible].append(_alternative(space, c, rise, settings))
+    plausible, ruled_out = (tuple(sorted(near[x], key=lambda a: a.rise_chi2)) for x in (True, False))
     return plausible, ruled_out
 
 
 def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> RejectedCandidate:
-    sds, sizes, why = {}, {}, list[RuledOut]()
+    amplitudes, sds, sizes, why = {}, {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
             continue
+        effect = space.library[name]
         sds[name], sizes[name] = float(amplitude), float(size)
+        amplitudes[name] = float(amplitude) * amplitude_unit(effect)
         sd = settings.width * float(c.sd[space.free + slot])
         if name in c.supplying:
             why.append(RuledOut(name, "power"))
         elif size >= 1:
-            check = space.library[name].rests_on or (linearization.amplitude_of(space.library[name]).spec.meaning,)
+            check = effect.rests_on or (linearization.amplitude_of(effect).spec.meaning,)
             why.append(RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
-    amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
     return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
     """Fitted robot with the effects of the proposal and no others of the library."""
     robot = space.problem(best.active).robot(jnp.asarray(best.z))
-    keep = set(best.effects) | {e.name for e in space.bare.base.effects}
-    return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in keep))
+    return with_only(robot, {*best.effects, *(e.name for e in space.bare.base.effects)})
 
 
 # --- the base and the library ---------------------------------------------------------------------------
@@ -263,15 +252,24 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     """
     score_list = []
     for effect in space.library.effects:
-        amplitude, explained = _plausible_amplitude_and_score(space, effect, scores, settings)
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
+        wanted, left, unit = float(scores.amplitude[m]), float(scores.left[m]), amplitude_unit(effect)
+        spec = linearization.amplitude_of(effect).spec
+        low = max(-settings.plausible, spec.bounds[0] / unit)
+        amplitude = min(max(wanted, low), settings.plausible)
+        explained = float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
         score_list.append(
             result.EffectScore(
                 name=effect.name,
                 balance=effect.balance,
                 score=max(explained, 0.0),
-                amplitude=amplitude * amplitude_unit(effect),
-                sigmas_per_prior_sd=float(scores.left[m]),
+                amplitude=amplitude * unit,
+                sigmas_per_prior_sd=left,
+                sd=unit / max(left, 1e-300),
+                family=effect.family(),
+                unit=spec.unit,
+                # as in `candidates.supplying_effects`
+                supplies=space.bare.observe.long and effect.dissipative and amplitude < 0,
             )
         )
     return tuple(sorted(score_list, key=lambda s: (-round(s.score, 9), s.name)))
@@ -296,41 +294,20 @@ def rank_effects_by_weak_form(
     return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 
 
-def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.RankedEffect, ...]:
+def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[result.EffectScore, ...]:
     """Effects sorted by score. Effects that would supply power come last."""
-    ranking = []
-    for s in effect_scores(space, scores, settings):
-        effect = space.library[s.name]
-        sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
-        unit = linearization.amplitude_of(effect).spec.unit
-        # as in `candidates.supplying_effects`
-        supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
-        ranking.append(result.RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
-    return tuple(sorted(ranking, key=lambda e: e.supplies))
+    return tuple(sorted(effect_scores(space, scores, settings), key=lambda e: e.supplies))
 
 
-def _plausible_amplitude_and_score(
-    space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
-) -> tuple[float, float]:
-    """Best amplitude within plausible limits [prior sds], and the decrease of χ² that it explains [σ²]."""
-    m = space.library.best_instance(effect.name, np.asarray(scores.single))
-    amplitude_wanted, score = float(scores.amplitude[m]), float(scores.left[m])
-    low = max(-settings.plausible, linearization.amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
-    amplitude = min(max(amplitude_wanted, low), settings.plausible)
-    return amplitude, float(scores.single[m] ** 2 - ((amplitude_wanted - amplitude) * score) ** 2)
-
-
-def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
+def invisible_effects(
+    space: CandidateSpace, scores: ScoreTable, by_effect: Sequence[result.EffectScore], settings: Settings
+) -> Names:
     """Effects that the data cannot reveal, because even their largest plausible amplitude hardly changes the
     readings.
+
+    Args:
+        by_effect: result of `effect_scores`.
     """
-    largest_scores = space.library.largest(np.asarray(scores.left))
-    return tuple(
-        e.name
-        for e, x in zip(space.library.effects, largest_scores, strict=True)
-        if settings.plausible * x < settings.visible
-        and _plausible_amplitude_and_score(space, e, scores, settings)[1] < settings.visible**2
-    )
-
-
-# --- readings and errors --------------------------------------------------------------------------------
+    weak = {s.name for s in by_effect if s.score < settings.visible**2}
+    largest = zip(space.library.names, space.library.largest(np.asarray(scores.left)), strict=True)
+    return tuple(name for name, x in largest if settings.plausible * x < settings.visible and name in weak)

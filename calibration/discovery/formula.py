@@ -11,7 +11,7 @@ from calibration.data import Names
 from calibration.described import describe
 from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import SmoothCurve
-from calibration.inference.bases import ORDERS, place_signature
+from calibration.inference.bases import place_signature
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import EVERY_VARIABLE, PLACES, READINGS
 from mmrjax.model import channels
@@ -146,14 +146,14 @@ class Proposal:
     """
 
     JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve=gain", "tried")
-    expression: str
-    terms: tuple[Monomial, ...]
-    coefficients: tuple[float, ...]
-    sds: tuple[float, ...]
-    variables: Names
-    explained: float
-    gain: float
-    tried: int
+    expression: str = ""
+    terms: tuple[Monomial, ...] = ()
+    coefficients: tuple[float, ...] = ()
+    sds: tuple[float, ...] = ()
+    variables: Names = ()
+    explained: float = 0.0
+    gain: float = 0.0
+    tried: int = 0
     mark: str = MARK
 
     @property
@@ -176,13 +176,11 @@ def propose_formula(
         curve: smooth curve that the formula is compared with.
         voltage: True for a rig with an imposed or measured voltage.
     """
-    if curve.wave:
-        return _wave_formula(balance, curve)
     if curve.happening:
         level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
         formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
         axis = curve.variable.split()[0]
-        return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
+        return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, tried=1)
     if curve.variable in FADING:
         return _decay_formula(linear, balance, counts, curve)
     counts = linear.at_points(counts)
@@ -192,23 +190,23 @@ def propose_formula(
     dictionary = monomial_dictionary(ratios[counts], scaled)
     terms = list(dictionary)
     if not terms:  # all runs have the same conditions
-        return Proposal("", (), (), (), (), 0.0, 0.0, 0)
+        return Proposal()
     shapes = np.zeros((linear.points, len(terms)))
     _, way = linear.curve_variable(balance, curve.variable)
-    for k, value in enumerate(dictionary.values()):
-        shapes[counts, k] = way[counts] * value
-    a, b = Projection(linear)(place_signature(linear, balance, shapes))
-    scale = np.sqrt(np.maximum(np.diag(a), 0))
-    visible = scale > 1e-3 * np.linalg.norm(place_signature(linear, balance, shapes), axis=0)
+    shapes[counts] = way[counts, None] * np.stack(list(dictionary.values()), 1)
+    columns = place_signature(linear, balance, shapes)
+    norm2, products = Projection.of(linear).norms(columns)
+    scale = np.sqrt(np.maximum(norm2, 0))
+    visible = scale > 1e-3 * np.linalg.norm(columns, axis=0)
     scale = np.where(visible, scale, 1.0)
-    b = np.where(visible, b / scale, 0.0)
+    b = np.where(visible, -products / scale, 0.0)
     cost = np.log(3 * counts.sum())
     explained = b**2
     located = {SAME_AS.get(curve.variable, curve.variable)}
-    foreign = np.array([len(frozenset(term.variables) - located) for term in terms])
+    foreign = np.array([len({*term.variables} - located) for term in terms])
     dear = np.where(visible & (explained >= MOST * curve.explained), FOREIGN * foreign - explained, np.inf)
     if not np.isfinite(dear).any():
-        return Proposal("", (), (), (), (), 0.0, 0.0, len(terms))
+        return Proposal(tried=len(terms))
     near = np.flatnonzero(dear < dear.min() + NO_EVIDENCE)
     k = min(near.tolist(), key=lambda j: (terms[j].complexity, dear[j]))
     size, sd = float(b[k] / scale[k]), float(1 / scale[k])
@@ -224,17 +222,6 @@ def propose_formula(
     )
 
 
-def _wave_formula(balance: str, curve: SmoothCurve) -> Proposal:
-    """Formula of a wave over the angle of a shaft."""
-    sine, cosine = curve.scale * curve.root @ curve.start
-    size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
-    order, unit = ORDERS[curve.variable][0], PLACES[balance][0]
-    formula = (
-        f"{SYMBOL[balance]} = {size:.2g} {unit} sin({order:.3g} θ_k {'-' if phase < 0 else '+'} {abs(phase):.2g})"
-    )
-    return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
-
-
 def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve) -> Proposal:
     """Formula of an exponential decay with time, or from run to run, without an offset.
 
@@ -244,17 +231,14 @@ def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curv
     (t, way), counts = linear.curve_variable(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
-    best: tuple[float, tuple] = (np.inf, ())
-    project, cost = Projection(linear), np.log(3 * counts.sum())
-    for tau in constants:
-        a, b = project(place_signature(linear, balance, (way * np.exp(-t / tau) * counts)[:, None]))
-        if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
-            best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
-    if not best[1]:
-        return Proposal("", (), (), (), (), 0.0, 0.0, len(constants))
-    tau, value, sd = best[1]
-    formula = f"{SYMBOL[balance]} = {value:.2g} {PLACES[balance][0]} exp(-{symbol} / {tau:.2g}{unit})"
-    gain = float(curve.freedom * cost - curve.explained - best[0])
-    return Proposal(
-        formula, (), (float(value),), (float(sd),), (curve.variable,), float(2 * cost - best[0]), gain, len(constants)
-    )
+    shapes = way[:, None] * np.exp(-t[:, None] / constants) * counts[:, None]
+    norm2, products = Projection.of(linear).norms(place_signature(linear, balance, shapes))
+    explained = np.where(norm2 > 0, products**2 / np.where(norm2 > 0, norm2, 1.0), -np.inf)
+    k = int(np.argmax(explained))
+    if not np.isfinite(explained[k]):
+        return Proposal(tried=len(constants))
+    value, sd = float(-products[k] / norm2[k]), float(norm2[k] ** -0.5)
+    expression = f"{SYMBOL[balance]} = {value:.2g} {PLACES[balance][0]} exp(-{symbol} / {constants[k]:.2g}{unit})"
+    gain = float((curve.freedom - 2) * np.log(3 * counts.sum()) - curve.explained + explained[k])
+    variables = (curve.variable,)
+    return Proposal(expression, (), (value,), (sd,), variables, float(explained[k]), gain, len(constants))

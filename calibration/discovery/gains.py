@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from calibration.discovery.standing import kept_readings
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import place_signature
-from calibration.inference.blocks import predict_unseen
 
 #: A reading counts if the mechanism changes it by at least this share of the largest rms change of a channel [-].
 CHANGED = 0.5
@@ -49,18 +48,13 @@ def best_hold_out_gain(
     alone = [best, *([min(sound, key=lambda c: c.cost)] if sound else [])]
     fits = {(c.key, base.key): (c, base) for c in alone}
     fits.setdefault((pair[0].key, pair[1].key), pair)
-    gains = [(having, _hold_out_gain(space, runs, having, without, predicted)) for having, without in fits.values()]
+    gains = []
+    for having, without in fits.values():
+        score, before = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
+        changed = _changed_readings(space, runs, *(simulated_reading(space, c) for c in (without, having)))
+        gains.append((having, _gain_over_changed(score, before, changed)))
     having, gain = max(gains, key=lambda one: one[1].mean / max(one[1].se, 1e-12))
     return tuple(n for n in having.effects if space.library[n].family() == family), gain
-
-
-def _hold_out_gain(
-    space: CandidateSpace, runs: Runs, having: Candidate, without: Candidate, predicted: Predicted
-) -> Gain:
-    """Hold-out gain of one fit over another, over the readings that differ."""
-    scores, before = (cached_hold_out_score(space, runs, c, predicted) for c in (having, without))
-    changed = _changed_readings(space, runs, simulated_reading(space, without), simulated_reading(space, having))
-    return _gain_over_changed(scores, before, changed)
 
 
 def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
@@ -90,10 +84,7 @@ def hold_out_gain_of_curve(beside: BaseCurve, runs: Runs, predicted: Predicted) 
     """
     space, base, curve = beside.space, beside.base, beside.curve
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    predictions = {
-        kind: predict_unseen(curve.problem, curve.z, list(blocks_by_name.values())).reading
-        for kind, blocks_by_name in kinds.items()
-    }
+    predictions = prediction.FittedProblem(curve.problem, curve.z, None).held_out(kinds)
     changed = _changed_readings(space, runs, simulated_reading(space, base), curve.reading)
     score = _where_seen(beside, prediction.score_predictions(space, runs, predictions), kinds)
     return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
@@ -119,35 +110,33 @@ def linear_gain_of_curve(beside: BaseCurve, runs: Runs, _: Predicted) -> Gain:
     if location.variable in bases_room.ORDERS:
         kinds = {blocks_room.PART: blocks_room.parts_of_runs(runs)}
 
-    def base_fit(_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.asarray(linear.jacobian), np.asarray(linear.residual)
+    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
 
-    def curve_fit(included: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def curve_columns(included: np.ndarray) -> np.ndarray:
         if location.variable not in bases_room.VARIABLES:
-            return augment_with_columns(linear, location_columns(linear, beside.bases, location))
+            return location_columns(linear, beside.bases, location)
         curve = fit_smooth_curve(linear, location.place, location.variable, included)
         x, way = linear.curve_variable(location.place, location.variable)
-        columns = place_signature(linear, location.place, way[:, None] * curve.basis(x))
-        return augment_with_columns(linear, curve.scale * columns @ curve.root)
+        return curve.scale * place_signature(linear, location.place, way[:, None] * curve.basis(x)) @ curve.root
 
-    def residuals(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], out: np.ndarray) -> np.ndarray:
+    def residuals(out: np.ndarray, with_curve: bool) -> np.ndarray:
         included = space.included & ~np.append(out, np.zeros(len(space.included) - rows, bool))
-        jacobian, residual = fit(included)
-        kept = np.append(kept_readings(space, out, linear.readings), np.ones(len(residual) - linear.readings, bool))
-        z = np.linalg.lstsq(jacobian[kept], -residual[kept], rcond=None)[0]
-        return (residual + jacobian @ z)[: linear.readings].reshape(len(space.included), -1)[:rows]
+        a, e = augment_with_columns(linear, curve_columns(included)) if with_curve else (jacobian, residual)
+        kept = np.append(kept_readings(space, out, linear.readings), np.ones(len(e) - linear.readings, bool))
+        z = np.linalg.lstsq(a[kept], -e[kept], rcond=None)[0]
+        return (e + a @ z)[: linear.readings].reshape(len(space.included), -1)[:rows]
 
-    def score(fit: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> HeldOutScore:
+    def score(with_curve: bool) -> HeldOutScore:
         nothing = np.zeros((rows, linear.readings // len(space.included)))
         errors = {
-            kind: sum((np.where(out[:, None], residuals(fit, out), 0.0) for out in by_name.values()), nothing)
-            for kind, by_name in kinds.items()
+            kind: sum((np.where(out[:, None], residuals(out, with_curve), 0.0) for out in masks.values()), nothing)
+            for kind, masks in kinds.items()
         }
         return prediction.score_readings(errors, nothing, nothing + 1.0, space.weight[:rows] > 0, kinds)
 
     sd, none = np.asarray(space.bare.data.sd)[:rows], np.zeros(rows, bool)
-    changed = _changed_readings(space, runs, sd * residuals(base_fit, none), sd * residuals(curve_fit, none))
-    return _gain_over_changed(_where_seen(beside, score(curve_fit), kinds), score(base_fit), changed)
+    changed = _changed_readings(space, runs, sd * residuals(none, False), sd * residuals(none, True))
+    return _gain_over_changed(_where_seen(beside, score(True), kinds), score(False), changed)
 
 
 def _within_seen_range(beside: BaseCurve, masks: Sequence[np.ndarray]) -> np.ndarray:

@@ -95,8 +95,7 @@ def _add_experiment(
     space: CandidateSpace, best: Candidate, what: HiddenEffect, after: Diagnosis, settings: Settings
 ) -> HiddenEffect:
     """Adds the experiment that best separates the fit with the largest hidden amplitude from the fit without it."""
-    slot = best.active.index("")
-    active = tuple(what.name if s == slot else n for s, n in enumerate(best.active))
+    slot, active = best.active.index(""), best.with_effect("", what.name)
     (joint,) = fit_candidates(space, [(active, start_of_fit(space, best, active, settings, after.scores))], settings)
     if not np.isfinite(joint.cost):
         return what

@@ -169,7 +169,7 @@ def smallest_confirmed(
     for sets in filter(None, sizes):
         fits = [refine_by_simulation(space, c, [c.z], settings) for c in sets]
         k = min(range(len(fits)), key=lambda k: fits[k].cost)
-        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left.test.null, settings, left.linear)
+        diagnosis = diagnose_candidate(space, fits[k], screened.bases, left, left.linear)
         searched = dataclasses.replace(searched, best=sets[k], diagnosis=diagnosis, room=space.room)
         if not diagnosis.test.rejected_with_margin:
             break
@@ -200,7 +200,7 @@ def best_simulated_size(
     best = sets[int(np.argmin(costs))]
     if best is searched.best:
         return searched
-    diagnosis = diagnose_candidate(screened.base.space, best, screened.bases, left.test.null, settings)
+    diagnosis = diagnose_candidate(screened.base.space, best, screened.bases, left)
     return dataclasses.replace(searched, best=best, diagnosis=diagnosis)
 
 
@@ -237,7 +237,7 @@ def _lower_if_contradicted(table: LoopInput, traced: LoopStages) -> LoopStages:
         return traced
     if traced.verdict == "mechanism" and traced.mechanism is not None:  # a curve is not simulated
         return dataclasses.replace(traced, verdict="place") if traced.mechanism.effects else traced
-    mechanism = find_mechanism(beside, table.runs, searched.ladder, traced.predicted, table.settings)
+    mechanism = find_mechanism(beside, table.runs, searched.ladder, traced.predicted)
     level = "place" if mechanism is None or mechanism.fails else "mechanism"
     return dataclasses.replace(traced, verdict=level, mechanism=mechanism, where=beside.where)
 

@@ -164,26 +164,18 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[fit_notes.Remark]]
     whole table consists of the same sequence of rows, repeated.
     """
     cells = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
-    seen_rows: set[Names] = set()
-    keep: list[int] = []
-    copies: list[int] = []
+    rows = list(zip(*(column.astype(str).tolist() for column in cells), strict=True))
     if runs.sampled or {"run_id", *columns.WHEN} & set(runs.headings):
-        for k in range(len(runs)):
-            row = tuple(str(column[k]) for column in cells)
-            (copies if row in seen_rows else keep).append(k)
-            seen_rows.add(row)
+        first = {row: k for k, row in reversed(list(enumerate(rows)))}
+        keep = sorted(first.values())
     else:
-        rows = list(zip(*(column.astype(str).tolist() for column in cells), strict=True))
         # rows after which the table repeats itself exactly, or all of its rows
-        first_rows = next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
-        keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
-    if not copies:
+        keep = list(range(next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])))
+    copies = np.setdiff1d(np.arange(len(runs)), keep)
+    if not copies.size:
         return runs, np.arange(1, len(runs) + 1), []
-    return (
-        runs.where(np.asarray(keep)),
-        np.asarray(keep) + 1,
-        [fit_notes.Remark("copies", rows=tuple(k + 1 for k in copies))],
-    )
+    remark = fit_notes.Remark("copies", rows=tuple((copies + 1).tolist()))
+    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [remark]
 
 
 def build_candidate_space(

@@ -87,11 +87,6 @@ class NameTest:
     root_changed: float = 0.0
 
     @property
-    def stands(self) -> bool:
-        """True if the effect is significant and explains at least as much as any curve in its place."""
-        return self.root >= self.needed and self.evidence >= -BETTER
-
-    @property
     def rests_on(self) -> int | None:
         """Number of the row without which the test would fail, or of the run in which a different constant explains
         as much. None if there is none.
@@ -162,11 +157,6 @@ class NameSupport:
         """True if the name of an effect is established, by its own test if there is one."""
         test = self.test_of(effect)
         return self.stands and (not self.tests if test is None else test.established)
-
-    def rests_on(self, effect: str) -> int | None:
-        """Number of the run that decides about an effect. None if there is no such run, or no test."""
-        test = self.test_of(effect)
-        return None if test is None else test.rests_on
 
     def with_leaders(self, names: Mapping[str, str]) -> NameSupport:
         """Copy in which classes have other leading effects. A test applies to the whole class."""

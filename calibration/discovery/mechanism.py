@@ -21,8 +21,8 @@ from calibration.discovery.classes import ammeter_families, errors_of_ammeters
 from calibration.discovery.discrepancy import BaseCurve, location_columns
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, BETTER, HALF, Mechanism
-from calibration.discovery.prediction import Predicted
-from calibration.discovery.projection import explained_function
+from calibration.discovery.prediction import Predicted, masks_of_blocks
+from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import changed_run, evidence_over_curves, kept_readings, recurrence_of_families
@@ -36,7 +36,7 @@ OF_CURVE = 5.0
 
 
 def find_mechanism(
-    beside: BaseCurve, runs: Runs, ladder: Sequence[Candidate], predicted: Predicted, settings: Settings
+    beside: BaseCurve, runs: Runs, ladder: Sequence[Candidate], predicted: Predicted
 ) -> Mechanism | None:
     """Mechanism that explains most of the discrepancy of the base fit. If it fails, the next one that does not.
 
@@ -49,58 +49,50 @@ def find_mechanism(
         ladder: candidates that were fitted.
         predicted: hold-out predictions of fits that are already known.
     """
-    space, base, diagnosis = beside.space, beside.base, beside.left
+    space, base, linear = beside.space, beside.base, beside.left.linear
+    settings, over_time = beside.settings, beside.space.bare.observe.over_time
     best = _best_by_family(space, ladder)
     pairs = _explained_by_family(space, base, ladder, best)
-    explained, alike, less = _rank_families(beside, pairs, settings)
-    location_families, most = _families_of_location(beside.where), max(explained.values())
+    explained, alike, less = _rank_families(beside, pairs)
+    located, *_ = location_families = _families_of_location(beside.where)
+    most, excess = max(explained.values()), excess_misfit(space, base)
     by_name = [(f, True) for f in (*alike, *less) if f in best and _explained(pairs[f]) >= HALF * most]
-    curved = location_families[0] in alike and space.bare.observe.reads
-    over_time, excess = space.bare.observe.over_time, excess_misfit(space, base)
-    fit = np.asarray(diagnosis.linear.jacobian), np.asarray(diagnosis.linear.residual)
-    run, changed, root = changed_run(space, diagnosis.linear, beside.bases, *fit) if over_time else (None, "", 0.0)
-    kinds = blocks_room.predictable_blocks(runs, space.bare).values()
-    blocks = [mask for blocks_by_name in kinds for mask in blocks_by_name.values()]
+    curved = [(located, False)] * (located in alike and space.bare.observe.reads)
+    run, changed, root = None, "", 0.0
+    if over_time:
+        run, changed, root = changed_run(space, linear, beside.bases, Projection.of(linear))
+    blocks = masks_of_blocks(blocks_room.predictable_blocks(runs, space.bare))
     curves = functools.cache(functools.partial(_curves_without_blocks, beside, blocks))
     mechanisms: list[Mechanism] = []
-    for leader, with_effects in (*by_name[:1], *([(location_families[0], False)] if curved else []), *by_name[1:]):
+    for leader, with_effects in (*by_name[:1], *curved, *by_name[1:]):
         effects: Names = ()
-        families = (leader, *alike) if with_effects else (leader, *alike, *less)
-        if with_effects:
-            names = best[leader].effects
-            if (
-                evidence_over_curves(space, best[leader], base, names, diagnosis.linear, beside.bases, settings)
-                < -BETTER
-            ):
-                # A driver whose form a curve refutes is no better than those that curves cannot separate.
-                families = (*families, *location_families)
+        families = (leader, *alike, *(() if with_effects else less))
+        if with_effects and evidence_over_curves(beside, best[leader], base, best[leader].effects, linear) < -BETTER:
+            # A driver whose form a curve refutes is no better than those that curves cannot separate.
+            families = (*families, *location_families)
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
         if with_effects:
             effects, gain = gains.best_hold_out_gain(
                 space, runs, ladder, best[leader], base, pairs[leader], predicted
             )
-            again = recurrence_of_families(
-                space, base, best[leader], diagnosis, families, beside.bases, blocks, settings
-            )
+            again = recurrence_of_families(beside, best[leader], families, blocks)
             if again < AGAIN:  # several effects together may be found again only by their sum
                 again = max(again, _curve_recurrence(*curves(), families, settings))
         else:
             hold_out = gains.linear_gain_of_curve if over_time else gains.hold_out_gain_of_curve
             gain, again = hold_out(beside, runs, predicted), _curve_recurrence(*curves(), families, settings)
+        by_leader = explained.get(leader, 0.0)
         mechanism = Mechanism(
-            families, effects, share_of_excess(excess, explained.get(leader, 0.0)), gain.mean, gain.se, again,
-            gain.errors, errors_of_ammeters(space, families),
-            run if root**2 >= explained.get(leader, 0.0) else None, changed,
+            families, effects, share_of_excess(excess, by_leader), gain.mean, gain.se, again, gain.errors,
+            errors_of_ammeters(space, families), run if root**2 >= by_leader else None, changed,
         )  # fmt: skip
         mechanisms.append(mechanism)
         if not mechanism.fails:
-            return _with_ammeter_families(beside, mechanism, settings)
-    return _with_ammeter_families(beside, mechanisms[0], settings) if mechanisms else None
+            return _with_ammeter_families(beside, mechanism)
+    return _with_ammeter_families(beside, mechanisms[0]) if mechanisms else None
 
 
-def _rank_families(
-    beside: BaseCurve, pairs: dict[str, Fits], settings: Settings
-) -> tuple[dict[str, float], Names, Names]:
+def _rank_families(beside: BaseCurve, pairs: dict[str, Fits]) -> tuple[dict[str, float], Names, Names]:
     """Decrease of χ² by the effects of each family and by the curve [σ²], and the families that explain most.
 
     If the curve explains most, also other families of its location.
@@ -113,23 +105,21 @@ def _rank_families(
     explained = {family: _explained(pair) for family, pair in pairs.items()}
     explained[families[0]] = max(by_curve, explained.get(families[0], 0.0))
     most = max(explained.values())
-    alike = [f for f in explained if explained[f] >= most - settings.tolerance(most)]
+    alike = [f for f in explained if explained[f] >= most - beside.settings.tolerance(most)]
     alike.sort(key=lambda f: -explained[f])
     less = [f for f in families if f not in alike and explained[alike[0]] == by_curve]
     return explained, tuple(alike), tuple(less)
 
 
-def _with_ammeter_families(beside: BaseCurve, mechanism: Mechanism, settings: Settings) -> Mechanism:
+def _with_ammeter_families(beside: BaseCurve, mechanism: Mechanism) -> Mechanism:
     """The mechanism with ammeter errors that explain the data as well, see `ammeter_families`."""
     space, linear = beside.space, beside.left.linear
     if mechanism.effects:
-        columns = np.asarray(linear.signatures)[
-            :, [space.library.names[k] in mechanism.effects for k in space.library.of]
-        ]
+        shown = [space.library.names[k] in mechanism.effects for k in space.library.of]
+        columns = np.asarray(linear.signatures)[:, shown]
     else:
         columns = location_columns(linear, beside.bases, beside.where)
-    fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    also = ammeter_families(space, *fit, columns, mechanism.families[0], settings)
+    also = ammeter_families(space, Projection.of(linear), columns, mechanism.families[0], beside.settings)
     families = tuple(dict.fromkeys((*mechanism.families, *also)))
     return dataclasses.replace(mechanism, families=families, ammeter=errors_of_ammeters(space, families))
 
@@ -198,14 +188,12 @@ def _curves_without_blocks(beside: BaseCurve, blocks: Sequence[np.ndarray]) -> t
     families = tuple(
         dataclasses.replace(beside.where, place=p, variable=v).family for p, v in (names[k] for k in smooth)
     )
-    columns = [family_columns(linear, beside.bases, k) for k in smooth]
-    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    columns, fit = [family_columns(linear, beside.bases, k) for k in smooth], Projection.of(linear)
     explained = []
     for out in (np.zeros(len(space.included), bool), *blocks):
         kept = kept_readings(space, out, linear.readings)
-        kept_residuals = np.append(kept, np.ones(len(residual) - len(kept), bool))
-        explains = explained_function(jacobian[kept_residuals], residual[kept_residuals])
-        explained.append([explains(c[kept]) for c in columns])
+        without_block = fit.only(kept)
+        explained.append([without_block.explained(c[kept]) for c in columns])
     return families, np.array(explained)
 
 

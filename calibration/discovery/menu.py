@@ -7,6 +7,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -107,9 +108,6 @@ WARM, FAST = 25.0, 0.85
 # --- experiments ------------------------------------------------------------------------------------
 
 
-# --- what is done -----------------------------------------------------------------------------------
-
-
 @dataclasses.dataclass(frozen=True)
 class CalibrationAct:
     """A reading that calibrates an instrument or a mass without a run of the robot.
@@ -141,20 +139,17 @@ class ProposedRuns:
         name: name of the runs.
         kinds: kinds from `KINDS`, and the configuration where there is one.
         doing: row of `experiment_words.DOING` that describes them.
-        where: name of the configuration, "" for none.
-        motors: number of motors of the robot.
         setup: setup of the robot. voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
-        configuration: index of the configuration.
+        reach: reach of the table. Levels of the imposed quantity are in `voltage`: [V], [rad/s] for `motor_speed`,
+            [A] for `motor_current`.
+        used: conditions of the table with the configuration of the runs. None: any configuration.
         sides: number of motors that are on. None: all.
         brake: brake torque on each motor shaft [N·m].
-        beyond: largest slope of the table [deg].
         steepest: True if only the steepest slope that the robot can climb is informative.
-        repeats: number of readings that are averaged.
-        watch: remarks on risks of damage.
-        imposed: quantity imposed on the motors, see `Rig`. Its levels are in `voltage`: [V], [rad/s] for
-            `motor_speed`, [A] for `motor_current`.
         torque: torque of a brake on the output, positive against forward rotation [N·m]. Empty without a brake.
+        watch: remarks on risks of damage.
+        repeats: number of readings that are averaged.
     """
 
     name: str
@@ -165,21 +160,19 @@ class ProposedRuns:
     slope: tuple[float, ...]
     payload: tuple[float, ...]
     channels: Names
-    configuration: int = 0
+    reach: Reach
+    used: UsedConditions | None = None
     sides: int | None = None
     brake: float = 0.0
-    beyond: float = math.inf
     steepest: bool = False
-    repeats: int = 3
-    watch: tuple[Remark, ...] = ()
-    imposed: str = "voltage"
-    where: str = ""
-    motors: int = 1
     torque: tuple[float, ...] = ()
+    watch: tuple[Remark, ...] = ()
+    repeats: int = 3
 
-    def read(self, shown: Names) -> tuple[int, ...]:
-        """Positions of its channels among all channels."""
-        return tuple(shown.index(c) for c in self.channels)
+    @property
+    def configuration(self) -> int:
+        """Index of the configuration."""
+        return 0 if self.used is None else self.used.index
 
 
 Experiment = CalibrationAct | ProposedRuns
@@ -265,31 +258,23 @@ def calibration_acts(reach: Reach) -> tuple[CalibrationAct, ...]:
     turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     settings = tuple((float(u.index), m) for u in reach.used for m in loads)
-    weighing = CalibrationAct("weigh", ("weigh",), _mass_difference, settings, 0.02, repeats=1)
-    shunted = _Instrument("total_current", ("total_current",))
-    strobed = _Instrument("motor_speed", ("speed_motor",))
-    ammeter = [
-        CalibrationAct("zero current", ("zero current",), shunted, ((0.0,),), 0.02),
-        CalibrationAct("shunt", ("shunt",), shunted, _one_tuple_each(amperes), 0.02),
-    ]
-    strobe = CalibrationAct("strobe", ("strobe",), strobed, _one_tuple_each(turning), 5 * RPM)
-    timing = CalibrationAct("timing", ("timing",), _Instrument("speed", ("speed",)), _one_tuple_each(paces), 3e-3)
-    acts = [weighing] * reach.has_ground
-    acts += ammeter * ("total_current" in reach.measured)
-    meters = [c for c in channels.channels_named(reach.measured) if c.misses_zero]
-    acts += [
-        CalibrationAct(
-            f"zero of {c.label}", ("zero reading",), _Instrument(c.name, STILL), ((0.0,),), None, channel=c.name
-        )
-        for c in meters
-    ]
-    acts += [strobe] * ("motor_speed" in reach.measured)
-    acts += [timing] * ("speed" in reach.measured)
+
+    def read(name: str, channel: str, signal: str, values: tuple[float, ...], sd: float) -> list[CalibrationAct]:
+        act = CalibrationAct(name, (name,), _Instrument(channel, (signal,)), tuple((v,) for v in values), sd)
+        return [act] * (channel in reach.measured)
+
+    acts = [CalibrationAct("weigh", ("weigh",), _mass_difference, settings, 0.02, repeats=1)] * reach.has_ground
+    acts += read("zero current", "total_current", "total_current", (0.0,), 0.02)
+    acts += read("shunt", "total_current", "total_current", amperes, 0.02)
+    for c in channels.channels_named(reach.measured):
+        if c.misses_zero:
+            zero = _Instrument(c.name, STILL)
+            acts.append(
+                CalibrationAct(f"zero of {c.label}", ("zero reading",), zero, ((0.0,),), None, channel=c.name)
+            )
+    acts += read("strobe", "motor_speed", "speed_motor", turning, 5 * RPM)
+    acts += read("timing", "speed", "speed", paces, 3e-3)
     return tuple(acts)
-
-
-def _one_tuple_each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
-    return tuple((v,) for v in values)
 
 
 # --- runs -------------------------------------------------------------------------------------------
@@ -304,54 +289,57 @@ def _combined_runs(
     doing: str,
     setup: Setup = on_ground,
     *,
-    kinds: Names = (),
     voltages: Sequence[float],
     slopes: Sequence[float] = (0.0,),
-    payload: float = 0.0,
-    read: Names = (),
-    at: UsedConditions | None = None,
-    sides: int | None = None,
-    brake: float = 0.0,
-    steepest: bool = False,
     torques: Sequence[float] = (0.0,),
+    payload: float = 0.0,
+    kinds: Names = (),
+    read: Names = (),
+    used: UsedConditions | None = None,
+    **further: Any,
 ) -> ProposedRuns:
-    """Runs at every combination of slopes, voltages and brake torques."""
+    """Runs at every combination of slopes, voltages and brake torques. `further`: other fields of the runs."""
     combinations = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
     slope, voltage, torque = (tuple(x) for x in zip(*combinations, strict=True))
-    fixed = (at.configuration,) if at is not None else ()
+    fixed = () if used is None else (used.configuration,)
     return ProposedRuns(
-        ", ".join((name, *fixed)), (*(kinds or (name,)), *fixed), doing, setup, voltage, slope,
-        (payload,) * len(combinations),
-        tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(fixed), motors=reach.motors,
+        name=", ".join((name, *fixed)),
+        kinds=(*(kinds or (name,)), *fixed),
+        doing=doing,
+        setup=setup,
+        voltage=voltage,
+        slope=slope,
+        payload=(payload,) * len(combinations),
+        channels=tuple(c for c in (read or reach.measured) if c in reach.measured),
+        reach=reach,
+        used=used,
         torque=torque if reach.torques else (),
-    )  # fmt: skip
+        **further,
+    )
+
+
+def _in_widest_gaps(levels: Sequence[float], settings: list[float], count: int) -> tuple[float, ...]:
+    """Settings with more of them in the widest gaps of some levels, up to this count, in order."""
+    levels = sorted(set(levels))
+    while len(settings) < count:
+        low, high = max(itertools.pairwise(levels), key=lambda gap: round_significant(gap[1] - gap[0], 6))
+        levels = sorted([*levels, 0.5 * (low + high)])
+        settings = [*settings, round_significant(0.5 * (low + high))]
+    return tuple(sorted(set(settings)))
 
 
 def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
     """Four voltages that the table lacks: one below its range, one above it if the motors allow, and others in the
     widest gaps.
     """
-    voltages = [round_significant(0.55 * used[0])]
-    if reach.voltage > used[-1]:
-        voltages.append(floor_significant(reach.voltage))
-    levels = [0.55 * used[0], *used] if len(used) == 1 else list(used)
-    while len(voltages) < 4:
-        low, high = max(itertools.pairwise(levels), key=lambda gap: gap[1] - gap[0])
-        levels = sorted([*levels, 0.5 * (low + high)])
-        voltages.append(round_significant(0.5 * (low + high)))
-    return tuple(sorted(set(voltages)))
+    ends = [round_significant(0.55 * used[0]), *[floor_significant(reach.voltage)] * (reach.voltage > used[-1])]
+    return _in_widest_gaps([0.55 * used[0], *used] if len(used) == 1 else used, ends, 4)
 
 
 def other_torques(used: Sequence[float]) -> tuple[float, ...]:
     """Brake torques that the table lacks, in the widest gaps above zero, and the largest one that it used."""
-    levels = sorted({0.0, *used})
-    torques: list[float] = []
-    while len(torques) < 3 and levels[-1] > 0:
-        low, high = max(itertools.pairwise(levels), key=lambda gap: round_significant(gap[1] - gap[0], 6))
-        levels = sorted([*levels, 0.5 * (low + high)])
-        torques.append(round_significant(0.5 * (low + high)))
-    return tuple(sorted({*torques, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
+    most = max(used, default=0.0)
+    return _in_widest_gaps([0.0, *used], [floor_significant(most)], 4) if most > 0 else (0.0,)
 
 
 def _travel_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
@@ -362,7 +350,7 @@ def _travel_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]
     inclines = sorted({abs(s) for s in used.slopes if s}) or [0.0]
     some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
-    runs = functools.partial(_combined_runs, reach, at=used)
+    runs = functools.partial(_combined_runs, reach, used=used)
     experiments = [
         runs("reverse", "backwards", facing_backward, voltages=ends, slopes=(0.0, -some)),
         runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
@@ -406,15 +394,9 @@ def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
     Some slopes or voltages may still be impossible for the robot. Only its predicted readings show this, see
     `possible_runs`.
     """
-    if reach.imposed != "voltage" or not reach.has_ground:
-        runs: tuple[ProposedRuns, ...] = tuple(
-            r for used_conditions in reach.used for r in _shaft_runs(reach, used_conditions)
-        )
-    else:
-        runs = (
-            *_motor_runs(reach),
-            *(r for used_conditions in reach.used for r in _travel_runs(reach, used_conditions)),
-        )
+    on_load = reach.imposed == "voltage" and reach.has_ground
+    runs_of = _travel_runs if on_load else _shaft_runs
+    runs = [*(_motor_runs(reach) if on_load else ()), *(run for used in reach.used for run in runs_of(reach, used))]
     return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 
@@ -429,22 +411,18 @@ def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
     top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
     between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)
     others = tuple(sorted({round_significant(low), round_significant(between), top}))
-    has_both_signs = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
-    experiments = [
-        _combined_runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
-              voltages=others),
-        *([] if has_both_signs else [
-            _combined_runs(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
-                  torques=[0.0, *(way * x for x in torques[1:2])])
-        ]),
-        *([
-            _combined_runs(reach, "other torques", "run", at=used, voltages=[-way * x for x in (sizes[0], sizes[-1])],
-                  torques=[-way * x for x in torques])
-        ] if max(reach.torques, default=0.0) > 0 else []),
-    ]  # fmt: skip
-    return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in experiments)
+    ends = [way * x for x in (sizes[0], sizes[-1])]
+    runs = functools.partial(_combined_runs, reach, used=used)
+    experiments = [runs(others_of[reach.imposed], "run", kinds=("other voltages",), voltages=others)]
+    if not min(levels) < 0 < max(levels):
+        backward = [0.0, *(way * x for x in torques[1:2])]
+        experiments.append(runs("reverse", "other way", voltages=ends, torques=backward))
+    if max(reach.torques, default=0.0) > 0:
+        forward = [-x for x in ends]
+        experiments.append(runs("other torques", "run", voltages=forward, torques=[-way * x for x in torques]))
+    return tuple(experiments)
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
@@ -478,9 +456,7 @@ def possible_runs(run: ProposedRuns, does: np.ndarray) -> np.ndarray:
     return possible
 
 
-def restrict_run(
-    run: ProposedRuns, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach
-) -> ProposedRuns:
+def restrict_run(run: ProposedRuns, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray) -> ProposedRuns:
     """Runs without impossible conditions, with remarks on risks of damage.
 
     Args:
@@ -488,13 +464,11 @@ def restrict_run(
         temperature: predicted winding temperature after a long time [°C], shape (runs,).
         speed: predicted speed of the motor shaft [rad/s], shape (runs,).
     """
-    voltage, slope, payload, torque = (
-        tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()
-        for x in (run.voltage, run.slope, run.payload, run.torque)
-    )
-    watch: list[Remark] = []
-    hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
-    allowed = reach.hot if reach.hot < UNLIMITED else None
+    conditions = {name: getattr(run, name) for name in ("voltage", "slope", "payload", "torque")}
+    kept_conditions: dict[str, Any] = {name: tuple(itertools.compress(x, kept)) for name, x in conditions.items()}
+    reach, watch = run.reach, list[Remark]()
+    hottest, fastest = float(temperature[kept].max()), float(np.abs(speed[kept]).max())
+    highest, allowed = max(kept_conditions["voltage"]), reach.hot if reach.hot < UNLIMITED else None
     if run.setup is locked:
         watch.append(Remark("held_motor", temperature=hottest, allowed=allowed, current=highest / reach.resistance))
     elif run.setup is braked:
@@ -504,6 +478,6 @@ def restrict_run(
     limit = reach.limit_alone if run.setup in (uncoupled, braked) else reach.limit_geared
     if run.setup in (uncoupled, lifted) and fastest > FAST * limit:
         watch.append(Remark("overspeed", speed=fastest, limit=limit, voltage=highest))
-    if run.imposed == "voltage" and highest > reach.voltages[-1]:
+    if reach.imposed == "voltage" and highest > reach.voltages[-1]:
         watch.append(Remark("overvoltage", voltage=highest, used=reach.voltages[-1]))
-    return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, torque=torque, watch=tuple(watch))
+    return dataclasses.replace(run, watch=tuple(watch), **kept_conditions)

@@ -107,17 +107,15 @@ def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.nda
     clusters: list[OutlierCluster] = []
     for share in WINDOWS:
         width = share * (high - low)
-        count, first = _fullest_window(x[mine][None], width)
+        (count,), (first,) = _fullest_window(x[mine][None], width)
         null, _ = _fullest_window(x[permutations], width)
-        p = (1 + int(np.sum(null >= count[0]))) / (1 + PERMUTATIONS)
+        p = (1 + int(np.sum(null >= count))) / (1 + PERMUTATIONS)
         if p == 1 / (1 + PERMUTATIONS):  # beyond the resolution of permutations: a normal approximation
-            p = min(p, float(ndtr((null.mean() - count[0]) / max(null.std(), 0.3))))
-        inside = x[mine][(x[mine] >= first[0]) & (x[mine] <= first[0] + width)]
-        clusters.append(
-            OutlierCluster(name, float(inside.min()), float(inside.max()), "", int(count[0]), len(mine), p)
-        )
-    best = min(clusters, key=lambda c: c.p)
-    return dataclasses.replace(best, p=min(1.0, best.p * len(WINDOWS)))
+            p = min(p, float(ndtr((null.mean() - count) / max(null.std(), 0.3))))
+        inside = x[mine][(x[mine] >= first) & (x[mine] <= first + width)]
+        p = min(1.0, p * len(WINDOWS))
+        clusters.append(OutlierCluster(name, float(inside.min()), float(inside.max()), "", int(count), len(mine), p))
+    return min(clusters, key=lambda c: c.p)
 
 
 def _fullest_window(x: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +190,7 @@ def compile_ahead(space: CandidateSpace, runs: Runs, settings: Settings) -> Iter
         if space.bare.observe.long:  # its readings are linear from here
             return
         looked.wait()  # needed last: compilation shares two cores with the base fit
-        fit_from_each_start(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
+        fit_from_each_start(space.equipped, [nothing], [space.weight], [space.coordinates.indices(none)])
 
     def compile_predictions(base: BaseFit) -> None:
         if space.bare.observe.menu:
@@ -224,25 +222,20 @@ def screen_outliers(base: BaseFit, runs: Runs, settings: Settings) -> Screening:
         clean = _refit_without(clean, far, settings, runs.source)
         bases, diagnosis = _diagnose_base(clean, runs, settings)
     screened = Screening(clean, excluded, bases, diagnosis)
-    cluster_rows = np.zeros(len(base.space.included), bool)
-    cluster_rows[list(screened.outliers)] = True
-    together = _common_property(screened, cluster_rows, runs, settings)
-    if together is None:
-        return screened
-    bases, diagnosis = _diagnose_base(base, runs, settings)
-    return Screening(base, (), bases, diagnosis, together)
+    cluster = _common_property(screened, runs, settings)
+    return screened if cluster is None else Screening(base, (), *_diagnose_base(base, runs, settings), cluster)
 
 
-def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> OutlierCluster | None:
+def _common_property(found: Screening, runs: Runs, settings: Settings) -> OutlierCluster | None:
     """Property that the outliers share."""
-    rows = len(runs)
+    rows, included = np.arange(len(runs)), found.base.space.included
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
-    turned_rows = found.diagnosed[0].turned()
-    if turned_rows is not None:
-        axes["angle of the driving shaft"] = turned_rows[:rows] % (2 * np.pi)
+    turned = found.diagnosed[0].turned()
+    if turned is not None:
+        axes["angle of the driving shaft"] = turned[rows] % (2 * np.pi)
     levels = {c: runs[c] for c in LEVELS if runs.has(c)}
-    included = found.base.space.included
-    return find_cluster(outliers[:rows], included[:rows], axes, levels, settings.outlier_error, settings.seed)
+    outliers = np.isin(rows, found.outliers)
+    return find_cluster(outliers, included[rows], axes, levels, settings.outlier_error, settings.seed)
 
 
 def screen_with_effects(found: Screening, left: ScoreTable, runs: Runs, settings: Settings) -> Screening | None:
@@ -260,9 +253,7 @@ def screen_with_effects(found: Screening, left: ScoreTable, runs: Runs, settings
         return None
     base = _refit_without(found.base, far, settings, runs.source)
     more = Screening(base, (*found.outliers, *map(int, far)), *_diagnose_base(base, runs, settings))
-    outliers = np.zeros(len(base.space.included), bool)
-    outliers[list(more.outliers)] = True
-    return None if _common_property(more, outliers, runs, settings) is not None else more
+    return more if _common_property(more, runs, settings) is None else None
 
 
 def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:

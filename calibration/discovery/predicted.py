@@ -38,7 +38,6 @@ class ExperimentBatch(eqx.Module):
         set_up: distinct pairs of a setup and a number of motors that are on.
         which: index of each run's pair in `set_up`.
         read: positions of the channels to read in each run experiment, and its number of runs.
-        order: position of each experiment in a list of calibrations followed by runs.
     """
 
     acts: tuple[Callable[[Robot, Array], Array], ...] = eqx.field(static=True)
@@ -48,7 +47,6 @@ class ExperimentBatch(eqx.Module):
     set_up: tuple[tuple[Setup, int | None], ...] = eqx.field(static=True)
     which: tuple[int, ...] = eqx.field(static=True)
     read: tuple[tuple[tuple[int, ...], int], ...] = eqx.field(static=True)
-    order: tuple[int, ...] = eqx.field(static=True)
 
 
 class MenuPrediction(eqx.Module):
@@ -72,7 +70,7 @@ class MenuPrediction(eqx.Module):
 
 
 def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> ExperimentBatch:
-    """Collects experiments in one batch, for a robot with these channels."""
+    """Collects experiments in one batch, for a robot with these channels. Calibrations come first."""
     acts = [e for e in experiments if isinstance(e, CalibrationAct)]
     runs = [e for e in experiments if isinstance(e, ProposedRuns)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
@@ -85,10 +83,7 @@ def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Experi
         brake=jnp.asarray(np.concatenate([np.full(n, r.brake) for r, n in several])),
         set_up=tuple(set_up),
         which=tuple(k for r, n in several for k in [set_up.index((r.setup, r.sides))] * n),
-        read=tuple((r.read(shown), n) for r, n in several),
-        order=tuple(
-            acts.index(e) if isinstance(e, CalibrationAct) else len(acts) + runs.index(e) for e in experiments
-        ),
+        read=tuple((tuple(shown.index(c) for c in r.channels), n) for r, n in several),
     )
 
 
@@ -96,12 +91,10 @@ def _conditions_of_runs(run: ProposedRuns) -> Conditions:
     # None would mean the robot's own mass, which cannot be in a batch with other masses.
     mass = UNLOADED if run.setup in menu.WEIGHTLESS else math.nan
     torque = run.torque or None
-    if run.imposed != "voltage":
-        level = {run.imposed: run.voltage}
-        return Conditions(
-            run.configuration, 0.0, run.slope, run.payload, total_mass=mass, load_torque=torque, **level
-        )
-    return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass, load_torque=torque)
+    levels: dict[str, Any] = {"voltage": 0.0, run.reach.imposed: run.voltage}
+    return Conditions(
+        run.configuration, slope_deg=run.slope, payload=run.payload, total_mass=mass, load_torque=torque, **levels
+    )
 
 
 def map_over_runs(function: Callable[..., T], robot: Robot, experiments: ExperimentBatch, *own: Array) -> T:
@@ -161,7 +154,7 @@ def arrange_readings(
     for read, runs in experiments.read:
         of_run = every[first : (first := first + runs)][:, list(read)]
         parts.append(of_run.reshape(-1, *every.shape[2:]))
-    return jnp.concatenate([parts[k] for k in experiments.order])
+    return jnp.concatenate(parts)
 
 
 # --- positions --------------------------------------------------------------------------------------
@@ -190,10 +183,9 @@ def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, flo
     """
     sds = [np.zeros(0)]
     for e in experiments:
-        one_sd = (
-            [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
-            if isinstance(e, CalibrationAct)
-            else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
-        )
-        sds.append(np.asarray(one_sd, float) / math.sqrt(e.repeats))
+        if isinstance(e, ProposedRuns):
+            one_sd = [of_channels[c] for c in e.channels] * len(e.voltage)
+        else:
+            one_sd = [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
+        sds.append(np.array(one_sd) / math.sqrt(e.repeats))
     return np.concatenate(sds)

@@ -125,6 +125,11 @@ def score_readings(
     return HeldOutScore(by_kind, blocks, reading)
 
 
+def masks_of_blocks(kinds: Mapping[str, Columns]) -> list[np.ndarray]:
+    """Masks of the rows of all blocks of all kinds."""
+    return [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
+
+
 #: `candidate_key` of a candidate → kind of block → hold-out predictions of each row.
 Predicted = dict[tuple[Names, bytes], dict[str, Readings]]
 
@@ -132,12 +137,6 @@ Predicted = dict[tuple[Names, bytes], dict[str, Readings]]
 def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:
     """Key under which the hold-out predictions of a candidate are cached."""
     return candidate.active, np.asarray(candidate.z).tobytes()
-
-
-def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
-    """Hold-out scores of a candidate, which is refitted without each block of each kind."""
-    kinds = blocks_room.predictable_blocks(runs, space.bare)
-    return score_predictions(space, runs, FittedProblem(*space.fit_of(candidate.active, candidate.z)).held_out(kinds))
 
 
 def score_predictions(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
@@ -151,12 +150,11 @@ def cached_hold_out_score(
     space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted
 ) -> HeldOutScore:
     """Hold-out scores of a candidate. Its predictions come from `predicted` or are added to it."""
-    prediction_before = predicted.get(candidate_key(candidate))
-    if prediction_before is not None:
-        return score_predictions(space, runs, prediction_before)
-    score = score_candidate(space, runs, candidate)
-    predicted[candidate_key(candidate)] = score.reading
-    return score
+    key = candidate_key(candidate)
+    if key not in predicted:
+        fit = FittedProblem(*space.fit_of(candidate.active, candidate.z))
+        predicted[key] = fit.held_out(blocks_room.predictable_blocks(runs, space.bare))
+    return score_predictions(space, runs, predicted[key])
 
 
 def smallest_predictive_set(
@@ -164,7 +162,7 @@ def smallest_predictive_set(
     runs: Runs,
     base: Candidate,
     path: Sequence[Candidate],
-    predicted: Predicted | None = None,
+    predicted: Predicted,
 ) -> Candidate | None:
     """Smallest set of effects whose hold-out score is within one standard error of the best (Breiman et al. 1984,
     sec. 3.4.3).
@@ -178,10 +176,8 @@ def smallest_predictive_set(
     if not blocks_room.predictable_blocks(runs, space.bare):
         return None
     candidates = [base, *path]
-    scores = [score_candidate(space, runs, c) for c in candidates]
-    if predicted is not None:
-        predicted |= {candidate_key(c): score.reading for c, score in zip(candidates, scores, strict=True)}
-    best = scores[max(range(len(scores)), key=lambda k: scores[k].gain(scores[0]).mean)]
+    scores = [cached_hold_out_score(space, runs, c, predicted) for c in candidates]
+    best = max(scores, key=lambda score: score.gain(scores[0]).mean)
     for candidate, score in zip(candidates, scores, strict=True):
         behind = best.gain(score)
         if behind.mean <= behind.se or score is best:

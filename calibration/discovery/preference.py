@@ -5,12 +5,10 @@ found.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery import candidates, prediction, search
 from calibration.discovery.active_set import CandidateSpace
@@ -21,14 +19,12 @@ from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.experiments import alternatives_of_class
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.loop_notes import NameSupport
-from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, Predicted
 from calibration.discovery.result import Errors, WorseChannel
-from calibration.discovery.search import SearchResult
+from calibration.discovery.search import Proposed, SearchResult
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import judge_names
 from calibration.inference import blocks as blocks_room
-from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import progress_remark
 
 #: Least relative difference of hold-out errors that counts; less is invisible in two digits.
@@ -80,15 +76,13 @@ def compare_alternatives(
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     if len(alternatives) < 2 or not kinds:
         return ()
+    held_out = counts & np.stack([np.any(list(masks.values()), 0) for masks in kinds.values()])[:, :, None]
     fits = [prediction.FittedProblem(*space.fit_of(c.active, c.z)).held_out(kinds) for c in alternatives]
-    errors = [{kind: np.where(counts, (x - measured) / sd, np.nan) for kind, x in fit.items()} for fit in fits]
-    held_out = {
-        kind: counts & np.any(list(blocks_by_name.values()), 0)[:, None] for kind, blocks_by_name in kinds.items()
-    }
-    common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
+    predicted = np.array([[fit[kind] for kind in kinds] for fit in fits])
+    errors = np.where(counts, (predicted - measured) / sd, np.nan)  # shape (fits, kinds, rows, channels)
+    common = np.asarray(np.isfinite(errors).all(0))
 
-    def rms(e: Columns, blocks: Sequence[str]) -> float:
-        squares = np.concatenate([e[kind][common[kind]] ** 2 for kind in blocks])
+    def rms(squares: np.ndarray) -> float:
         return float(np.sqrt(squares.mean())) if squares.size else float("nan")
 
     return tuple(
@@ -96,9 +90,9 @@ def compare_alternatives(
             effects=c.effects,
             leads=c is best,
             rise_chi2=float(2 * (c.cost - min(x.cost for x in alternatives))),
-            rms_sigma=rms(e, list(kinds)),
-            by_kind={kind: rms(e, [kind]) for kind in kinds},
-            lost=int(sum(np.sum(held_out[kind] & ~np.isfinite(e[kind])) for kind in kinds)),
+            rms_sigma=rms(e[common] ** 2),
+            by_kind={kind: rms(e[k, common[k]] ** 2) for k, kind in enumerate(kinds)},
+            lost=int(np.sum(held_out & ~np.isfinite(e))),
         )
         for c, e in zip(alternatives, errors, strict=True)
     )
@@ -111,36 +105,32 @@ def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
     decides nothing.
     """
     able = [k for k, a in enumerate(table) if a.lost <= table[0].lost]
-    least = min(table[k].rms_sigma for k in able)
-    is_draw = not table[0].rms_sigma > (1 + TOLD) * least
+    is_draw = not any(table[0].rms_sigma > (1 + TOLD) * table[k].rms_sigma for k in able)
     return sorted(able, key=lambda k: (k != 0 or not is_draw, table[k].rms_sigma))
 
 
 def prefer_by_held_out(
-    space: CandidateSpace, runs: Runs, searched: SearchResult, alike: Classes, bases: Bases, settings: Settings
-) -> tuple[SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
+    beside: BaseCurve, runs: Runs, best: Candidate, before: Diagnosis, alike: Classes
+) -> tuple[Candidate, Diagnosis, Classes, tuple[HeldOutAlternative, ...]]:
     """Replaces the best fit by the alternative with the smallest hold-out error, see `_order_alternatives`.
 
     An alternative with significant residuals does not replace a best fit without them.
+
+    Args:
+        best, before: the best fit and its diagnosis.
     """
-    best, before = searched.best, searched.diagnosis
-    if best is None or before is None:
-        return searched, alike, ()
+    space, settings = beside.space, beside.settings
     table = compare_alternatives(space, runs, best, alike)
-    if not table:
-        return searched, alike, ()
     fitted = {c.key: c for c in alternatives_of_class(best, alike, stated=False).values()}
     for k in _order_alternatives(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
-        diagnosis = search.diagnose_candidate(space, leader, bases, before.test.null, settings)
-        sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
-        if sound:
+        diagnosis = search.diagnose_candidate(space, leader, beside.bases, before)
+        if before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin:
             led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
-            searched = dataclasses.replace(searched, best=leader, diagnosis=diagnosis)
-            return searched, _classes_with_leader(space, best, leader, alike, settings), led
-    return searched, alike, table
+            return leader, diagnosis, _classes_with_leader(space, best, leader, alike, settings), led
+    return best, before, alike, table
 
 
 def _classes_with_leader(
@@ -157,12 +147,8 @@ def _classes_with_leader(
     stated_by_effect = dict(zip(best.effects, alike.stated, strict=True))
     stated_by_effect[new] = stated_by_effect.pop(old)
     keys = {best.key, *(c.key for c in alike.ladder)}
-    missing_fits = [
-        tuple(other if n == name else n for n in leader.active)
-        for name in leader.effects
-        for other in members[name][1:]
-    ]
-    missing = [w for w in missing_fits if frozenset(n for n in w if n) not in keys]
+    missing_fits = [leader.with_effect(name, other) for name in leader.effects for other in members[name][1:]]
+    missing = [w for w in missing_fits if frozenset(w) - {""} not in keys]
     fitted = candidates.fit_candidates(
         space, [(w, candidates.start_of_fit(space, leader, w, settings)) for w in missing], settings
     )
@@ -178,13 +164,8 @@ def _classes_with_leader(
 
 
 def choose_effects(
-    given: LoopInput,
-    screened: Screening,
-    left: Diagnosis,
-    searched: SearchResult,
-    beside: BaseCurve,
-    predicted: Predicted,
-) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
+    given: LoopInput, searched: SearchResult, beside: BaseCurve, predicted: Predicted
+) -> tuple[Proposed | None, SearchResult, NameSupport]:
     """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
 
     The effects are those whose names are established, and those of the smallest set that predicts as well as any.
@@ -192,48 +173,39 @@ def choose_effects(
     otherwise those of the predictive set.
 
     Args:
-        left: diagnosis of the base fit.
-        beside: smooth curve of its discrepancy.
+        beside: the base fit, its diagnosis and the smooth curve of its discrepancy.
         predicted: cache of hold-out predictions of fits. This function adds to it.
     """
-    base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    best, after, settings = searched.best, searched.diagnosis, given.settings
+    space, base, settings = beside.space, beside.base, given.settings
+    best, after = searched.best, searched.diagnosis
     if best is None or after is None:
-        return None, searched, judge_names(space, base, searched, left, bases, settings)
+        return None, searched, judge_names(beside, searched)
     adequate = not after.test.rejected_with_margin
-    kinds = blocks_room.predictable_blocks(given.runs, space.bare)
-    blocks = [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
-    support_of = functools.partial(
-        judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
-    )
-    stood = support_of() if adequate else None
-    if stood is not None and all(stood.established(e) for e in best.effects):
+    blocks = prediction.masks_of_blocks(blocks_room.predictable_blocks(given.runs, space.bare))
+    stood = judge_names(beside, searched, blocks=blocks) if adequate else None
+    if stood is not None and all(map(stood.established, best.effects)):
         return (best, after), searched, stood
+
+    def diagnosed(fit: Candidate) -> Proposed:
+        return fit, after if fit is best else search.diagnose_candidate(space, fit, beside.bases, beside.left)
+
     given.progress(progress_remark("held out"))
-    few = prediction.smallest_predictive_set(space, given.runs, base, search.best_of_each_size(searched), predicted)
+    path = search.best_of_each_size(searched)
+    few = prediction.smallest_predictive_set(space, given.runs, base, path, predicted)
+    proposed = best, after
     if stood is None:
-        judged = best if few is None else few
-        proposed = (
-            judged,
-            after if judged is best else search.diagnose_candidate(space, judged, bases, left.test.null, settings),
-        )
-        stood = support_of(proposed=proposed)
-    else:
-        proposed = best, after
+        proposed = diagnosed(best if few is None else few)
+        stood = judge_names(beside, searched, proposed, blocks)
     names = [e for e in proposed[0].effects if stood.established(e)]
-    added_effects = [
-        e for e in (() if few is None else few.effects) if e not in names and not stood.imitates_curve(e)
-    ]
+    predictive = () if few is None else few.effects
+    added_effects = [e for e in predictive if e not in names and not stood.imitates_curve(e)]
     names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    fits_of_names = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
-    if not fits_of_names:
+    fit = next((c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)), None)
+    if fit is None:
         active = candidates.fill_slots(names, settings)
-        begins = candidates.start_of_fit(space, proposed[0], active, settings, left.scores)
-        fits_of_names = candidates.fit_candidates(space, [(active, begins)], settings)
-        searched = dataclasses.replace(searched, ladder=(*searched.ladder, *fits_of_names))
-    diagnosis = next((d for c, d in (proposed, (best, after)) if c is fits_of_names[0]), None)
-    if diagnosis is None:
-        diagnosis = search.diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)
-    return (fits_of_names[0], diagnosis), searched, stood
+        begins = candidates.start_of_fit(space, proposed[0], active, settings, beside.left.scores)
+        (fit,) = candidates.fit_candidates(space, [(active, begins)], settings)
+        searched = dataclasses.replace(searched, ladder=(*searched.ladder, fit))
+    return proposed if fit is proposed[0] else diagnosed(fit), searched, stood

@@ -2,59 +2,84 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+import functools
 
 import numpy as np
 
 from calibration.inference.bases import place_signature
 from calibration.inference.linearization import Linearization
 
-
-def projection_factor(jacobian: np.ndarray) -> np.ndarray:
-    """H = L⁻¹ Jᵀ with L Lᵀ = JᵀJ, so that HᵀH projects onto the columns of J, shape (columns, rows)."""
-    return np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+#: Share of a signature's norm below which the free parameters absorb it completely.
+ABSORBED = 1e-3
 
 
 class Projection:
-    """Projects columns orthogonally to the free parameters, as if these were fitted again.
+    """Projects columns orthogonally to the free parameters of a fit, as if these were fitted again.
+
+    Columns are whitened changes of the readings per unit, shape (readings, columns). Prior rows belong to the free
+    parameters.
 
     Args:
-        linear: linearization of the base fit of settled rows. Its prior rows belong to the free parameters.
+        jacobian, residual: Jacobian J and residuals e of the fit, those of the readings first.
     """
 
-    def __init__(self, linear: Linearization) -> None:
-        jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-        self.readings = linear.readings
-        half = projection_factor(jacobian)
-        self.half = half[:, : self.readings]
-        self.left = (residual - half.T @ (half @ residual))[: self.readings]
+    def __init__(self, jacobian: np.ndarray, residual: np.ndarray) -> None:
+        self.jacobian, self.residual = jacobian, residual
+
+    @classmethod
+    def of(cls, linear: Linearization) -> Projection:
+        """Projection at a linearized fit."""
+        return cls(np.asarray(linear.jacobian), np.asarray(linear.residual))
+
+    @functools.cached_property
+    def half(self) -> np.ndarray:
+        """H = L⁻¹ Jᵀ with L Lᵀ = JᵀJ, so that HᵀH projects onto the columns of J, shape (coordinates, rows)."""
+        return np.linalg.solve(np.linalg.cholesky(self.jacobian.T @ self.jacobian), self.jacobian.T)
+
+    @functools.cached_property
+    def left(self) -> np.ndarray:
+        """Projected residuals (I - P) e."""
+        return self.residual - self.half.T @ (self.half @ self.residual)
 
     def __call__(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A = Cᵀ (I - P) C and b = -Cᵀ (I - P) e. Coefficients a of the columns C reduce χ² by 2 bᵀa - aᵀA a.
+        """A = Cᵀ (I - P) C and b = -Cᵀ (I - P) e. Coefficients a of the columns C reduce χ² by 2 bᵀa - aᵀA a."""
+        inside = self.half[:, : len(columns)] @ columns
+        return columns.T @ columns - inside.T @ inside, -columns.T @ self.left[: len(columns)]
+
+    def explained(self, columns: np.ndarray) -> tuple[float, float]:
+        """Decrease of χ² by all columns, and their sensitivity that the free parameters leave [σ²]."""
+        a, b = self(columns)
+        return float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0]), float(np.trace(a))
+
+    def norms(self, columns: np.ndarray, rows: np.ndarray | slice | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Squared norm of each projected column, and its product with the residuals.
 
         Args:
-            columns: whitened change of the readings per unit, shape (readings, columns).
+            rows: readings of the columns. None: the first ones.
         """
-        inside = self.half @ columns
-        return columns.T @ columns - inside.T @ inside, -columns.T @ self.left
+        rows = slice(len(columns)) if rows is None else rows
+        inside = self.half[:, rows] @ columns
+        return np.sum(columns**2, 0) - np.sum(inside**2, 0), columns.T @ self.left[rows]
+
+    def roots(self, columns: np.ndarray, rows: np.ndarray | slice | None = None) -> np.ndarray:
+        """Square root of the score of each column [σ]. 0 for columns that the free parameters can imitate."""
+        left, scores = self.norms(columns, rows)
+        is_visible = left > ABSORBED**2 * np.sum(columns**2, 0)
+        return np.where(is_visible, np.abs(scores) / np.sqrt(np.maximum(left, 1e-12)), 0.0)
+
+    def only(self, kept: np.ndarray) -> Projection:
+        """Projection of the same fit with some of the readings. Residuals of priors remain.
+
+        Args:
+            kept: True for readings that remain, shape (readings,).
+        """
+        rows = np.append(kept, np.ones(len(self.residual) - len(kept), bool))
+        return Projection(self.jacobian[rows], self.residual[rows])
 
 
-@dataclasses.dataclass(frozen=True)
-class BalanceError:
-    """Error of a balance or channel in each row that the free parameters cannot absorb.
-
-    Attributes:
-        value, sd: error and its standard deviation [unit of the balance or channel], shape (rows,). NaN if the
-            readings do not show it.
-    """
-
-    value: np.ndarray
-    sd: np.ndarray
-
-
-def balance_error_by_row(linear: Linearization, place: str) -> BalanceError:
-    """Error of one balance equation in each row, by least squares that also refits the free parameters.
+def balance_error_by_row(linear: Linearization, place: str) -> tuple[np.ndarray, np.ndarray]:
+    """Error of one balance equation in each row, by least squares that also refits the free parameters, and its
+    standard deviation [unit of the balance or channel]. NaN if the readings do not show it.
 
     δ_i = -(r_i·e) / ‖r_i‖² with the sd 1/‖r_i‖ and r_i = (I - P) g_i. The residuals are e. All readings change by g_i
     per unit error of the equation in row i. In time histories the error is largest at that instant and falls to zero
@@ -64,26 +89,8 @@ def balance_error_by_row(linear: Linearization, place: str) -> BalanceError:
     shapes = np.zeros((linear.rows, len(places)))
     shapes[places, np.arange(len(places))] = 1.0
     columns = place_signature(linear, place, shapes)
-    a, b = Projection(linear)(columns)
-    norm2, total_norm = np.diag(a), np.sum(columns**2, 0)
-    is_visible = norm2 > 1e-6 * np.maximum(total_norm, 1e-300)
-    norm2 = np.where(is_visible, norm2, np.nan)
-    value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
-    value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
-    return BalanceError(value, sd)
-
-
-def explained_function(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
-    """Function that returns how much columns over the readings explain of a fit's residuals.
-
-    Its results are the decrease of χ² by all columns, and their sensitivity that the free parameters leave [σ²].
-    """
-    half = projection_factor(jacobian)
-    projected_residual = residual - half.T @ (half @ residual)
-
-    def explained(columns: np.ndarray) -> tuple[float, float]:
-        inside = half[:, : len(columns)] @ columns
-        inner, told = columns.T @ columns - inside.T @ inside, columns.T @ projected_residual[: len(columns)]
-        return float(told @ np.linalg.lstsq(inner, told, rcond=1e-9)[0]), float(np.trace(inner))
-
-    return explained
+    norm2, products = Projection.of(linear).norms(columns)
+    norm2 = np.where(norm2 > 1e-6 * np.maximum(np.sum(columns**2, 0), 1e-300), norm2, np.nan)
+    value, sd = np.full((2, linear.rows), np.nan)
+    value[places], sd[places] = -products / norm2, 1 / np.sqrt(norm2)
+    return value, sd

@@ -118,7 +118,6 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         at: values of the variable [SI].
         value, sd: value and standard deviation of the curve there [unit].
         proposal: proposed formula.
-        score_free_in_each_run: score of a wave with its own phase in each run. None for other curves.
         over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
             plus the row's residual, along the travel. None if single rows do not show it.
     """
@@ -131,7 +130,6 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     value: np.ndarray
     sd: np.ndarray
     proposal: formula.Proposal
-    score_free_in_each_run: float | None = None
     over: np.ndarray | None = None
     defect: np.ndarray | None = None
     defect_sd: np.ndarray | None = None
@@ -186,36 +184,28 @@ class ParameterShift:
 
 @dataclasses.dataclass(frozen=True)
 class EffectScore:
-    """Score of a library effect at its best shape [σ²], its amplitude [own unit], and its change of the readings per
-    prior sd [σ].
+    """Score of a library effect alone. All other parameters are refitted on the linearised equations of the base fit.
+
+    Attributes:
+        name: name of the effect.
+        balance: balance that it enters.
+        score: decrease of χ² by the effect at its best shape and plausible size [σ²].
+        amplitude, sd: its amplitude and standard deviation [unit].
+        sigmas_per_prior_sd: change of the readings per prior sd [σ].
+        family: equation and driving variable in words.
+        unit: unit of its amplitude.
+        supplies: True if its sign would supply power. It then explains nothing.
     """
 
+    JSON = ("name", "balance", "score", "amplitude", "sigmas_per_prior_sd")
     name: str
     balance: str
     score: float
     amplitude: float
     sigmas_per_prior_sd: float
-
-
-@dataclasses.dataclass(frozen=True)
-class RankedEffect:
-    """An effect of the ranking. All other parameters are refitted on the linearised equations of the base fit.
-
-    Attributes:
-        name: name of the effect.
-        family: equation and driving variable in words.
-        unit: unit of its amplitude.
-        score: decrease of χ² by the effect alone, at plausible size [σ²].
-        amplitude, sd: its amplitude and standard deviation [unit].
-        supplies: True if its sign would supply power. It then explains nothing.
-    """
-
-    name: str
+    sd: float
     family: str
     unit: str
-    score: float
-    amplitude: float
-    sd: float
     supplies: bool = False
 
 
@@ -235,9 +225,14 @@ class EffectRanking:
     missing: bool
     p_value: float
     chance: float
-    effects: tuple[RankedEffect, ...]
+    effects: tuple[EffectScore, ...]
     windows: int = 0
     parameters: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def beyond_chance(self) -> list[EffectScore]:
+        """Effects that explain more than chance."""
+        return [e for e in self.effects if e.score > self.chance and not e.supplies]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,6 +241,7 @@ class KindOfEvidence:
     tables.
     """
 
+    JSON = ("found", "threshold", "p")
     found: float
     threshold: float
     p: float
@@ -261,6 +257,10 @@ class Evidence:
     kinds: dict[str, KindOfEvidence]
     p_value: float
     adequate: bool
+
+    def to_json(self) -> Json:
+        """Entry of result.json."""
+        return {**self.kinds, "p_value": self.p_value}
 
 
 Errors = dict[str, dict[str, float | int]]
@@ -385,10 +385,8 @@ class DiscoveryResult:
         """The answer in a sentence or two. It begins with backlash or compliance that no effect of the library
         explains.
         """
-        lost_motion_sentences = (
-            f"{note}." for note in described.sentences(fit_notes.remarks_with_codes(self.remarks, "lost_motion"))
-        )
-        return " ".join((*lost_motion_sentences, described.describe(self.headline)))
+        lost_motion = described.sentences(fit_notes.remarks_with_codes(self.remarks, "lost_motion"))
+        return " ".join((*(f"{note}." for note in lost_motion), described.describe(self.headline)))
 
     @property
     def verdict_statement(self) -> str:
@@ -432,53 +430,51 @@ class DiscoveryResult:
         Unlike `chi2`, it excludes the distances of parameters from their priors, and penalties.
         """
         readings = self.readings_of_rows
-        before, after = (
-            float(
-                np.nansum(
-                    np.where(self.included[:, None], (simulated - readings.measured) / readings.sd, np.nan) ** 2
-                )
-            )
-            for simulated in (readings.before, readings.after)
-        )
+        off = [(x - readings.measured) / readings.sd for x in (readings.before, readings.after)]
+        before, after = (float(np.nansum(x[self.included] ** 2)) for x in off)
         return before, after
 
     @property
     def predicted(self) -> dict[str, tuple[int, int]]:
         """Kind of block → number of rows with hold-out predictions, without and with the proposal."""
-
-        def rows(reading: np.ndarray) -> int:
-            return int(np.sum(np.isfinite(reading).any(1) & self.included))
-
-        return {kind: (rows(a), rows(b)) for kind, (a, b) in self.readings_of_rows.held_out.items()}
+        rows = {}
+        for kind, held_out in self.readings_of_rows.held_out.items():
+            before, after = (int(np.sum(np.isfinite(x[self.included]).any(1))) for x in held_out)
+            rows[kind] = before, after
+        return rows
 
     @property
     def rms(self) -> dict[str, dict[str, float]]:
         """rms error of each fit and channel [unit of the channel], over the rows of the percentage errors."""
-        fits = dict(zip(("before", "after"), self.errors, strict=True))
-        main = next(iter(self.errors_held_out.values()), ())
-        fits |= dict(zip(("held_out_before", "held_out_after"), main, strict=False))
+        fits = *self.errors, *next(iter(self.errors_held_out.values()), ())
+        names = ("before", "after", "held_out_before", "held_out_after")
         return {
-            fit: {name: e["rms"] for name, e in errors_by_channel.items() if e["rows"]}
-            for fit, errors_by_channel in fits.items()
+            fit: {name: e["rms"] for name, e in by_channel.items() if e["rows"]}
+            for fit, by_channel in zip(names, fits, strict=False)
         }
 
     @property
     def held_by_prior(self) -> Names:
         """Names of the fitted parameters that the data do not determine, so that their priors do."""
-        base = [name for name, p in self.base_shift.items() if p.held_by_prior]
-        parameters = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
-        return (*base, *(name for name, p in parameters if p.held_by_prior))
+        return tuple(name for name, p in self._parameters.items() if p.held_by_prior)
+
+    @property
+    def _parameters(self) -> dict[str, ParameterShift | ParameterEstimate]:
+        """Fitted parameters of the base and of the effects, by name."""
+        of_effects = {f"effects.{e.name}.{name}": p for e in self.effects for name, p in e.parameters.items()}
+        return {**self.base_shift, **of_effects}
 
     @property
     def together(self) -> tuple[fit_notes.DependentPair, ...]:
         """Pairs of parameters, of the base or of effects, that the data determine only in combination."""
-        shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
-        return tuple(pair for pair in pairs if shown_names >= {pair.one, pair.other})
+        return tuple(pair for pair in pairs if self._parameters.keys() >= {pair.one, pair.other})
 
     def to_json(self) -> Json:
         """The whole result as JSON data, as described in docs/schemas/loop.schema.json."""
         mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
+        as_stated, course = self.errors_as_stated, "" if self.unnamed is None else described.describe(self.unnamed)
+        unnamed = [] if self.unnamed is None else [_unnamed_json(self.unnamed, course)]
         return writing.json_value(
             {
                 "schema": SCHEMA,
@@ -490,7 +486,7 @@ class DiscoveryResult:
                         mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"
                     ),
                     "established": not mechanism.fails,
-                    "course": "" if self.unnamed is None else described.describe(self.unnamed),
+                    "course": course,
                 },
                 "missed": [m._asdict() for m in self.summary.missed],
                 "headline": {
@@ -501,19 +497,19 @@ class DiscoveryResult:
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
                 **writing.entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
-                "effects": [_effect_json(e, self.support) for e in self.effects]
-                + ([] if self.unnamed is None else [_unnamed_json(self.unnamed)]),
+                "effects": [*(_effect_json(e, self.support) for e in self.effects), *unnamed],
                 **writing.entries_of(
-                    self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"
+                    self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories", "needs_reverse"
                 ),
-                "needs_reverse": self.needs_reverse,
                 **self.detail.to_json(),
-                **writing.entries_of(self, "alternatives", "implausible", "hidden", "standing", "cluster"),
-                "residual_clusters": self.residual_clusters,
+                **writing.entries_of(
+                    self, "alternatives", "implausible", "hidden", "standing", "cluster", "residual_clusters"
+                ),
                 "errors": {
                     # nothing is fitted as stated, so both are the same
-                    "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
-                    **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(("before", "after"))},
+                    "as_stated": {"fitted": as_stated, "held_out": as_stated},
+                    "before": {"fitted": self.errors[0], "held_out": main[0]},
+                    "after": {"fitted": self.errors[1], "held_out": main[1]},
                 },
                 "errors_percent_of": OF_SIZE,
                 "held_out_by": {
@@ -522,17 +518,14 @@ class DiscoveryResult:
                 },
                 **writing.entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
                 "prediction": {
-                    **(
-                        {"gain": None, "se": None}
-                        if self.gain is None
-                        else writing.entries_of(self.gain, "gain=mean", "se")
-                    ),
+                    "gain": self.gain and self.gain.mean,
+                    "se": self.gain and self.gain.se,
                     "sets": [{"effects": names, "gain": g.mean, "se": g.se} for names, g in self.gains],
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },
                 "adequate": writing.entries_of(self, "before=before.adequate", "after=after.adequate"),
-                "evidence": {"before": _evidence_json(self.before), "after": _evidence_json(self.after)},
+                "evidence": writing.entries_of(self, "before", "after"),
                 "chi2": {
                     "before": self.chi2[0],
                     "after": self.chi2[1],
@@ -558,18 +551,14 @@ class DiscoveryResult:
         main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
-            table[column] = readings.measured[:, k] / unit
-            table[channel.sd_column] = readings.sd[:, k] / unit
-            table[f"before_{column}"], table[f"after_{column}"] = (
-                readings.before[:, k] / unit,
-                readings.after[:, k] / unit,
-            )
+            shown = {column: readings.measured, channel.sd_column: readings.sd}
+            shown |= {f"before_{column}": readings.before, f"after_{column}": readings.after}
             if main is not None:
-                table[f"held_out_before_{column}"] = main[0][:, k] / unit
-                table[f"held_out_after_{column}"] = main[1][:, k] / unit
+                shown |= {f"held_out_before_{column}": main[0], f"held_out_after_{column}": main[1]}
+            table |= {name: x[:, k] / unit for name, x in shown.items()}
             for when, simulated in (("before", readings.before), ("after", readings.after)):
-                name = f"residual_{when}_{channel.name}_sigma"
-                table[name] = (simulated[:, k] - readings.measured[:, k]) / readings.sd[:, k]
+                off = simulated[:, k] - readings.measured[:, k]
+                table[f"residual_{when}_{channel.name}_sigma"] = off / readings.sd[:, k]
         table |= self.detail.columns()
         use = np.full(len(self.runs), "used", dtype="<U8")
         use[np.isin(self.numbers, self.outliers)] = "outlier"
@@ -590,12 +579,9 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows_table(), tables)
-        held_sentence = (
-            [described.describe(fit_notes.Remark("held_by_prior", names=self.held_by_prior))]
-            if self.held_by_prior
-            else []
-        )
-        note = "\n".join([described.describe(self, "header", robot_name), *held_sentence])
+        note = described.describe(self, "header", robot_name)
+        if self.held_by_prior:
+            note += "\n" + described.describe(fit_notes.Remark("held_by_prior", names=self.held_by_prior))
         write_robot(self.robot, folder / "robot.toml", note=note)
         write_robot(self.refit, folder / REFIT_FILE, note=described.describe(self, "refit header", robot_name))
         posterior_file.write_posterior(self.posterior, folder / posterior_file.FILE)
@@ -627,25 +613,24 @@ class NoiseVerdict:
 
 def _effect_json(e: FoundEffect, support: loop_notes.NameSupport | None) -> Json:
     test = None if support is None else support.test_of(e.name)
+    form = test is not None and test.shows_form
     return {
         "name": e.name,
         "class": [*e.members, *e.stated],
         "standing": "established" if support is None or support.established(e.name) else "tentative",
-        "doubts": [] if test is None else test.fails,
-        "rests_on_row": None if test is None else test.rests_on,
-        "root": None if test is None else test.root,
-        "root_needed": None if test is None else test.needed,
+        "doubts": test.fails if test else [],
+        "rests_on_row": test and test.rests_on,
+        "root": test and test.root,
+        "root_needed": test and test.needed,
         **writing.entries_of(
             e, "families", "balance", "unit", "equation", "source", "parameters", "p_value", "score", "share"
         ),
-        "accuracy_of_form": None
-        if test is None or not test.shows_form
-        else {"over": test.over, "share": test.spread},
+        "accuracy_of_form": writing.entries_of(test, "over", "share=spread") if form else None,
         **writing.entries_of(e, "members", "stated_values=stated"),
     }
 
 
-def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
+def _unnamed_json(d: UnnamedDiscrepancy, course: str) -> Json:
     return {
         "name": "unnamed",
         "class": [],
@@ -654,13 +639,8 @@ def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
         "unit": d.unit,
         "equation": None,
         "parameters": {},
-        **writing.entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
+        **writing.entries_of(d, "p_value", "score", "effect"),
         "curve": writing.entries_of(d, "at", "value", "sd", "unit"),
-        "course": described.describe(d),
+        "course": course,
         "proposal": d.proposal,
     }
-
-
-def _evidence_json(e: Evidence) -> Json:
-    kinds = {name: {"found": k.found, "threshold": k.threshold, "p": k.p} for name, k in e.kinds.items()}
-    return {**kinds, "p_value": e.p_value}

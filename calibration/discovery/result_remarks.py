@@ -84,9 +84,6 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     after = found.readings_of_rows.after if found.written else found.readings_of_rows.before
     off = np.where(found.included[:, None], after - found.readings_of_rows.measured, np.nan)
     remarks += error_after_steps(found.runs, off)
-    wave = found.unnamed
-    if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
-        remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
     delay = found.base_shift.get(priors.DELAY)
     remarks += delay_remarks(found.runs, delay, priors.DELAY in found.robot.rig.stated) if delay is not None else []
     if found.remains is not None:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.discovery.projection import ABSORBED
 from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.optimizers import CORES, with_solved_rows
@@ -26,8 +27,6 @@ from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, Threads, compiled
 from mmrjax.numerics.linear_equations import solve_lower
 
-#: Share of a signature's norm below which the free parameters absorb it completely.
-ABSORBED = 1e-3
 #: Largest predicted decrease of the objective [½σ²] for a refit's statistics to count.
 UNSETTLED = 0.05
 #: Prior sd of a curve's columns in a fit with the free parameters [σ]: wide, but it keeps their rank.

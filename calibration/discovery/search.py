@@ -6,6 +6,7 @@ For logs, also the ranking of the effects on the equations in weak form, before 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import (
     Candidate,
     candidate_of_fit,
@@ -24,13 +25,10 @@ from calibration.discovery.candidates import (
     fit_candidates,
     fit_in_addition,
     start_of_fit,
+    with_slots,
 )
-from calibration.discovery.score_tests import (
-    ABSORBED,
-    ScoreTable,
-    StrongestStatistics,
-    diagnose_fit,
-)
+from calibration.discovery.projection import ABSORBED
+from calibration.discovery.score_tests import ScoreTable, diagnose_fit
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
 from calibration.inference.fit_notes import Remark, progress_remark
@@ -60,14 +58,18 @@ class SearchResult:
 
 
 def diagnose_candidate(
-    space: CandidateSpace, fitted: Candidate, bases: Bases, null: StrongestStatistics, settings: Settings,
-    near: Linearization | None = None,
-) -> Diagnosis:  # fmt: skip
-    """Linearises a candidate's fit and tests its residuals. `near`: as in `diagnose_fit`."""
+    space: CandidateSpace, fitted: Candidate, bases: Bases, known: Diagnosis, near: Linearization | None = None
+) -> Diagnosis:
+    """Linearises a candidate's fit and tests its residuals.
+
+    Args:
+        known: diagnosis of another fit, with the same test.
+        near: as in `diagnose_fit`.
+    """
     z = jnp.asarray(fitted.z)
     diagnosis = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases, near)
     linear, scores, statistics = jax.device_get(diagnosis)
-    return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
+    return Diagnosis(linear, scores, known.test.of(statistics))
 
 
 def search_effects(
@@ -92,7 +94,7 @@ def search_effects(
         best = None
     while best is not None:
         diagnosed = best
-        diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
+        diagnosis = diagnose_candidate(space, best, bases, left)
         if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
             min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
         ):
@@ -153,7 +155,7 @@ def refit_without_each(
 def _names_by_score(space: CandidateSpace, scores: ScoreTable, last: Sequence[str] = ()) -> list[str]:
     """Names of effects by their best |score|, strongest first. Effects in `last` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
-    strength[list(space.library.indices(last))] = 0.0
+    strength[np.isin(space.library.names, last)] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
 
 
@@ -173,19 +175,13 @@ def _extend_set(
     names = _names_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
-        effect, effect_names = space.library.of, space.library.names
         pair_scores = np.triu(np.asarray(left.scores.pair))
-        pairs: list[tuple[str, str]] = []
-        for flat in np.argsort(-pair_scores, axis=None)[:PAIRS]:
-            i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
-            if i != j and (effect_names[i], effect_names[j]) not in pairs:
-                pairs.append((effect_names[i], effect_names[j]))
-            if len(pairs) == _batch_size(space):
-                break
-        for pair in pairs:
-            pair_set, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
-            if pair_set not in sources and swapped not in sources:
-                sources[pair_set] = (base, left)
+        strongest = np.unravel_index(np.argsort(-pair_scores, axis=None)[:PAIRS], pair_scores.shape)
+        pairs = dict.fromkeys(tuple(sorted(pair)) for pair in space.library.of[np.stack(strongest, 1)].tolist())
+        for i, j in itertools.islice((pair for pair in pairs if pair[0] != pair[1]), _batch_size(space)):
+            pair = space.library.names[i], space.library.names[j]
+            if not {fill_slots(pair, settings), fill_slots(pair[::-1], settings)} & sources.keys():
+                sources[fill_slots(pair, settings)] = base, left
     wanted = [(active, fit, ranking.scores) for active, (fit, ranking) in sources.items()]
     return fit_in_addition(space, wanted, settings)
 
@@ -193,6 +189,10 @@ def _extend_set(
 def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:
     sound = [c for c in candidates if c.plausible and np.isfinite(c.cost)]
     return min(sound, key=lambda c: c.cost) if sound else None
+
+
+#: A candidate and its diagnosis.
+Proposed = tuple[Candidate, Diagnosis]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -241,12 +241,10 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormSc
     scores = ScoreTable(*parts)
     random = np.random.default_rng(settings.seed)
     null = np.max(np.abs(random.standard_normal((settings.replicates, len(ways))) @ ways), 1)
-    slots = np.zeros(2 * settings.slots)
     sd = np.sqrt(np.diag(np.linalg.inv(equations.jacobian.T @ equations.jacobian)))
-    z, sd = np.concatenate([equations.z, slots]), np.concatenate([sd, slots + 1])
     cost = np.asarray(0.5 * np.sum(equations.residual**2))
-    of_fit: tuple[Any, ...] = (z, sd, np.zeros((0, 0)), cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
-    optimum = Optimum(*of_fit)
+    of_fit: tuple[Any, ...] = (equations.z, sd, np.zeros((0, 0)), cost, np.zeros(()), np.asarray(True), np.asarray(0))
+    optimum = with_slots(Optimum(*of_fit), space, settings)
     base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), optimum, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     return WeakFormScreening(base, slides, scores, equations.windows, null)

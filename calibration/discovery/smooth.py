@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array
 from numpy.polynomial import legendre
 
-from calibration.data import Names
 from calibration.discovery.projection import Projection
 from calibration.inference.bases import ORDERS, place_signature, scale_to_unit_range, window_from_name
 from calibration.inference.linearization import Linearization
@@ -38,7 +37,7 @@ class SmoothCurve:
     """A smooth curve (or a wave) at the base fit. The size and length of its prior maximise the evidence.
 
     Attributes:
-        effect, variable: name of the curve, and its variable.
+        effect, variable: name of the curve as an effect, and its variable.
         low, high: range of the variable.
         scale: amplitude of the curve [unit of the balance].
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
@@ -62,26 +61,9 @@ class SmoothCurve:
     evidence: float
 
     @property
-    def wave(self) -> bool:
-        """True if it repeats with the angle of a shaft."""
-        return self.variable in ORDERS
-
-    @property
     def happening(self) -> bool:
         """True if it describes a temporary change."""
         return window_from_name(self.variable) is not None
-
-    @property
-    def ordinates(self) -> Names:
-        """Names of the parameters that define its shape."""
-        return ("y_sin", "y_cos") if self.wave else ORDINATES
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Its other parameters, by name."""
-        if self.wave:
-            return {"amplitude": self.scale, "order_shaft": ORDERS[self.variable][0]}
-        return {"amplitude": self.scale, "low": self.low, "high": self.high}
 
     def basis(self, x: np.ndarray) -> np.ndarray:
         """Weight of each ordinate at x, shape (points, ordinates)."""
@@ -123,13 +105,9 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # a constant variable: only an offset can be seen
     basis = _basis_functions(variable, x, low, high)
-    a, b = Projection(linear)(place_signature(linear, balance, way[:, None] * basis))
+    a, b = Projection.of(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    roots = (
-        [np.eye(2)]
-        if variable in ORDERS
-        else [_prior_root(correlation, happens is not None) for correlation in LENGTHS]
-    )
+    roots = [np.eye(2)] if variable in ORDERS else [_prior_root(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
     for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size
@@ -138,28 +116,25 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
         z = np.linalg.solve(information, pull)
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(information)[1]
         if evidence > best[0]:
-            explained = 2 * pull @ z - z @ inner @ z
-            degrees_taken = float(np.trace(np.linalg.solve(information, inner)))
-            best = evidence, (
-                scale, root, z, np.linalg.inv(information), float(explained), degrees_taken, 2 * float(evidence)
-            )  # fmt: skip
-    name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
-    return SmoothCurve(name, variable, low, high, *best[1])
+            covariance = np.linalg.inv(information)
+            explained, freedom = float(2 * pull @ z - z @ inner @ z), float(np.trace(covariance @ inner))
+            best = evidence, (scale, root, z, covariance, explained, freedom, 2 * float(evidence))
+    return SmoothCurve(f"curve_{balance}_{axis}", variable, low, high, *best[1])
 
 
 def _prior_root(length: float, happening: bool) -> np.ndarray:
     """L of the prior covariance L Lᵀ of the ordinates for one correlation length [spacings of the ordinates]. A
     temporary change is zero at its ends.
     """
-    distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
     across = np.linspace(-1.0, 1.0, len(ORDINATES))
+    distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
+    covariance = np.exp(-0.5 * (distance / length) ** 2) + 1e-6 * np.eye(len(ORDINATES))
+    if not happening:
+        covariance += WIDE**2 * (1 + np.outer(across, across))
+    root = np.linalg.cholesky(covariance)
     if happening:
-        covariance = np.exp(-0.5 * (distance / length) ** 2) + 1e-6 * np.eye(len(ORDINATES))
-        root = np.linalg.cholesky(covariance)
         root[[0, -1]] = 0.0
-        return root
-    broad = WIDE**2 * (1 + np.outer(across, across)) + 1e-6 * np.eye(len(ORDINATES))
-    return np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)
+    return root
 
 
 def fit_smooth_surface(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +22,11 @@ from calibration.discovery import (
 )
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.discrepancy import BaseCurve
-from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
+from calibration.discovery.location import varied_by_duty
 from calibration.discovery.loop_input import LoopInput
 from calibration.discovery.mechanism import find_mechanism
 from calibration.discovery.outliers import Screening
-from calibration.discovery.search import SearchResult
+from calibration.discovery.search import Proposed, SearchResult
 from calibration.discovery.settings import HELD_OUT
 from calibration.discovery.verdict import VerdictNoise
 from calibration.inference.fit_notes import progress_remark
@@ -131,9 +132,8 @@ def _search_effects(
     given: LoopInput, screened: Screening, left: Diagnosis
 ) -> tuple[Screening, Diagnosis, SearchResult]:
     """Searches for effects that explain the residuals of the base fit."""
-    base = screened.base
-    searched = search.search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
-    return screened, left, searched
+    space, base = screened.base.space, screened.base.candidate
+    return screened, left, search.search_effects(space, base, left, screened.bases, given.settings, given.progress)
 
 
 def end_without_search(
@@ -171,36 +171,35 @@ def curve_of_base(given: LoopInput, screened: Screening, left: Diagnosis) -> Bas
 
 def check_described(
     given: LoopInput,
-    screened: Screening,
-    left: Diagnosis,
     sds: VerdictNoise,
     searched: SearchResult,
-    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    chosen: Proposed | None,
     beside: BaseCurve,
     predicted: prediction.Predicted,
+    screened: Screening,
 ) -> tuple[loop_notes.MissedChannel, ...] | verdict.LoopStages:
     """Channels that the refit misses but effects describe. Ends the loop if no set of effects describes the runs."""
-    runs, space = given.runs, screened.base.space
+    runs, space, left = given.runs, beside.space, beside.left
     missed = verdict.missed_channels(space, runs, sds.noise, left.linear)
     if not missed:
         return ()
     given.progress(progress_remark("held out"))
-    refit = prediction.cached_hold_out_score(space, runs, screened.base.candidate, predicted)
-    sets = (chosen[0] if chosen else None, searched.best, *search.best_of_each_size(searched))
+    refit = prediction.cached_hold_out_score(space, runs, beside.base, predicted)
+    sets = (chosen and chosen[0], searched.best, *search.best_of_each_size(searched))
     for fit in {c.key: c for c in sets if c}.values():
         with_effects = prediction.cached_hold_out_score(space, runs, fit, predicted)
         if leaves := verdict.remaining_errors(space, runs, missed, refit, with_effects):
             return leaves
-    unused = verdict.unused_inputs(runs)
     return verdict.LoopStages(
-        "undescribed", screened, left, sds, searched, beside=beside, predicted=predicted, missed=missed, unused=unused
-    )
+        "undescribed", screened, left, sds, searched, beside=beside, predicted=predicted, missed=missed,
+        unused=verdict.unused_inputs(runs),
+    )  # fmt: skip
 
 
 def trace_mechanism(
     given: LoopInput,
     searched: SearchResult,
-    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    chosen: Proposed | None,
     standing: loop_notes.NameSupport,
     beside: BaseCurve,
     predicted: prediction.Predicted,
@@ -210,65 +209,49 @@ def trace_mechanism(
         return None
     given.progress(progress_remark("mechanism"))
     ladder = [*searched.ladder, *([] if chosen is None else chosen[:1])]
-    return find_mechanism(beside, given.runs, ladder, predicted, given.settings)
-
-
-def _location(given: LoopInput, beside: BaseCurve) -> DiscrepancyLocation:
-    return dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))
+    return find_mechanism(beside, given.runs, ladder, predicted)
 
 
 def find_alternatives(
-    given: LoopInput,
-    screened: Screening,
-    left: Diagnosis,
-    searched: SearchResult,
-    chosen: tuple[candidates.Candidate, Diagnosis] | None,
+    given: LoopInput, searched: SearchResult, chosen: Proposed | None, beside: BaseCurve
 ) -> tuple[SearchResult, classes.Classes | None]:
     """The search with the chosen effects, and the alternatives to each of them. None without effects."""
     if chosen is None:
         return searched, None
-    searched, base = dataclasses.replace(searched, best=chosen[0], diagnosis=chosen[1]), screened.base
-    given.progress(progress_remark("alike", chosen[0].effects))
-    alike = classes.find_classes(
-        base.space, base.candidate, chosen[0], searched.ladder, left, chosen[1], given.settings
-    )
-    return searched, alike
+    best, after = chosen
+    given.progress(progress_remark("alike", best.effects))
+    alike = classes.find_classes(beside, best, searched.ladder, after)
+    return dataclasses.replace(searched, best=best, diagnosis=after), alike
 
 
 def reach_verdict(
     given: LoopInput,
-    screened: Screening,
     searched: SearchResult,
+    chosen: Proposed | None,
     alike: classes.Classes | None,
     standing: loop_notes.NameSupport,
     beside: BaseCurve,
     mechanism: loop_notes.Mechanism | None,
-) -> tuple[
-    str,
-    SearchResult,
-    classes.Classes | None,
-    loop_notes.NameSupport,
-    DiscrepancyLocation | None,
-    tuple[prediction.HeldOutAlternative, ...],
-]:
-    """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects."""
-    best, after, space, settings = searched.best, searched.diagnosis, screened.base.space, given.settings
-    named = [] if alike is None or best is None else [standing.established(e) for e in best.effects]
-    if alike is None or best is None or after is None or not any(named):
+) -> dict[str, Any]:
+    """Verdict: effects, classes of effects, a mechanism, or a place. Hold-out errors may choose leading effects.
+
+    Returns the changed results by their names in `LoopStages`.
+    """
+    named = [] if chosen is None else [standing.established(e) for e in chosen[0].effects]
+    if chosen is None or alike is None or not any(named):
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
-        return level, searched, alike, standing, _location(given, beside), ()
-    compared: tuple[prediction.HeldOutAlternative, ...] = ()
-    if settings.prefer == HELD_OUT:
+        return {"verdict": level, "where": dataclasses.replace(beside.where, by_duty=varied_by_duty(given.runs))}
+    (best, after), changed = chosen, dict[str, Any]()
+    if given.settings.prefer == HELD_OUT:
         given.progress(progress_remark("held out"))
-        searched, alike, compared = preference.prefer_by_held_out(
-            space, given.runs, searched, alike, screened.bases, settings
-        )
-        after = searched.diagnosis or after
-        standing = standing.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
+        leading, after, alike, held_out = preference.prefer_by_held_out(beside, given.runs, best, after, alike)
+        changed = {
+            "searched": dataclasses.replace(searched, best=leading, diagnosis=after),
+            "alike": alike,
+            "standing": standing.with_leaders(dict(zip(best.active, leading.active, strict=True))),
+            "held_out": held_out,
+        }
+    if after.test.rejected_with_margin:
+        changed["where"] = discrepancy.locate_discrepancy(after, beside.bases, beside.space.included)
     alone = all(one for one, name in zip(alike.alone, named, strict=True) if name)
-    remains = (
-        discrepancy.locate_discrepancy(after, screened.bases, space.included)
-        if after.test.rejected_with_margin
-        else None
-    )
-    return "named" if alone else "class", searched, alike, standing, remains, compared
+    return {"verdict": "named" if alone else "class", **changed}

@@ -17,16 +17,16 @@ from statistics import NormalDist
 import numpy as np
 
 from calibration.data import Names
-from calibration.discovery import score_tests, smooth
+from calibration.discovery import smooth
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import remove_effect
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
-from calibration.discovery.projection import Projection, projection_factor
-from calibration.discovery.score_tests import family_columns, statistics_with_columns
-from calibration.discovery.search import SearchResult, diagnose_candidate, refit_without_each
+from calibration.discovery.projection import Projection
+from calibration.discovery.score_tests import augment_with_columns, family_columns, statistics_with_columns
+from calibration.discovery.search import Proposed, SearchResult, diagnose_candidate, refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -53,15 +53,10 @@ def equation_of_place(place: str) -> str:
 
 
 def judge_names(
-    space: CandidateSpace,
-    base: Candidate,
+    beside: BaseCurve,
     searched: SearchResult,
-    left: Diagnosis,
-    bases: Bases,
-    settings: Settings,
     proposed: Proposed | None = None,
     blocks: Sequence[np.ndarray] = (),
-    beside: BaseCurve | None = None,
 ) -> NameSupport:
     """Tests which effects of a candidate may be named: of the best candidate of a search, or of a given proposal.
 
@@ -69,86 +64,79 @@ def judge_names(
     Then each effect is tested on its own (`judge_each_name`).
 
     Args:
-        left: diagnosis of the base fit.
+        beside: the base fit, its diagnosis and the smooth curve of its discrepancy.
+        proposed: a candidate instead of the search's best, and its diagnosis.
         blocks: mask of the rows of each block that is left out in turn, shape (rows,).
-        beside: smooth curve of the base's discrepancy, if it is computed already.
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
         return NameSupport(False, "implausible")
-    better = _better_but_implausible(space, base, searched.best or best, searched.ladder, settings)
+    better = _better_but_implausible(beside, searched.best or best, searched.ladder)
     adequate = not after.test.rejected_with_margin
     if len(best.effects) == 1 and adequate and better:
         return NameSupport(False, "larger", better[0].effects)
-    if adequate:
-        support = _compare_with_curves(space, base, best, left.linear, bases, settings)
-    else:
-        beside = BaseCurve(space, base, left, bases) if beside is None else beside
-        support = _compare_with_single_curve(space, best, left, bases, settings, beside)
-    fits = dataclasses.replace(searched, ladder=(base, *searched.ladder))
-    tests = judge_each_name(space, best, fits, bases, after, settings, blocks, better)
+    support = _compare_with_curves(beside, best) if adequate else _compare_with_single_curve(beside, best)
+    fits = dataclasses.replace(searched, ladder=(beside.base, *searched.ladder))
+    tests = judge_each_name(beside, best, fits, after, blocks, better)
     if support.stands:
-        support = NameSupport(any(t.established for t in tests))
-        support = dataclasses.replace(support, why="beside" if support.stands else "none by itself")
+        stands = any(t.established for t in tests)
+        support = NameSupport(stands, "beside" if stands else "none by itself")
     return dataclasses.replace(support, tests=tests)
 
 
-def _better_but_implausible(
-    space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
-) -> list[Candidate]:
+def _better_but_implausible(beside: BaseCurve, best: Candidate, ladder: Sequence[Candidate]) -> list[Candidate]:
     """Candidates with more evidence that only their size excludes, the best first."""
-    names = evidence_of_names(space, base, best, settings)
-    fits = [c for c in ladder if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
-    ruled_out = [c for c in fits if not c.plausible]
-    evidence = {c.active: evidence_of_names(space, base, c, settings) for c in ruled_out}
-    better = [c for c in ruled_out if evidence[c.active] > names + settings.preferred]
-    return sorted(better, key=lambda c: -evidence[c.active])
+    least = evidence_of_names(beside.space, beside.base, best) + beside.settings.preferred
+    evidence = {
+        c.active: (evidence_of_names(beside.space, beside.base, c), c)
+        for c in ladder
+        if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects) and not c.plausible
+    }
+    better = [(e, c) for e, c in evidence.values() if e > least]
+    return [c for _, c in sorted(better, key=lambda pair: -pair[0])]
 
 
 # --- an adequate fit: is a curve the better explanation? ---------------------------------------------------
 
 
-def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) -> float:
+def cost_of_names(space: CandidateSpace, best: Candidate) -> float:
     """Penalty on the decrease of χ² by a set of effects [σ²], for its free parameters and for the number of sets of
     its size.
 
     The prior of an amplitude has the size of greatest evidence, as for a curve.
     """
-    slots = [slot for slot, name in enumerate(best.active) if name]
-    sets = 2 * math.log(math.comb(len(space.library), len(slots)))
-    return sum(_cost_of_effect(space, best, slot, settings) for slot in slots) + sets
+    sets = 2 * math.log(math.comb(len(space.library), len(best.effects)))
+    return sum(_cost_of_effect(space, best, effect) for effect in best.effects) + sets
 
 
-def _cost_of_effect(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> float:
+def _cost_of_effect(space: CandidateSpace, best: Candidate, effect: str) -> float:
     """Penalty for the free amplitude and shape of one effect [σ²]."""
-    sds = np.clip(np.asarray(best.sd), 1e-6, 1.0)
-    k = space.free + slot
-    amplitude = min(-2 * math.log(sds[k]), 1 + math.log1p((float(best.z[k]) / sds[k]) ** 2))
-    return float(amplitude - 2 * math.log(sds[k + settings.slots]))
+    k = space.free + best.active.index(effect)
+    of_amplitude, of_shape = np.clip(np.asarray(best.sd)[[k, k + len(best.active)]], 1e-6, 1.0)
+    amplitude = min(-2 * math.log(of_amplitude), 1 + math.log1p((float(best.z[k]) / of_amplitude) ** 2))
+    return float(amplitude - 2 * math.log(of_shape))
 
 
-def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:
+def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate) -> float:
     """Twice the log evidence for a set of effects against no effects [σ²]."""
-    return 2 * (base.cost - best.cost) - cost_of_names(space, best, settings)
+    return 2 * (base.cost - best.cost) - cost_of_names(space, best)
 
 
-def _compare_with_curves(
-    space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
-) -> NameSupport:
+def _compare_with_curves(beside: BaseCurve, best: Candidate) -> NameSupport:
     """Compares names with one smooth curve: of one variable anywhere, or of two variables in a balance with several
     names.
     """
-    equations = [equation_of_place(space.library[e].channel or space.library[e].balance) for e in best.effects]
+    space, bases, linear = beside.space, beside.bases, beside.left.linear
+    equations = [_equation_of_effect(space, effect) for effect in best.effects]
     places = {place for place, _ in bases_room.family_names(bases)}
-    crowded = {e for e in equations if equations.count(e) > 1 and e in places}
-    curves = _curve_evidence(space, linear, bases, crowded)
+    curves = _curve_evidence(space, linear, bases, {e for e in places if equations.count(e) > 1})
     if not curves:
         return NameSupport(True)
     curve, best_place = max(curves)
     # Curves are linear at the base, so names get the better of their fit and of their linear gain there.
-    fall = max(2 * (base.cost - best.cost), _linear_explanation(space, best, linear, settings))
-    names = fall - cost_of_names(space, best, settings)
-    if curve - 2 * math.log(len(curves)) > names + settings.preferred:
+    fall = max(2 * (beside.base.cost - best.cost), _linear_explanation(space, best, linear))
+    names = fall - cost_of_names(space, best)
+    if curve - 2 * math.log(len(curves)) > names + beside.settings.preferred:
         return NameSupport(False, "better curve", best.effects, (best_place,))
     return NameSupport(True)
 
@@ -163,26 +151,22 @@ def _curve_evidence(
         equation: only curves in its places. Empty: in all.
     """
     included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
+    variables = {variable for _, variable in offered}
     known_curves = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
-        if any(v == variables for _, variables in offered) and _variable_varies(linear, v, included)
+        if v in variables and _variable_varies(linear, v, included)
     ]
     curves = []
     for place, variable in offered:
         if variable in known_curves and (not equation or equation_of_place(place) == equation):
             curve = smooth.fit_smooth_curve(linear, place, variable, included)
             curves.append((curve.evidence, PlacedCurve(place, (variable,))))
-    project = Projection(linear)
-    for place in sorted(crowded):
-        for pair in itertools.combinations([v for v in VARIABLES if v in known_curves], 2):
-            evidence, _ = smooth.fit_smooth_surface(linear, place, pair, included, project)
-            curves.append((evidence, PlacedCurve(place, pair)))
+    project, varied = Projection.of(linear), [v for v in VARIABLES if v in known_curves]
+    for place, pair in itertools.product(sorted(crowded), itertools.combinations(varied, 2)):
+        evidence, _ = smooth.fit_smooth_surface(linear, place, pair, included, project)
+        curves.append((evidence, PlacedCurve(place, pair)))
     return curves
-
-
-def _curve_of_variable(place: str, variable: str) -> PlacedCurve:
-    return PlacedCurve(place, (variable,))
 
 
 def _variable_varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
@@ -190,60 +174,50 @@ def _variable_varies(linear: Linearization, variable: str, included: np.ndarray)
     return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
 
 
-def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Linearization, settings: Settings) -> float:
+def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Linearization) -> float:
     """Decrease of χ² by the effects of a candidate, to first order at the base fit and at their nearest grid shapes
     [σ²].
     """
-    p, s = space.free, settings.slots
-    chosen_places = []
+    shapes, library, nearest = best.z[space.free + len(best.active) :], space.library, []
     for slot, name in enumerate(best.active):
         if name:
-            instances = np.flatnonzero(space.library.of == space.library.names.index(name))
-            chosen_places.append(
-                int(instances[np.argmin(np.abs(space.library.at[instances] - best.z[p + s + slot]))])
-            )
-    a, b = Projection(linear)(np.asarray(linear.signatures)[:, chosen_places])
-    return float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0])
+            instances = library.instances(name)
+            nearest.append(instances[np.argmin(np.abs(library.at[instances] - shapes[slot]))])
+    return Projection.of(linear).explained(np.asarray(linear.signatures)[:, nearest])[0]
 
 
 # --- a fit that is not adequate: do the names keep their significance? -------------------------------------
-
-
-#: A candidate instead of a search's best, and its diagnosis.
-Proposed = tuple[Candidate, Diagnosis]
 
 
 def _equation_of_effect(space: CandidateSpace, effect: str) -> str:
     return equation_of_place(space.library[effect].channel or space.library[effect].balance)
 
 
-def _compare_with_single_curve(
-    space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: BaseCurve
-) -> NameSupport:
+def _compare_with_single_curve(beside: BaseCurve, best: Candidate) -> NameSupport:
     """Tests if a single smooth curve fits the data where the effects of a candidate do not."""
+    left, bases = beside.left, beside.bases
     names = bases_room.family_names(bases)
     strongest: dict[str, int] = {}  # family of each place, the most significant place first
     for index in np.argsort(-np.asarray(left.scores.curve)):
         strongest.setdefault(names[index][0], int(index))
-    for k in list(strongest.values())[:ALONE]:
-        statistics, _ = statistics_with_columns(
-            left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]]
-        )
-        if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
-    location = beside.where
-    place = equation_of_place(location.place)
+    for place, k in itertools.islice(strongest.items(), ALONE):
+        columns = family_columns(left.linear, bases, k)
+        statistics, _ = statistics_with_columns(left.linear, bases, columns, [place])
+        if not left.test.of(statistics).rejected_with_margin:
+            return NameSupport(False, "curve alone", curves=(PlacedCurve(place, names[k][1:]),))
+    location, space = beside.where, beside.space
+    equations = {_equation_of_effect(space, effect) for effect in best.effects}
     # Linear rows of logs have no fit of a curve.
-    if not space.bare.observe.over_time and place in {_equation_of_effect(space, e) for e in best.effects}:
+    if not space.bare.observe.over_time and equation_of_place(location.place) in equations:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_curve_of_variable(location.place, location.variable),))
+            return NameSupport(False, "curve alone", curves=(PlacedCurve(location.place, (location.variable,)),))
     return NameSupport(True)
 
 
-def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str, settings: Settings) -> list[int]:
+def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str) -> list[int]:
     """Families of curves outside an equation, the most significant first, until the residuals are noise or `CURVES`
     are added.
     """
@@ -255,17 +229,15 @@ def _strongest_curves(seen: Diagnosis, bases: Bases, equation: str, settings: Se
         chosen_curves.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen_curves[-1])], 1)
         statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen_curves])
-        test = AdequacyTest(statistics, seen.test.null, settings)
+        test = test.of(statistics)
     return chosen_curves
 
 
 def judge_each_name(
-    space: CandidateSpace,
+    beside: BaseCurve,
     best: Candidate,
     searched: SearchResult,
-    bases: Bases,
     after: Diagnosis,
-    settings: Settings,
     blocks: Sequence[np.ndarray],
     better: Sequence[Candidate],
 ) -> tuple[NameTest, ...]:
@@ -285,6 +257,7 @@ def judge_each_name(
         blocks: as in `judge_names`.
         better: candidates that are the better explanation but not of a plausible size.
     """
+    space, bases, settings = beside.space, beside.bases, beside.settings
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
     over_time = space.bare.observe.over_time
     most = searched.diagnosis or after
@@ -292,43 +265,35 @@ def judge_each_name(
     fewer = dict(zip(largest.effects, refit_without_each(space, largest, settings, searched.ladder), strict=True))
     without_effect = refit_without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*without_effect, *(c for e, c in fewer.items() if e in best.effects))}
-    linearizations = {
-        name_set: diagnose_candidate(space, c, bases, after.test.null, settings).linear
-        for name_set, c in fits.items()
-    }
+    linearizations = {active: diagnose_candidate(space, c, bases, after).linear for active, c in fits.items()}
     for effect, without in zip(best.effects, without_effect, strict=True):
-        equation = _equation_of_effect(space, effect)
-        linear = linearizations[without.active]
-        chosen_curves = _strongest_curves(after, bases, equation, settings)
-        beside = _augment_with_curves(space, linear, bases, chosen_curves, effect)
-        promised = _largest_root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
-        judged, signatures = beside, linear.signatures
-        if promised < PROMISED * 2 * (without.cost - best.cost):
-            judged = _restore_effect(
-                space, best, effect, _augment_with_curves(space, after.linear, bases, chosen_curves, effect)
-            )
-            signatures = after.linear.signatures
+        equation, linear = _equation_of_effect(space, effect), linearizations[without.active]
+        curves = _strongest_curves(after, bases, equation)
+        fit, columns = _with_curves(linear, bases, curves), space.library.columns(effect, linear)
+        root = float(fit.roots(columns).max())
+        judged, at = fit, linear
+        if root**2 < PROMISED * 2 * (without.cost - best.cost):
+            at = after.linear
+            judged = remove_effect(space, best, effect, _with_curves(at, bases, curves))
         row, root_without, changed, root_changed = None, math.inf, "", 0.0
         if over_time:
-            row, changed, root_changed = changed_run(space, linear, bases, *beside[:2])
+            row, changed, root_changed = changed_run(space, linear, bases, fit)
         else:
-            row, root_without = _most_influential_row(space, *beside)
+            row, root_without = _most_influential_row(space, fit, columns)
         full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
+        evidence = evidence_over_curves(beside, full_fit, other_fit, (effect,), linearizations[other_fit.active])
+        families = (space.library[effect].family(),)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
             NameTest(
                 effect,
-                _largest_root(*beside),
+                root,
                 after.test.threshold("single") + over_time * settings.margins["single"],
-                tuple(_curve_of_variable(*names[k]) for k in chosen_curves),
-                evidence_over_curves(
-                    space, full_fit, other_fit, (effect,), linearizations[other_fit.active], bases, settings
-                ),
+                tuple(PlacedCurve(names[k][0], names[k][1:]) for k in curves),
+                evidence,
                 row,
                 root_without,
-                _recurrence(
-                    space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
-                ),
+                _recurrence(space, families, judged, space.library.columns(effect, at), at, blocks, settings),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
                 *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
@@ -347,11 +312,10 @@ def _relative_zero_error(space: CandidateSpace, best: Candidate, effect: str, se
     kind = space.library[effect]
     if kind.channel not in settings.silent or not getattr(kind, "of_zero", False):
         return math.inf
-    measured_values = np.asarray(space.bare.data.measured)[
-        :, [c.name for c in space.bare.channels].index(kind.channel)
-    ]
+    k = [c.name for c in space.bare.channels].index(kind.channel)
+    measured = np.asarray(space.bare.data.measured)[space.included, k]
     amplitude = abs(float(best.amplitude[best.active.index(effect)])) * amplitude_of(kind).spec.prior_sd(0.0)
-    return amplitude / max(float(np.sqrt(np.nanmean(measured_values[space.included] ** 2))), 1e-300)
+    return amplitude / max(float(np.sqrt(np.nanmean(measured**2))), 1e-300)
 
 
 def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
@@ -384,30 +348,22 @@ def _largest_variation(
     most = 0.0, "", math.inf
     if space.bare.observe.over_time:
         return *most[:2], math.inf, math.inf
-    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    slot = space.free + best.active.index(effect)
-    of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
+    fit, slot = Projection.of(linear), space.free + best.active.index(effect)
+    of_row = fit.jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _variable_varies(linear, v, space.included)]
     for variable in variables:
         values = linear.curve_variable(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        projected_residual, scores = _projected_columns(jacobian, residual, changed)
-        for k, root in enumerate(_score_roots(jacobian, residual, changed)):
-            spread = abs(scores[k] / max(projected_residual[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
+        for root, norm2, score in zip(fit.roots(changed), *fit.norms(changed), strict=True):
+            spread = abs(score / max(norm2, 1e-300) / best.z[slot]) if best.z[slot] else math.inf
             most = max(most, (float(root), variable, float(spread)))
     chance = NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
     return *most[:2], chance, most[2]
 
 
 def evidence_over_curves(
-    space: CandidateSpace,
-    best: Candidate,
-    without: Candidate,
-    effects: Names,
-    linear: Linearization,
-    bases: Bases,
-    settings: Settings,
+    beside: BaseCurve, best: Candidate, without: Candidate, effects: Names, linear: Linearization
 ) -> float:
     """Twice the log Bayes factor of effects of one equation over the best smooth curve in it [σ²].
 
@@ -418,97 +374,44 @@ def evidence_over_curves(
         without: the same candidate without them.
         linear: linearization at `without`.
     """
+    space = beside.space
     equation = _equation_of_effect(space, effects[0])
     offered = sum(_equation_of_effect(space, name) == equation for name in space.library.names)
-    cost = sum(
-        _cost_of_effect(space, best, best.active.index(name), settings) + 2 * math.log(offered) for name in effects
-    )
-    same_equation = [evidence for evidence, _ in _curve_evidence(space, linear, bases, set(), equation)]
-    return (
-        2 * (without.cost - best.cost)
-        - cost
-        - max(same_equation, default=-math.inf)
-        + 2 * math.log(max(len(same_equation), 1))
-    )
+    cost = sum(_cost_of_effect(space, best, name) + 2 * math.log(offered) for name in effects)
+    same_equation = [evidence for evidence, _ in _curve_evidence(space, linear, beside.bases, set(), equation)]
+    by_curve = max(same_equation, default=-math.inf) - 2 * math.log(max(len(same_equation), 1))
+    return 2 * (without.cost - best.cost) - cost - by_curve
 
 
-def _largest_root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
-    """Largest square root of the scores of several columns, with the free parameters refitted [σ]."""
-    return float(np.max(_score_roots(jacobian, residual, signatures)))
-
-
-def _score_roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
-    """Square root of the score of each column [σ]. 0 for columns that the free parameters can imitate."""
-    return _roots(*_projected_columns(jacobian, residual, signatures), np.sum(signatures**2, 0))
-
-
-def _roots(left: np.ndarray, scores: np.ndarray, norm2: np.ndarray) -> np.ndarray:
-    """Square roots of scores from the squared norms after and before projection [σ]."""
-    return np.where(left > score_tests.ABSORBED**2 * norm2, np.abs(scores) / np.sqrt(np.maximum(left, 1e-12)), 0.0)
-
-
-def _projected_columns(
-    jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Squared norm of each column after projection, and its product with the residual."""
-    half = projection_factor(jacobian)
-    projected_residual, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
-    return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ projected_residual[: len(signatures)]
-
-
-def _augment_with_curves(
-    space: CandidateSpace, linear: Linearization, bases: Bases, curves: Sequence[int], effect: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobian and residual of a fit with additional families of curves, and the sensitivities to one effect."""
+def _with_curves(linear: Linearization, bases: Bases, curves: Sequence[int]) -> Projection:
+    """Projection at a fit with additional families of curves."""
     columns = [np.zeros((linear.readings, 0)), *(family_columns(linear, bases, k) for k in curves)]
-    own_columns = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
-    return *score_tests.augment_with_columns(linear, np.concatenate(columns, 1)), own_columns
-
-
-def _restore_effect(
-    space: CandidateSpace, best: Candidate, effect: str, beside: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The arrays of `_augment_with_curves` for a fit with the effect, with the effect's own contribution restored to
-    the residual.
-
-    If the effect explains much, the fit without it may be so far off that its linearization predicts nothing
-    reliable.
-    """
-    jacobian, residual, signatures = beside
-    return *remove_effect(space, best, best.active.index(effect), jacobian, residual), signatures
+    return Projection(*augment_with_columns(linear, np.concatenate(columns, 1)))
 
 
 def recurrence_of_families(
-    space: CandidateSpace,
-    base: Candidate,
-    best: Candidate,
-    left: Diagnosis,
-    families: Sequence[str],
-    bases: Bases,
-    blocks: Sequence[np.ndarray],
-    settings: Settings,
+    beside: BaseCurve, best: Candidate, families: Sequence[str], blocks: Sequence[np.ndarray]
 ) -> float:
     """Share of the informative blocks for which, without the block, an effect of these families still explains most.
 
     A block is informative if half of the information on the candidate's first effect remains without it. 1 if there
     is none.
-
-    Args:
-        left: diagnosis of the base fit.
     """
-    effect, linear = best.effects[0], left.linear
-    judged = _augment_with_curves(space, linear, bases, (), effect)
-    if _largest_root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
-        linear = diagnose_candidate(space, best, bases, left.test.null, settings).linear
-        judged = _restore_effect(space, best, effect, _augment_with_curves(space, linear, bases, (), effect))
-    return _recurrence(space, families, judged, np.asarray(linear.signatures), blocks, settings)
+    space, effect, linear = beside.space, best.effects[0], beside.left.linear
+    fit = Projection.of(linear)
+    if fit.roots(space.library.columns(effect, linear)).max() ** 2 < PROMISED * 2 * (beside.base.cost - best.cost):
+        linear = diagnose_candidate(space, best, beside.bases, beside.left).linear
+        fit = remove_effect(space, best, effect, Projection.of(linear))
+    columns = space.library.columns(effect, linear)
+    return _recurrence(space, families, fit, columns, linear, blocks, beside.settings)
 
 
 def _recurrence(
     space: CandidateSpace,
     families: Sequence[str],
-    beside: tuple[np.ndarray, ...],
-    signatures: np.ndarray,
+    fit: Projection,
+    columns: np.ndarray,
+    linear: Linearization,
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
@@ -517,44 +420,42 @@ def _recurrence(
     The criterion is that of `classes`. A block is informative if half of the information on the effect remains
     without it. 1 if there is none.
 
+    If an effect explains much, the fit without it may be so far off that its linearization predicts nothing reliable.
+    Then `fit` is the fit with the effect, to first order without it.
+
     Args:
-        beside: Jacobian, residual and the effect's own sensitivities, as for `_largest_root`.
-        signatures: sensitivities to all effects of the library.
+        columns: sensitivities to the effect.
+        linear: linearization with the sensitivities to all effects of the library.
     """
-    library, chosen_effects = space.library, []
+    library, chosen_effects, signatures = space.library, [], np.asarray(linear.signatures)
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
-    best_score = _projected_columns(*beside)[0].max()
+    best_score = fit.norms(columns)[0].max()
     for out in blocks:
         kept = kept_readings(space, out, len(signatures))
-        kept_signatures = signatures[kept]
-        j, e, kept_parts = _restrict_readings(kept, *beside)
-        if _projected_columns(j, e, kept_parts)[0].max() < 0.5 * best_score:
+        without = fit.only(kept)
+        if without.norms(columns[kept])[0].max() < 0.5 * best_score:
             continue
-        roots = _score_roots(j, e, kept_signatures)
+        roots = without.roots(signatures[kept])
         most = np.max(roots) ** 2
         chosen_effects.append(np.max(roots[akin]) ** 2 >= most - settings.tolerance(most))
     return float(np.mean(chosen_effects)) if chosen_effects else 1.0
 
 
-def _most_influential_row(
-    space: CandidateSpace, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
-) -> tuple[int | None, float]:
-    """Number of the row whose omission reduces the root most, and the root without it. None for fewer than three
-    rows.
+def _most_influential_row(space: CandidateSpace, fit: Projection, columns: np.ndarray) -> tuple[int | None, float]:
+    """Number of the row whose omission reduces the largest root most, and the root without it. None for fewer than
+    three rows.
     """
     least: tuple[int | None, float] = None, math.inf
     rows = np.flatnonzero(space.included)
     for row in rows if len(rows) > 2 else ():
-        out = np.arange(len(space.included)) == row
-        root = _largest_root(
-            *_restrict_readings(kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
-        )
+        kept = kept_readings(space, np.arange(len(space.included)) == row, len(columns))
+        root = float(fit.only(kept).roots(columns[kept]).max())
         least = (int(row) + 1, root) if root < least[1] else least
     return least
 
 
 def changed_run(
-    space: CandidateSpace, linear: Linearization, bases: Bases, jacobian: np.ndarray, residual: np.ndarray
+    space: CandidateSpace, linear: Linearization, bases: Bases, fit: Projection
 ) -> tuple[int | None, str, float]:
     """Run, constant and root of the best explanation by one constant that differs in one run. None for one run.
 
@@ -568,18 +469,13 @@ def changed_run(
             columns.append(family_columns(linear, bases, k)[:, :1])
             names += [place] * columns[-1].shape[1]  # none if the readings do not show the place
     constants = np.concatenate(columns, 1)
-    half = projection_factor(jacobian)
-    projected_residual = residual - half.T @ (half @ residual)
     best: tuple[int | None, str, float] = None, "", 0.0
     runs = [(k, rows) for k, rows in enumerate(linear.runs()) if space.included[rows].any()]
     for k, rows in runs if len(runs) > 1 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
         inside = np.flatnonzero(~kept_readings(space, out, readings))
-        of_run = constants[inside]
-        norm2, scores = np.sum(of_run**2, 0), of_run.T @ projected_residual[inside]
-        left = norm2 - np.sum((half[:, inside] @ of_run) ** 2, 0)
-        roots = _roots(left, scores, norm2)
+        roots = fit.roots(constants[inside], inside)
         if roots.max() > best[2]:
             best = k + 1, names[int(np.argmax(roots))], float(roots.max())
     return best
@@ -589,11 +485,3 @@ def kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.n
     """True for readings that remain after some rows are left out, including padding, shape (readings,)."""
     rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
     return np.repeat(~rows, readings // len(rows))
-
-
-def _restrict_readings(
-    kept: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobian, residual and sensitivities, restricted to the remaining readings. Residuals of priors are kept."""
-    kept_residuals = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
-    return jacobian[kept_residuals], residual[kept_residuals], signatures[kept]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.runs import Runs
-from calibration.discovery import loop_notes
+from calibration.discovery import loop_notes, search
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate
@@ -21,7 +22,6 @@ from calibration.discovery.log_simulation import LogSimulation
 from calibration.discovery.loop_notes import Headline, VerdictSummary
 from calibration.discovery.outliers import Screening
 from calibration.discovery.prediction import HeldOutAlternative, HeldOutScore, Predicted
-from calibration.discovery.search import SearchResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import checks as unused_room
 from calibration.inference.fit_notes import Remark
@@ -84,7 +84,7 @@ class LoopStages:
     screened: Screening = PENDING
     left: Diagnosis = PENDING
     sds: VerdictNoise = PENDING
-    searched: SearchResult | None = None
+    searched: search.SearchResult | None = None
     alike: Classes | None = None
     where: DiscrepancyLocation | None = None
     standing: loop_notes.NameSupport | None = None
@@ -97,28 +97,25 @@ class LoopStages:
     run: LogSimulation | None = None
     settled: bool = False
     begin: Candidate | None = None
-    chosen: tuple[Candidate, Diagnosis] | None = None
+    chosen: search.Proposed | None = None
 
     @property
     def members(self) -> tuple[Names, ...]:
         """For each established effect, the effect and those that the data cannot separate from it."""
-        return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
-
-    @property
-    def _classes(self) -> tuple[Names, ...]:
-        return () if self.alike is None else self.alike.members
+        classes = () if self.alike is None else self.alike.members
+        return tuple(itertools.compress(classes, self._named))
 
     @property
     def _named(self) -> list[bool]:
-        return [self.standing is None or self.standing.established(m[0]) for m in self._classes]
+        """For each class of effects, True if its leading effect is established."""
+        classes = () if self.alike is None else self.alike.members
+        return [self.standing is None or self.standing.established(m[0]) for m in classes]
 
     @property
     def families(self) -> Names:
         """Families of the members of each established class, or of the location of a discrepancy without a name."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
-            return tuple(
-                f for members, name in zip(self.alike.families, self._named, strict=True) if name for f in members
-            )
+            return tuple(itertools.chain(*itertools.compress(self.alike.families, self._named)))
         if self.verdict == "mechanism" and self.mechanism is not None:
             return self.mechanism.families
         return () if self.where is None else (self.where.family,)
@@ -223,11 +220,9 @@ def _verdict_without_claim(said: VerdictSummary) -> str:
 def _claimed_families(said: VerdictSummary) -> list[Names]:
     """Families of each established law or mechanism."""
     families = [m.families for m in said.missing if m.established]
-    return (
-        [*families, said.mechanism.families]
-        if said.verdict == "mechanism" and said.mechanism is not None
-        else families
-    )
+    if said.verdict == "mechanism" and said.mechanism is not None:
+        families.append(said.mechanism.families)
+    return families
 
 
 def _claimed_equations(said: VerdictSummary) -> list[Names]:

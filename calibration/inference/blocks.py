@@ -128,15 +128,11 @@ def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Colu
     """Kind → blocks, for the kinds that the data have. A kind that divides the rows as an earlier one does is
     omitted.
     """
-    blocks: dict[str, Columns] = {}
-    divided = []
+    by_parts: dict[frozenset[bytes], tuple[str, Columns]] = {}
     for kind in kinds:
-        blocks_by_name = blocks_of_kind(runs, kind)
-        parts = {m.tobytes() for m in blocks_by_name.values()}
-        if parts not in divided:
-            divided.append(parts)
-            blocks[kind] = blocks_by_name
-    return {kind: blocks_by_name for kind, blocks_by_name in blocks.items() if blocks_by_name}
+        blocks = blocks_of_kind(runs, kind)
+        by_parts.setdefault(frozenset(m.tobytes() for m in blocks.values()), (kind, blocks))
+    return {kind: blocks for kind, blocks in by_parts.values() if blocks}
 
 
 def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
@@ -150,24 +146,17 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
     for follower, k, _ in coordinates.tied:
         informs[k].add(_configuration_of_parameter(follower, names))
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
-    kinds = {
-        kind: {
-            label: m for label, m in blocks_by_name.items() if not any(m[block_rows].all() for block_rows in owned)
-        }
-        for kind, blocks_by_name in distinct_held_out_blocks(runs, problem.observe.blocks).items()
-    }
-    return {kind: blocks_by_name for kind, blocks_by_name in kinds.items() if blocks_by_name}
+    kinds = {}
+    for kind, blocks in distinct_held_out_blocks(runs, problem.observe.blocks).items():
+        kinds[kind] = {label: m for label, m in blocks.items() if not any(m[rows].all() for rows in owned)}
+    return {kind: blocks for kind, blocks in kinds.items() if blocks}
 
 
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
-    all_blocks, predictable = (
-        distinct_held_out_blocks(runs, problem.observe.blocks),
-        predictable_blocks(runs, problem),
-    )
-    return tuple(
-        kind for kind, blocks_by_name in all_blocks.items() if len(predictable.get(kind, {})) < len(blocks_by_name)
-    )
+    predictable = predictable_blocks(runs, problem)
+    every = distinct_held_out_blocks(runs, problem.observe.blocks)
+    return tuple(kind for kind, blocks in every.items() if len(predictable.get(kind, {})) < len(blocks))
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:

@@ -33,7 +33,6 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from calibration.data import Columns
 from calibration.inference import linearization
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
@@ -440,7 +439,7 @@ def fit_delay(problem: Problem, plan: StatePlan) -> float:
     z, centre = np.zeros(len(problem.coordinates)), np.asarray(problem.data.centre)
     prompt = course.at(0.0)[0]
 
-    def terms_with(imposed: Columns) -> np.ndarray:
+    def terms_with(imposed: dict[str, np.ndarray]) -> np.ndarray:
         """Terms at z with other imposed quantities, which do not depend on a delay."""
         conditions = rows.conditions
         for name, x in imposed.items():

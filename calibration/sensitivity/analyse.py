@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,13 +14,14 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import sampled_indices
-from calibration.sensitivity.result import METHODS, InputSummary, OutputStudy, SensitivityResult
+from calibration.sensitivity.result import InputSummary, OutputStudy, SensitivityResult
 from calibration.sensitivity.sampled_indices import IntervalEstimate
 from calibration.sensitivity.study import (
     LocalDerivatives,
     Study,
     correlated_directions,
     inert_inputs,
+    interval_ends,
     local_derivatives,
 )
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
@@ -27,143 +32,145 @@ from mmrjax.model.quantities import Quantity
 MOST_LOST = 0.5
 
 
-@dataclasses.dataclass(frozen=True)
-class PartialResult:
-    """Result of a method for one output, as fields of `OutputStudy`."""
-
-    overall: dict[str, IntervalEstimate]
-    at_points: dict[str, IntervalEstimate]
-    share: np.ndarray | None
-    sd: np.ndarray | None
-    second: IntervalEstimate | None
-    lost: np.ndarray
-    studied: np.ndarray
+#: Analysis of an output at one point: the result, None for too few values, and the share of base points without one.
+Analyse = Callable[[np.ndarray], tuple[Any, float]]
 
 
-def _sampled_scores(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _sampled_scores(study: Study, unit: np.ndarray, which: Sequence[int]) -> np.ndarray:
     """Scores of all inputs, for points in the unit cube of some inputs. The other inputs are at their medians."""
     unit_scores = np.full((len(unit), len(study.inputs)), 0.5)
     unit_scores[:, which] = unit
     return study.inputs.scores(unit_scores)
 
 
-def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
-    """Groups of operating points with the same inputs."""
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for k in range(len(study.points)):
-        acting_inputs = tuple(i for i in study.acting(k) if moving[i])
-        if acting_inputs:
-            groups.setdefault(acting_inputs, []).append(k)
-    return groups
+def _results_at_points(
+    study: Study,
+    studies: dict[str, OutputStudy],
+    moving: np.ndarray,
+    design: Callable[[tuple[int, ...]], tuple[np.ndarray, Analyse]],
+) -> Iterator[tuple[str, OutputStudy, dict[int, Any]]]:
+    """Yields for each output its name, the study without results of the sample, and the result at each point.
 
-
-def _empty_estimate(points: int, size: int) -> IntervalEstimate:
-    return IntervalEstimate(*(np.full((points, size), np.nan) for _ in range(3)))
-
-
-def _store_estimate(into: IntervalEstimate, k: int, found: IntervalEstimate) -> None:
-    into.value[k], into.low[k], into.high[k] = found.value, found.low, found.high
-
-
-def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, PartialResult]:
-    """First-order, total and second-order Sobol indices at each point and over all points."""
-    points, d = len(study.points), len(study.inputs)
-    names = [o.name for o in study.model.outputs]
-    terms: dict[str, dict[int, sampled_indices.VarianceTerms]] = {name: {} for name in names}
-    lost_counts = {name: np.zeros(points) for name in names}
-    for input_set, group in group_points(study, moving).items():
-        size = sampled_indices.base_point_count(evaluations / points, len(input_set))
-        design = sampled_indices.sobol_design(len(input_set), size, seed)
-        scores = _sampled_scores(study, design.points, np.array(input_set))
+    Args:
+        studies: local study of each output.
+        moving: True for inputs that are sampled, shape (inputs,).
+        design: function that returns sampled scores for some inputs, and the analysis of their outputs.
+    """
+    points = len(study.points)
+    results: dict[str, dict[int, Any]] = {name: {} for name in studies}
+    lost = {name: np.zeros(points) for name in studies}
+    groups: dict[tuple[int, ...], list[int]] = {}  # of points with the same inputs
+    for k in range(points):
+        groups.setdefault(tuple(i for i in study.acting(k) if moving[i]), []).append(k)
+    groups.pop((), None)
+    for input_set, group in groups.items():
+        scores, analyse = design(input_set)
         for k, outputs in study.sample(study.values_at(scores), group):
-            for name in names:
-                output_terms = sampled_indices.sobol_terms(design, outputs[name])
-                rows = design.size * design.replicates
-                lost_counts[name][k] = 1.0 if output_terms is None else output_terms.lost / rows
-                if output_terms is not None and lost_counts[name][k] <= MOST_LOST:
-                    terms[name][k] = output_terms.widened(input_set, d)
+            for name in studies:
+                result, lost[name][k] = analyse(outputs[name])
+                if result is not None and lost[name][k] <= MOST_LOST:
+                    results[name][k] = result
+    for name, local in studies.items():
+        studied = np.isin(np.arange(points), list(results[name]))
+        share = np.full_like(local.share, np.nan)
+        yield name, dataclasses.replace(local, share=share, lost=lost[name], studied=studied), results[name]
+
+
+def _estimates_by_point(study: Study, by_point: Mapping[int, IntervalEstimate]) -> IntervalEstimate:
+    """Estimates at each point, shape (points, inputs), NaN at points without one."""
+    estimates = np.full((3, len(study.points), len(study.inputs)), np.nan)
+    for k, estimate in by_point.items():
+        estimates[:, k] = estimate
+    return IntervalEstimate(*estimates)
+
+
+def sobol_indices(
+    study: Study, studies: dict[str, OutputStudy], moving: np.ndarray, evaluations: int, seed: int
+) -> dict[str, OutputStudy]:
+    """First-order, total and second-order Sobol indices at each point and over all points."""
+
+    def design(input_set: tuple[int, ...]) -> tuple[np.ndarray, Analyse]:
+        size = sampled_indices.base_point_count(evaluations / len(study.points), len(input_set))
+        sobol = sampled_indices.sobol_design(len(input_set), size, seed)
+
+        def analyse(values: np.ndarray) -> tuple[Any, float]:
+            terms = sampled_indices.sobol_terms(sobol, values)
+            if terms is None:
+                return None, 1.0
+            return terms.widened(input_set, len(study.inputs)), terms.lost / (size * sampled_indices.REPLICATES)
+
+        return _sampled_scores(study, sobol.points, input_set), analyse
+
     answer = {}
-    for name in names:
-        first, total, sd = _empty_estimate(points, d), _empty_estimate(points, d), np.full(points, np.nan)
-        total_terms: sampled_indices.VarianceTerms | None = None
-        for k, output_terms in terms[name].items():
-            indices = sampled_indices.indices_of_terms(output_terms)
-            _store_estimate(first, k, indices.first)
-            _store_estimate(total, k, indices.total)
-            sd[k] = np.sqrt(indices.variance)
-            total_terms = output_terms if total_terms is None else total_terms + output_terms
-        studied = np.array([k in terms[name] for k in range(points)])
-        if total_terms is None:
-            answer[name] = PartialResult({}, {}, None, None, None, lost_counts[name], studied)
-            continue
-        overall = sampled_indices.indices_of_terms(total_terms)
-        answer[name] = PartialResult(
-            {"first": overall.first, "total": overall.total},
-            {"first": first, "total": total},
-            np.where(np.isfinite(total.value), np.clip(total.value, 0.0, 1.0), np.nan),
-            sd,
-            overall.second,
-            lost_counts[name],
-            studied,
-        )
+    for name, output, terms in _results_at_points(study, studies, moving, design):
+        if terms:
+            indices = {k: sampled_indices.indices_of_terms(of_point) for k, of_point in terms.items()}
+            overall = sampled_indices.indices_of_terms(functools.reduce(operator.add, terms.values()))
+            total = _estimates_by_point(study, {k: of_point.total for k, of_point in indices.items()})
+            sd = np.full(len(study.points), np.nan)
+            sd[list(indices)] = np.sqrt([of_point.variance for of_point in indices.values()])
+            output = dataclasses.replace(
+                output,
+                overall={"first": overall.first, "total": overall.total},
+                at_points={
+                    "first": _estimates_by_point(study, {k: of_point.first for k, of_point in indices.items()}),
+                    "total": total,
+                },
+                share=np.clip(total.value, 0.0, 1.0),
+                sd=sd,
+                second=overall.second,
+            )
+        answer[name] = output
     return answer
 
 
-def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, PartialResult]:
+def morris_screening(
+    study: Study, studies: dict[str, OutputStudy], moving: np.ndarray, evaluations: int, seed: int
+) -> dict[str, OutputStudy]:
     """Elementary effects (Morris) over the 95 % range of each input, at each point."""
-    points, d = len(study.points), len(study.inputs)
-    names = [o.name for o in study.model.outputs]
-    found: dict[str, dict[int, tuple[sampled_indices.ElementaryEffects, tuple[int, ...]]]] = {
-        name: {} for name in names
-    }
-    lost_counts = {name: np.zeros(points) for name in names}
-    for input_set, group in group_points(study, moving).items():
-        count = max(int(np.ceil(evaluations / points / (len(input_set) + 1))), 10)
+
+    def design(input_set: tuple[int, ...]) -> tuple[np.ndarray, Analyse]:
+        count = max(int(np.ceil(evaluations / len(study.points) / (len(input_set) + 1))), 10)
         unit = sampled_indices.morris_design(len(input_set), count, seed)
-        scores = np.array(_sampled_scores(study, 0.025 + 0.95 * unit, np.array(input_set)))
+        scores = np.array(_sampled_scores(study, 0.025 + 0.95 * unit, input_set))
         # Trajectories have equal steps in the scores, between the ends of the 95 % interval.
-        normal = np.arange(d) < len(study.inputs.parameters)
         for j, i in enumerate(input_set):
-            if normal[i]:
+            if not study.inputs.uniform[i]:
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
-        for k, outputs in study.sample(study.values_at(scores), group):
-            for name in names:
-                effects = sampled_indices.elementary_effects(unit, outputs[name])
-                lost_counts[name][k] = 1.0 if effects is None else effects.lost / count
-                if effects is not None and lost_counts[name][k] <= MOST_LOST:
-                    found[name][k] = effects, input_set
+
+        def analyse(values: np.ndarray) -> tuple[Any, float]:
+            found = sampled_indices.elementary_effects(unit, values)
+            if found is None:
+                return None, 1.0
+            effects, lost = found
+            widened = {}
+            for key, estimate in effects.items():
+                every = np.zeros((3, len(study.inputs)))
+                every[:, input_set] = estimate
+                widened[key] = IntervalEstimate(*every)
+            return widened, lost / count
+
+        return scores, analyse
+
     answer = {}
-    for name in names:
-        size, mean, spread = _empty_estimate(points, d), np.full((points, d), np.nan), np.full((points, d), np.nan)
-        for k, (effects, input_set) in found[name].items():
-            places = list(input_set)
-            for whole, part in (
-                (size.value, effects.size.value),
-                (size.low, effects.size.low),
-                (size.high, effects.size.high),
-                (mean, effects.mean),
-                (spread, effects.spread),
-            ):
-                whole[k] = 0.0
-                whole[k, places] = part  # fmt: skip
-        studied = np.array([k in found[name] for k in range(points)])
-        if not studied.any():
-            answer[name] = PartialResult({}, {}, None, None, None, lost_counts[name], studied)
-            continue
-        square = size.value**2
-        share = square / np.where(square.sum(1, keepdims=True) > 0, square.sum(1, keepdims=True), 1.0)
-        rows = np.flatnonzero(studied)
-        overall = {
-            "mean_absolute_effect": IntervalEstimate(*(x[rows].mean(0) for x in (size.value, size.low, size.high))),
-            "mean_effect": IntervalEstimate(*(mean[rows].mean(0),) * 3),
-            "sd_effect": IntervalEstimate(*(spread[rows].mean(0),) * 3),
-        }
-        at_points = {
-            "mean_absolute_effect": size,
-            "mean_effect": IntervalEstimate(mean, mean, mean),
-            "sd_effect": IntervalEstimate(spread, spread, spread),
-        }
-        answer[name] = PartialResult(overall, at_points, share, None, None, lost_counts[name], studied)
+    for name, output, effects in _results_at_points(study, studies, moving, design):
+        if effects:
+            keys = next(iter(effects.values()))
+            at_points = {
+                key: _estimates_by_point(study, {k: of_point[key] for k, of_point in effects.items()}) for key in keys
+            }
+            square = at_points["mean_absolute_effect"].value ** 2
+            total = square.sum(1, keepdims=True)
+            output = dataclasses.replace(
+                output,
+                overall={
+                    key: IntervalEstimate(*(x[output.studied].mean(0) for x in estimate))
+                    for key, estimate in at_points.items()
+                },
+                at_points=at_points,
+                share=square / np.where(total > 0, total, 1.0),
+            )
+        answer[name] = output
     return answer
 
 
@@ -182,12 +189,10 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
         seed: random seed.
 
     Raises:
-        BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs that
-            change no output, or no point that can be studied.
+        BadConfiguration: a method that needs independent inputs, too few evaluations, inputs that change no output,
+            or no point that can be studied.
     """
     inputs, model = study.inputs, study.model
-    if method not in METHODS:
-        raise BadConfiguration(f"--method: got {method}; expected one of {', '.join(METHODS)}")
     if inputs.is_posterior and method != "local":
         raise BadConfiguration(f"--method {method}: needs independent inputs, unlike a posterior's; expected local")
     long = fidelities.fidelity_facts(model.fidelity).rollout or any(o in derived.OF_START for o in model.outputs)
@@ -198,18 +203,17 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
     study.tell(progress_remark("points"))
     studies = local_derivatives(study)
     if not any(np.isfinite(x).any() for x in studies.value.values()):
-        raise BadConfiguration(_no_point_message(study, studies.statuses))
+        raise BadConfiguration(_no_point_message(studies.statuses))
     idle = inert_inputs(study, studies, seed)
     if idle.all():
         raise BadConfiguration("--parameters: every derivative is zero; choose others, or change --outputs")
-    parts: dict[str, PartialResult] = {}
+    outputs = {o.name: _local_study(o, study, studies) for o in model.outputs}
     if method != "local":
         study.tell(Remark("sampling", method=method, points=len(study.points)))
         by_method = sobol_indices if method == "sobol" else morris_screening
-        parts = by_method(study, ~idle, evaluations, seed)
-    outputs = {o.name: _study_of_output(o, study, studies, parts.get(o.name)) for o in model.outputs}
-    if method != "local" and not any(s.studied.any() for s in outputs.values()):
-        raise BadConfiguration(_no_point_message(study, study.statuses()))
+        outputs = by_method(study, outputs, ~idle, evaluations, seed)
+        if not any(s.studied.any() for s in outputs.values()):
+            raise BadConfiguration(_no_point_message(study.statuses()))
     return SensitivityResult(
         method=method,
         model=model.fidelity,
@@ -228,68 +232,45 @@ def analyse_sensitivity(study: Study, method: str, evaluations: int | None, seed
 
 def _describe_inputs(inputs: UncertainInputs, idle: np.ndarray) -> dict[str, InputSummary]:
     slope = inputs.slope[inputs.places]
-    uniform = np.arange(len(inputs)) >= len(inputs.parameters)
-    sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
-    directions = correlated_directions(inputs)
-    p = len(inputs.parameters)
-    rows = {q: np.tile(inputs.centre, (len(inputs), 1)) for q in (-1, 0, 1)}
-    for side in (-1, 1):
-        rows[side][:, :p] += side * Z95 * directions[:, :p]
-        for k in range(p, len(inputs)):
-            rows[side][k] = inputs.centre
-            rows[side][k, k] = 0.5 + side * 0.475
-    settings = {
-        q: inputs.values(x)[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))] for q, x in rows.items()
-    }
+    sd = np.where(inputs.uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
+    low, high = (np.diag(inputs.values(ends)[:, inputs.places]) for ends in interval_ends(inputs))
+    median = inputs.values(inputs.centre)[inputs.places]
     described = {}
-    for k, name in enumerate(inputs.names):
-        kind = "uniform" if uniform[k] else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
-        axis = inputs.axes[name]
-        interval = (float(settings[-1][k]), float(settings[1][k]))
+    for k, (name, uniform) in enumerate(zip(inputs.names, inputs.uniform, strict=True)):
+        kind = "uniform" if uniform else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
+        axis, interval = inputs.axes[name], (float(low[k]), float(high[k]))
         described[name] = InputSummary(
-            axis.unit, axis.meaning, kind, float(settings[0][k]), interval, float(sd[k]), bool(idle[k])
+            axis.unit, axis.meaning, kind, float(median[k]), interval, float(sd[k]), bool(idle[k])
         )
     return described
 
 
-def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part: PartialResult | None) -> OutputStudy:
-    name, points = row.name, len(study.points)
+def _local_study(row: Quantity, study: Study, found: LocalDerivatives) -> OutputStudy:
+    """Study of an output from its derivatives at the medians."""
+    inputs, name = study.inputs, row.name
     value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
-    median = study.inputs.values(study.inputs.centre)[study.inputs.places]
     with np.errstate(divide="ignore", invalid="ignore"):
-        elasticity = slopes * median / value[:, None]
-    elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)
+        elasticity = slopes * inputs.values(inputs.centre)[inputs.places] / value[:, None]
     # A condition's score is uniform in 0..1, with variance 1/12.
-    weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
-    directions = correlated_directions(study.inputs)
-    squared_changes = (scores @ directions.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
+    weight = np.where(inputs.uniform, 1 / 12, 1.0)
+    along = scores @ correlated_directions(inputs).T if inputs.is_posterior else scores
     variance = np.sum(scores**2 * weight, 1)
-    linear = squared_changes / np.where(variance > 0, variance, 1.0)[:, None]
+    share = along**2 * weight / np.where(variance > 0, variance, 1.0)[:, None]
     finite = np.isfinite(value)
-    share = np.where(finite[:, None], linear, np.nan)
-    sd = np.where(finite, np.sqrt(variance), np.nan)
-    if part is None:
-        nothing = np.zeros(points)
-        return OutputStudy(
-            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, nothing, finite
-        )
     return OutputStudy(
-        row,
-        value,
-        slopes,
-        elasticity,
-        found.swing[name],
-        sd if part.sd is None else part.sd,
-        np.full_like(share, np.nan) if part.share is None else part.share,
-        part.overall,
-        part.at_points,
-        part.second,
-        part.lost,
-        part.studied,
+        row=row,
+        value=value,
+        derivative=slopes,
+        elasticity=np.where(np.isfinite(elasticity), elasticity, np.nan),
+        swing=found.swing[name],
+        sd=np.where(finite, np.sqrt(variance), np.nan),
+        share=np.where(finite[:, None], share, np.nan),
+        lost=np.zeros(len(value)),
+        studied=finite,
     )
 
 
-def _no_point_message(study: Study, statuses: dict[str, dict[str, int]]) -> str:
+def _no_point_message(statuses: dict[str, dict[str, int]]) -> str:
     status_words = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
         f"too many robots do not travel at any operating point ({status_words}). Choose smaller --slopes, "
@@ -306,24 +287,15 @@ def _study_remarks(
         alike.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
     for group in alike.values():
         o, names = group[0], tuple(x.row.label for x in group)
-        if not o.studied.all():
-            remarks.append(
-                Remark(
-                    "points_left_out",
-                    points=int((~o.studied).sum()),
-                    total=len(o.studied),
-                    sampled=method != "local",
-                    outputs=names,
-                )
-            )
-        some = o.studied & (o.lost >= 1e-3)
-        if some.any():
-            remarks.append(
-                Remark("sample_left_out", points=int(some.sum()), share=float(o.lost[some].max()), outputs=names)
-            )
-    names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k])
-    if names:
-        remarks.append(Remark("inert", inputs=names))
+        out, total = int(np.sum(~o.studied)), len(o.studied)
+        if out:
+            sampled = method != "local"
+            remarks.append(Remark("points_left_out", points=out, total=total, sampled=sampled, outputs=names))
+        some = o.lost[o.studied & (o.lost >= 1e-3)]
+        if some.size:
+            remarks.append(Remark("sample_left_out", points=some.size, share=float(some.max()), outputs=names))
+    if idle.any():
+        remarks.append(Remark("inert", inputs=tuple(np.array(study.inputs.names)[idle].tolist())))
     if study.inputs.parameters.tied:
         remarks.append(Remark("tied", inputs=tuple(f for f, _, _ in study.inputs.parameters.tied)))
     return tuple(remarks)

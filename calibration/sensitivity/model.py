@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -45,12 +44,11 @@ class ModelOutputs:
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Source → status → number of points."""
-        return {source: count_statuses(codes) for source, codes in self.statuses.items()}
+        return {source: named_counts(np.bincount(codes)) for source, codes in self.statuses.items()}
 
 
-def count_statuses(codes: np.ndarray) -> dict[str, int]:
-    """Number of points with each status that occurs."""
-    counts = np.bincount(codes, minlength=len(STATUSES))
+def named_counts(counts: np.ndarray) -> dict[str, int]:
+    """Number of points with each status that occurs, from the numbers by code."""
     return {STATUSES[k]: int(n) for k, n in enumerate(counts) if n}
 
 
@@ -61,22 +59,15 @@ def known_outputs(robot: Robot) -> dict[str, Quantity]:
 
 def default_outputs(robot: Robot, turns: bool) -> Names:
     """Names of the outputs that are studied by default: every channel, and those defined for the robot's load."""
-    further_outputs: Names = DEFAULT
+    outputs, names = known_outputs(robot), channels.channel_names(robot.channels)
     if turns:
-        straight_only = {row.name for row in derived.OF_STRAIGHT}
-        return (
-            *channels.channel_names(robot.channels),
-            *(n for n in DEFAULT if n not in straight_only),
-            derived.OF_TURNS[0].name,
-        )
+        return (*names, *(n for n in DEFAULT if outputs[n] not in derived.OF_STRAIGHT), derived.OF_TURNS[0].name)
     if not robot.has_ground:
-        further_outputs = ("power_supply",)
-    elif robot.rig.imposed == "motor_speed":  # no slope stalls it
-        further_outputs = tuple(name for name in DEFAULT if name != "steepest_slope")
-    outputs = known_outputs(robot)
-    return tuple(
-        n for n in (*channels.channel_names(robot.channels), *further_outputs) if robot.knows(outputs[n].rests_on)
-    )
+        names = (*names, "power_supply")
+    else:  # no slope stalls an imposed speed
+        stalls = robot.rig.imposed != "motor_speed"
+        names = (*names, *(name for name in DEFAULT if stalls or name != "steepest_slope"))
+    return tuple(n for n in names if robot.knows(outputs[n].rests_on))
 
 
 def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
@@ -161,7 +152,7 @@ class Model:
         self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions
     ) -> ModelOutputs:
         """Outputs of one source, see `sources`."""
-        results = self._call_in_chunks(self._function(source), self.chunk(source, len(values)), values, conditions)
+        results = self._call_in_chunks(_values, source, values, conditions)
         codes = results.pop(STATUS).astype(int)
         return ModelOutputs(results, {source: codes})
 
@@ -183,46 +174,28 @@ class Model:
         """
         columns: Columns = {}
         for source in self.sources:
-            size = self.chunk(source, len(values), differentiated=True)
-            results = self._call_in_chunks(self._function(source, differentiated=True), size, values, conditions)
-            results.pop(STATUS)
-            columns |= results
+            columns |= self._call_in_chunks(_derivatives, source, values, conditions)
         return {o.name: columns[o.name] for o in self.outputs}
 
-    def _function(self, source: str, differentiated: bool = False) -> Callable[..., dict[str, Array]]:
-        rows = tuple(o.name for o in self.sources[source])
-        variation = Variation(self.robot, self.columns)
-        options = dict(self.options) if source == self.fidelity else {}
-        run = _derivatives if differentiated else _values
-        return lambda values, conditions: run(variation, source, options, rows, values, conditions)
-
     def _call_in_chunks(
-        self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
+        self, function: Callable[..., dict[str, Array]], source: str, values: np.ndarray, conditions: Conditions
     ) -> Columns:
-        """Results of a function that is called with chunks of equal size. The last chunk is padded with its last
-        point.
+        """Results of `_values` or `_derivatives` for one source, in chunks of equal size. The last chunk is padded
+        with its last point.
         """
-        points, values = len(values), np.asarray(values)
+        variation, names = Variation(self.robot, self.columns), tuple(o.name for o in self.sources[source])
+        options = dict(self.options) if source == self.fidelity else {}
+        points, size = len(values), self.chunk(source, len(values), differentiated=function is _derivatives)
         alike = conditions.shape == ()  # broadcast by the program
-        spread = conditions if alike else jax.tree.map(np.asarray, conditions)
         parts = []
         for first in range(0, points, size):
-            count = min(size, points - first)
-            part, rows = values[first : first + count], spread
-            if not alike:
-                rows = jax.tree.map(lambda x, f=first, n=count: _pad_rows(x[f : f + n], size), spread)
-            part = function(jnp.asarray(_pad_rows(part, size)), rows)
-            parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
-        if len(parts) == 1:
-            return parts[0]
+            rows = np.minimum(np.arange(first, first + size), points - 1)
+            row_conditions = (
+                conditions if alike else jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], conditions)
+            )
+            part = function(variation, source, options, names, jnp.asarray(np.asarray(values)[rows]), row_conditions)
+            parts.append({name: np.asarray(x)[: points - first] for name, x in part.items()})
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _pad_rows(rows: np.ndarray, size: int) -> np.ndarray:
-    """Rows, padded to a given number by repeating the last one."""
-    if len(rows) == size:
-        return rows
-    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)])
 
 
 def _outputs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 from scipy import stats
@@ -126,11 +127,11 @@ class OutputStudy:
         sd: standard deviation of the output due to all inputs [SI], shape (points,). From the sample if there is one,
             otherwise to first order.
         share: share of the variance that involves an input, as defined by the method [-].
+        lost: share of base points without a value, at each point, shape (points,).
+        studied: True for points that could be studied.
         overall: indices of each input over all points: name → estimates of shape (inputs,).
         at_points: indices at each point: name → estimates of shape (points, inputs).
         second: second-order indices over all points, shape (inputs, inputs). None if not computed.
-        lost: share of base points without a value, at each point, shape (points,).
-        studied: True for points that could be studied.
     """
 
     JSON = ("label=row.label", "unit=row.unit_shown", "factor=row.factor", "value", "sd", "share", "studied", "lost")
@@ -141,11 +142,11 @@ class OutputStudy:
     swing: np.ndarray
     sd: np.ndarray
     share: np.ndarray
-    overall: dict[str, IntervalEstimate]
-    at_points: dict[str, IntervalEstimate]
-    second: IntervalEstimate | None
     lost: np.ndarray
     studied: np.ndarray
+    overall: dict[str, IntervalEstimate] = dataclasses.field(default_factory=dict)
+    at_points: dict[str, IntervalEstimate] = dataclasses.field(default_factory=dict)
+    second: IntervalEstimate | None = None
 
     @property
     def overall_share(self) -> np.ndarray:
@@ -159,23 +160,6 @@ class OutputStudy:
         if not weight.sum() > 0:
             return np.zeros(self.share.shape[1])
         return np.einsum("p,pk->k", weight, np.nan_to_num(self.share)) / weight.sum()
-
-
-@dataclasses.dataclass(frozen=True)
-class Interaction:
-    """Interaction of two inputs: share of the variance in addition to that of each alone.
-
-    Attributes:
-        second: second-order index.
-        interval: 95 % interval of the index.
-        sure: True if the index is above zero even with an interval for all tested pairs at once.
-    """
-
-    JSON = ("pair", "second", "second_interval=interval", "sure")
-    pair: tuple[str, str]
-    second: float
-    interval: tuple[float, float]
-    sure: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,17 +202,12 @@ class SensitivityResult:
     def importance(self) -> np.ndarray:
         """Largest share of the variance that each input causes, over all outputs and points, shape (inputs,). Shares
         at single points count with the upper ends of their intervals."""
-        largest_share = np.zeros(len(self.inputs))
+        shares = [np.zeros((1, len(self.inputs)))]
         for study in self.outputs.values():
-            ends = [study.overall_share]
-            if study.at_points:
-                main = study.at_points.get("total")
-                if main is not None:
-                    ends.append(np.nanmax(np.where(np.isfinite(main.high), main.high, 0.0), axis=0))
-            shares = np.where(np.isfinite(study.share), study.share, 0.0)
-            ends.append(shares.max(0, initial=0.0))
-            largest_share = np.maximum(largest_share, np.max(np.stack(ends), 0))
-        return np.clip(largest_share, 0.0, 1.0)
+            total = study.at_points.get("total")
+            shares += [study.overall_share[None], study.share, *([] if total is None else [total.high])]
+        finite = np.nan_to_num(np.concatenate(shares), posinf=0.0, neginf=0.0)
+        return np.clip(finite.max(0), 0.0, 1.0)
 
     @property
     def negligible(self) -> Names:
@@ -321,15 +300,10 @@ class SensitivityResult:
                 "at_high": study.swing[1].ravel() / study.row.factor,
                 "share": study.share.ravel(),
             }
-            for key, estimate in study.at_points.items():
-                table |= {key: estimate.value.ravel()}
-                table |= {f"{key}_low": estimate.low.ravel(), f"{key}_high": estimate.high.ravel()}
-            tables_by_file["points.csv"].append(table)
+            tables_by_file["points.csv"].append(table | _estimate_columns(study.at_points))
             if study.overall:
                 overall = {"output": np.full(size, name), "input": names}
-                for key, estimate in study.overall.items():
-                    overall |= {key: estimate.value, f"{key}_low": estimate.low, f"{key}_high": estimate.high}
-                tables_by_file["indices.csv"].append(overall)
+                tables_by_file["indices.csv"].append(overall | _estimate_columns(study.overall))
         return {
             file: {key: np.concatenate([t[key] for t in tables]) for key in tables[0]}
             for file, tables in tables_by_file.items()
@@ -337,19 +311,32 @@ class SensitivityResult:
         }
 
 
-def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
-    """Interactions of the relevant inputs of an output, the strongest first."""
+def _estimate_columns(estimates: dict[str, IntervalEstimate]) -> Columns:
+    """Columns of estimates and the ends of their intervals."""
+    return {
+        f"{key}{end}": x.ravel()
+        for key, estimate in estimates.items()
+        for end, x in zip(("", "_low", "_high"), estimate, strict=True)
+    }
+
+
+def interactions(study: OutputStudy, names: Names) -> list[Json]:
+    """Pairs of relevant inputs of an output with their shares of the variance in addition to those of each alone, the
+    largest first.
+
+    `sure`: True if the index is above zero even with an interval for all tested pairs at once.
+    """
     second = study.second
     if second is None:
         return []
-    part = np.flatnonzero(np.nan_to_num(study.overall["total"].value) >= NEGLIGIBLE / 10)
-    pairs = [(int(i), int(j)) for n, i in enumerate(part) for j in part[n + 1 :]]
-    wider = 1.0
-    if pairs:  # in 95 of 100 studies no pair is sure by chance (Bonferroni)
-        single_quantile, all_ = (stats.t.ppf(1 - (1 - LEVEL) / 2 / n, REPLICATES - 1) for n in (1, len(pairs)))
-        wider = float(all_ / single_quantile)
-    pairs_found = []
-    for i, j in pairs:
-        value, low, high = float(second.value[i, j]), float(second.low[i, j]), float(second.high[i, j])
-        pairs_found.append(Interaction((names[i], names[j]), value, (low, high), value - wider * (value - low) > 0))
-    return sorted(pairs_found, key=lambda pair: -pair.second)
+    relevant = np.flatnonzero(np.nan_to_num(study.overall["total"].value) >= NEGLIGIBLE / 10)
+    pairs = list(itertools.combinations(relevant.tolist(), 2))
+    # in 95 of 100 studies no pair is sure by chance (Bonferroni)
+    quantiles = stats.t.ppf(1 - (1 - LEVEL) / 2 / np.array([1, max(len(pairs), 1)]), REPLICATES - 1)
+    entries: list[Json] = []
+    for pair in pairs:
+        value, low, high = (float(x[pair]) for x in second)
+        sure = value - float(quantiles[1] / quantiles[0]) * (value - low) > 0
+        pair_names = [names[k] for k in pair]
+        entries.append({"pair": pair_names, "second": value, "second_interval": [low, high], "sure": sure})
+    return sorted(entries, key=lambda entry: -entry["second"])

@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -31,8 +32,7 @@ REPLICATES = 32
 LEVEL = 0.95
 
 
-@dataclasses.dataclass(frozen=True)
-class IntervalEstimate:
+class IntervalEstimate(NamedTuple):
     """Estimates with their 95 % intervals.
 
     Attributes:
@@ -43,9 +43,6 @@ class IntervalEstimate:
     value: np.ndarray
     low: np.ndarray
     high: np.ndarray
-
-    def __getitem__(self, k: Any) -> IntervalEstimate:
-        return IntervalEstimate(self.value[k], self.low[k], self.high[k])
 
 
 def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEstimate:
@@ -85,26 +82,13 @@ class SobolDesign:
     """Points of the unit cube for Sobol indices, grouped by replicates.
 
     Attributes:
-        points: points, shape (replicates · size · blocks, inputs). Blocks follow one another: A, then A with the k-th
-            column of B for each k, then (with `second`) B with the k-th column of A for each k, then B.
+        points: points, shape (`REPLICATES` · size · blocks, inputs). Blocks follow one another: A, then A with the
+            k-th column of B for each k, then B with the k-th column of A for each k, then B.
         size: number of base points of a replicate, a power of 2.
-        second: True for designs with second-order indices.
     """
 
     points: np.ndarray
     size: int
-    second: bool
-    replicates: int = REPLICATES
-
-    @property
-    def inputs(self) -> int:
-        """Number of inputs."""
-        return self.points.shape[1]
-
-    @property
-    def blocks(self) -> int:
-        """Number of evaluations for each base point."""
-        return (2 * self.inputs if self.second else self.inputs) + 2
 
 
 def base_point_count(evaluations: float, inputs: int) -> int:
@@ -113,7 +97,7 @@ def base_point_count(evaluations: float, inputs: int) -> int:
     return 2 ** max(math.ceil(math.log2(max(evaluations / (REPLICATES * blocks), FEWEST))), 0)
 
 
-def sobol_design(inputs: int, size: int, seed: int, second: bool = True) -> SobolDesign:
+def sobol_design(inputs: int, size: int, seed: int) -> SobolDesign:
     """Design of independent replicates, each a Sobol sequence with its own scrambling.
 
     Args:
@@ -122,14 +106,9 @@ def sobol_design(inputs: int, size: int, seed: int, second: bool = True) -> Sobo
     """
     from SALib.sample import sobol as sampling
 
-    problem = {
-        "num_vars": inputs,
-        "names": [str(k) for k in range(inputs)],
-        "bounds": [[0.0, 1.0]] * inputs,
-    }
     generators = np.random.default_rng(seed).spawn(REPLICATES)
-    parts = [sampling.sample(problem, size, calc_second_order=second, seed=rng) for rng in generators]
-    return SobolDesign(np.concatenate(parts), size, second, REPLICATES)
+    parts = [sampling.sample(_problem(inputs), size, seed=rng) for rng in generators]
+    return SobolDesign(np.concatenate(parts), size)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,41 +118,26 @@ class VarianceTerms:
     Attributes:
         variance: total variance, shape (replicates,).
         first, total: parts for the first-order and total indices, shape (replicates, inputs).
-        second: part of each pair including its single effects, shape (replicates, inputs, inputs). None if not
-            computed.
-        rows: number of included base points.
+        second: part of each pair including its single effects, shape (replicates, inputs, inputs).
         lost: number of base points omitted because the model has no value.
     """
 
     variance: np.ndarray
     first: np.ndarray
     total: np.ndarray
-    second: np.ndarray | None
-    rows: int
+    second: np.ndarray
     lost: int
 
     def __add__(self, other: VarianceTerms) -> VarianceTerms:
         """Terms of both outputs together, as for a vector of outputs (Gamboa et al., Electron. J. Stat. 8 (2014))."""
-        second = None if self.second is None or other.second is None else self.second + other.second
-        return VarianceTerms(
-            self.variance + other.variance,
-            self.first + other.first,
-            self.total + other.total,
-            second,
-            self.rows + other.rows,
-            self.lost + other.lost,
-        )
+        return VarianceTerms(*map(operator.add, dataclasses.astuple(self), dataclasses.astuple(other)))
 
     def widened(self, places: Sequence[int], inputs: int) -> VarianceTerms:
         """Terms for more inputs: these terms at `places`, the others without influence."""
-
-        first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
+        first, total = np.zeros((2, len(self.variance), inputs))
         first[:, places], total[:, places] = self.first, self.total
-        second = None
-        columns = np.asarray(places)
-        if self.second is not None:
-            second = first[:, :, None] + first[:, None, :]  # without interaction
-            second[np.ix_(np.arange(len(second)), columns, columns)] = self.second
+        second = first[:, :, None] + first[:, None, :]  # without interaction
+        second[:, np.array(places)[:, None], places] = self.second
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
@@ -190,80 +154,50 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
     Returns:
         None if some replicate has fewer than two base points left.
     """
-    d = design.inputs
-    values_by_block = np.reshape(values, (design.replicates, design.size, design.blocks))
+    d = design.points.shape[1]
+    values_by_block = np.reshape(values, (REPLICATES, design.size, 2 * d + 2))
     finite = np.asarray(np.isfinite(values_by_block).all(-1))
     count = finite.sum(1)
     if count.min() < 2:
         return None
-    values_by_block = np.where(finite[..., None], values_by_block, 0.0)
-    a, b = values_by_block[..., 0], values_by_block[..., -1]
-    centre = (a + b)[finite].mean() / 2
+    centre = (values_by_block[..., 0] + values_by_block[..., -1])[finite].mean() / 2
     values_by_block = np.where(finite[..., None], values_by_block - centre, 0.0)
-    a, b, ab = values_by_block[..., 0], values_by_block[..., -1], values_by_block[..., 1 : d + 1]
+    a, b = values_by_block[..., 0], values_by_block[..., -1]
+    ab, ba = values_by_block[..., 1 : d + 1], values_by_block[..., d + 1 : -1]
     # A replicate with more rows has a larger weight: sums are divided by the mean number of rows.
     weight = 1.0 / count.mean()
-    second = None
-    if design.second:
-        ba = values_by_block[..., d + 1 : 2 * d + 1]
-        # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
-        mixed = np.einsum("rnj,rnk->rjk", ba, ab)
-        square_of_means = np.einsum("rn,rn->r", a, b)[:, None, None]
-        closed = weight * (mixed - square_of_means)
-        second = (closed + np.swapaxes(closed, 1, 2)) / 2
+    # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
+    mixed = np.einsum("rnj,rnk->rjk", ba, ab)
+    closed = weight * (mixed - np.einsum("rn,rn->r", a, b)[:, None, None])
     return VarianceTerms(
         variance=weight * np.sum(a**2 + b**2, 1) / 2,
         first=weight * np.einsum("rn,rnk->rk", b, ab - a[..., None]),
         total=weight * np.sum((a[..., None] - ab) ** 2, 1) / 2,
-        second=second,
-        rows=int(count.sum()),
-        lost=int(finite.size - count.sum()),
+        second=(closed + np.swapaxes(closed, 1, 2)) / 2,
+        lost=int(np.sum(~finite)),
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class SobolIndices:
-    """Sobol indices of one output, shape (inputs,). `second` has the shape (inputs, inputs) or is None. `variance`:
-    [unit²].
-    """
+    """Sobol indices of one output, shape (inputs,). `second` has the shape (inputs, inputs). `variance`: [unit²]."""
 
     first: IntervalEstimate
     total: IntervalEstimate
-    second: IntervalEstimate | None
+    second: IntervalEstimate
     variance: float
 
 
 def indices_of_terms(terms: VarianceTerms) -> SobolIndices:
     """Sobol indices from the parts of the variance."""
-    variance, first, second = terms.variance, terms.first, None
-    if terms.second is not None:
-        second = ratio_estimate(terms.second - first[:, :, None] - first[:, None, :], variance)
-    return SobolIndices(
-        ratio_estimate(first, variance), ratio_estimate(terms.total, variance), second, float(variance.mean())
-    )
+    variance, single = terms.variance, terms.first
+    together = terms.second - single[:, :, None] - single[:, None, :]
+    first, total, second = (ratio_estimate(part, variance) for part in (single, terms.total, together))
+    return SobolIndices(first, total, second, float(variance.mean()))
 
 
 #: Levels of the grid of the trajectories.
 LEVELS = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class ElementaryEffects:
-    """Elementary effects of each input on an output [unit of the output per range of the input], shape (inputs,).
-
-    Attributes:
-        mean: μ, mean of the effects.
-        size: μ*, mean magnitude of the effects, with its interval.
-        spread: σ, standard deviation of the effects.
-        trajectories: number of included trajectories.
-        lost: number of omitted trajectories, at a point of which the model has no value.
-    """
-
-    mean: np.ndarray
-    size: IntervalEstimate
-    spread: np.ndarray
-    trajectories: int
-    lost: int
 
 
 def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
@@ -278,8 +212,11 @@ def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
         np.random.set_state(state)  # noqa: NPY002
 
 
-def elementary_effects(points: np.ndarray, values: np.ndarray) -> ElementaryEffects | None:
-    """Elementary effects of each input on one output.
+def elementary_effects(points: np.ndarray, values: np.ndarray) -> tuple[dict[str, IntervalEstimate], int] | None:
+    """Statistics of the elementary effects of each input on one output [unit of the output per range of the input],
+    and the number of trajectories that are omitted, because the model has no value at one of their points.
+
+    The statistics are μ* with its interval, μ and σ, each of shape (inputs,).
 
     Args:
         points: points from `morris_design`.
@@ -288,39 +225,24 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> ElementaryEffe
     Returns:
         None if fewer than two trajectories have values at all points.
     """
-    from SALib.analyze.morris import analyze
-
-    count, steps = len(points) // (points.shape[1] + 1), points.shape[1] + 1
-    values_by_path = values.reshape(count, steps)
+    inputs = points.shape[1]
+    paths, values_by_path = points.reshape(-1, inputs + 1, inputs), values.reshape(-1, inputs + 1)
     finite = np.isfinite(values_by_path).all(1)
-    finite_points = np.repeat(finite, steps)
     if finite.sum() < 2:
         return None
-    state = np.random.get_state()  # noqa: NPY002
-    try:
-        analysis = analyze(
-            _problem(points.shape[1]), points[finite_points], values[finite_points], num_levels=LEVELS, seed=0
-        )
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
-    size = np.asarray(analysis["mu_star"], float)
-    # change of the output per change of the moved input, shape (trajectories, inputs)
-    steps_taken = np.diff(points[finite_points].reshape(-1, steps, points.shape[1]), axis=1)
-    moved_input = np.abs(steps_taken).argmax(-1)
-    change = (
-        np.diff(values_by_path[finite], axis=1) / np.take_along_axis(steps_taken, moved_input[..., None], -1)[..., 0]
-    )
-    elementary = np.zeros_like(change)
-    np.put_along_axis(elementary, moved_input, change, 1)
-    width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
-    error = width * np.abs(elementary).std(0, ddof=1)
-    return ElementaryEffects(
-        np.asarray(analysis["mu"], float),
-        IntervalEstimate(size, size - error, size + error),
-        np.asarray(analysis["sigma"], float),
-        int(finite.sum()),
-        int(count - finite.sum()),
-    )
+    steps = np.diff(paths[finite], axis=1)
+    moved_input = np.abs(steps).argmax(-1)[..., None]
+    changes = np.diff(values_by_path[finite], axis=1)[..., None] / np.take_along_axis(steps, moved_input, -1)
+    effects = np.zeros((len(changes), inputs))
+    np.put_along_axis(effects, moved_input[..., 0], changes[..., 0], 1)
+    size, mean, sd = np.abs(effects).mean(0), effects.mean(0), effects.std(0, ddof=1)
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, len(effects) - 1)) / np.sqrt(len(effects))
+    error = width * np.abs(effects).std(0, ddof=1)
+    return {
+        "mean_absolute_effect": IntervalEstimate(size, size - error, size + error),
+        "mean_effect": IntervalEstimate(mean, mean, mean),
+        "sd_effect": IntervalEstimate(sd, sd, sd),
+    }, int(np.sum(~finite))
 
 
 def _problem(inputs: int) -> dict[str, object]:

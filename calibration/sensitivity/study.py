@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.stats import qmc
 
 from calibration.data import Columns
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity.model import Model, ModelOutputs, count_statuses
+from calibration.sensitivity.model import Model, ModelOutputs, named_counts
 from calibration.sensitivity.result import OperatingPoints
 from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax import fidelities
@@ -92,32 +93,23 @@ class Study:
                 ignored = self.model.ignores(source)
                 fields = {f.name: getattr(conditions, f.name) for f in dataclasses.fields(conditions)}
                 mark = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
-                if (source, mark) not in sampled:
-                    if not ignored:  # so no other point can reuse it
-                        parts[source] = self.model.of_source(source, values, conditions)
-                        continue
-                    sampled[source, mark] = self.model.of_source(source, values, conditions)
-                parts[source] = sampled[source, mark]
+                parts[source] = sampled.get((source, mark)) or self.model.of_source(source, values, conditions)
+                if ignored:  # otherwise no other point can reuse it
+                    sampled[source, mark] = parts[source]
             answer = self.model.joined(parts)
-            self._count_evaluations(answer, len(values), began)
+            self.seconds += time.perf_counter() - began
+            self.evaluations += len(values)
+            for source, codes in answer.statuses.items():
+                self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
             if time.perf_counter() - self.told > SILENCE:
                 self.told = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
                 self.tell(progress_remark("evaluations", self.evaluations, rate))
             yield k, answer.values
 
-    def _count_evaluations(self, answer: ModelOutputs, rows: int, began: float) -> None:
-        self.seconds += time.perf_counter() - began
-        self.evaluations += rows
-        for source, codes in answer.statuses.items():
-            self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
-
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → number of evaluations in the sample."""
-        return {
-            source_words(source): count_statuses(np.repeat(np.arange(len(source_outputs)), source_outputs))
-            for source, source_outputs in self.sampled.items()
-        }
+        return {source_words(source): named_counts(counts) for source, counts in self.sampled.items()}
 
 
 def source_words(source: str) -> str:
@@ -153,39 +145,35 @@ def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
     Each row has length 1. A condition moves along its own score.
     """
     p = len(inputs.parameters)
-    identity = np.eye(len(inputs))
+    directions = np.eye(len(inputs))
     root = inputs.parameters.root
     length = np.linalg.norm(root, axis=1, keepdims=True)
-    identity[:p, :p] = root / np.where(length > 0, length, 1.0)
-    return identity
+    directions[:p, :p] = root / np.where(length > 0, length, 1.0)
+    return directions
+
+
+def interval_ends(inputs: UncertainInputs) -> Float[np.ndarray, "2 inputs inputs"]:
+    """Scores with one input at the lower or upper end of its 95 % interval, in a row for each input."""
+    reach = np.where(inputs.uniform, 0.475, Z95)[:, None] * correlated_directions(inputs)
+    return inputs.centre + np.stack([-reach, reach])
 
 
 def local_derivatives(study: Study) -> LocalDerivatives:
     """Outputs, exact derivatives and swings at each operating point."""
-    inputs, points = study.inputs, len(study.points)
-    d, centre = len(inputs), np.tile(study.inputs.centre, (points, 1))
-    values = study.values_at(centre)
+    inputs, points, d = study.inputs, len(study.points), len(study.inputs)
+    values = study.values_at(np.tile(inputs.centre, (points, 1)))
     answer = study.model(values, study.conditions)
     by_columns = study.model.derivatives(values, study.conditions)
-    derivative, by_score, swing = {}, {}, {}
+    derivative, by_score = {}, {}
     for name, derivatives in by_columns.items():
         finite = np.isfinite(answer.values[name])[:, None]
         derivative[name] = np.where(finite, _derivatives_by_input(inputs, derivatives), np.nan)
         by_score[name] = np.where(finite, derivatives @ inputs.slope, np.nan)
-    directions = correlated_directions(inputs)
-    p = len(inputs.parameters)
-    ends = []
-    for side in (-1, 1):
-        scores = np.tile(centre[:, None], (1, d, 1))
-        scores[:, :p] += side * Z95 * directions[:p]
-        for k in range(p, d):
-            scores[:, k, k] = 0.5 + side * 0.475
-        rows = scores.reshape(-1, d)
-        spread = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
-        ends.append({n: x.reshape(points, d) for n, x in study.model(study.values_at(rows), spread).values.items()})
-    for name in by_columns:
-        swing[name] = np.stack([end[name] for end in ends])
-    return LocalDerivatives(answer.values, derivative, by_score, swing, _in_words(answer.counts()))
+    spread = jax.tree.map(lambda x: np.repeat(np.asarray(x), d), study.conditions)
+    ends = [study.model(study.values_at(np.tile(rows, (points, 1))), spread).values for rows in interval_ends(inputs)]
+    swing = {name: np.stack([end[name].reshape(points, d) for end in ends]) for name in by_columns}
+    statuses = {source_words(source): counts for source, counts in answer.counts().items()}
+    return LocalDerivatives(answer.values, derivative, by_score, swing, statuses)
 
 
 def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np.ndarray:
@@ -196,10 +184,6 @@ def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
         by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
     return by_inputs
-
-
-def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
-    return {source_words(source): counts_by_status for source, counts_by_status in counts.items()}
 
 
 def inert_inputs(study: Study, found: LocalDerivatives, seed: int) -> np.ndarray:

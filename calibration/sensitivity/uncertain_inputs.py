@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -67,10 +68,6 @@ class UncertainInputs:
         """Columns of a point: inputs, and parameters tied to them."""
         return (*self.parameters.names, *self.conditions)
 
-    @cached_property
-    def _root(self) -> np.ndarray:
-        return self.parameters.root
-
     def values(self, scores: Any) -> Any:
         """Values of `columns` at independent scores: standard normal for parameters, 0 to 1 for conditions.
 
@@ -83,18 +80,14 @@ class UncertainInputs:
             Values, shape (..., columns).
         """
         p = len(self.parameters)
-        theta = self.parameters.at(self.parameters.mean + scores[..., :p] @ self._root.T)
+        theta = self.parameters.at(self.parameters.mean + scores[..., :p] @ self.parameters.root.T)
         uniform_values = self.low + (self.high - self.low) * scores[..., p:]
         return (np if isinstance(scores, np.ndarray) else jnp).concatenate([theta, uniform_values], -1)
-
-    def jacobian(self, scores: Float[np.ndarray, "rows inputs"]) -> Float[np.ndarray, "rows columns inputs"]:
-        """Derivatives of the values with respect to the scores, for each row."""
-        return np.asarray(jax.jit(jax.vmap(jax.jacfwd(self.values)))(scores))
 
     @cached_property
     def slope(self) -> Float[np.ndarray, "columns inputs"]:
         """Derivatives of the values with respect to the scores, at the medians."""
-        return self.jacobian(self.centre[None])[0]
+        return np.asarray(jax.jit(jax.jacfwd(self.values))(self.centre))
 
     def scores(self, unit: Float[np.ndarray, "... inputs"]) -> Float[np.ndarray, "... inputs"]:
         """Scores of points of the unit cube."""
@@ -102,9 +95,14 @@ class UncertainInputs:
         return np.concatenate([ndtri(np.clip(unit[..., :p], EDGE, 1 - EDGE)), unit[..., p:]], -1)
 
     @property
+    def uniform(self) -> np.ndarray:
+        """True for conditions, whose scores are uniform, shape (inputs,)."""
+        return np.arange(len(self)) >= len(self.parameters)
+
+    @property
     def centre(self) -> np.ndarray:
         """Scores of the medians."""
-        return np.concatenate([np.zeros(len(self.parameters)), np.full(len(self.conditions), 0.5)])
+        return np.where(self.uniform, 0.5, 0.0)
 
     @property
     def places(self) -> np.ndarray:
@@ -161,11 +159,9 @@ def inputs_from_priors(
         BadConfiguration: a name is unknown (the message lists the choices), its prior has zero width, or a range is
             invalid.
     """
-    everything = list(params.parameters_by_name(robot))
-    names = list(
-        dict.fromkeys(name for word in words for name in priors.expand_name(word, everything, "--parameters"))
-    )
     by_name = params.parameters_by_name(robot)
+    expanded = (priors.expand_name(word, list(by_name), "--parameters") for word in words)
+    names = list(dict.fromkeys(itertools.chain(*expanded)))
     for name in names:
         if not by_name[name].spec.prior_sd(float(by_name[name].value)) > 0:
             raise BadConfiguration(

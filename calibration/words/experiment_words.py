@@ -53,12 +53,10 @@ def join_slopes(angles: Sequence[float]) -> str:
 #: Instructions for each calibration act, by its name; the setting fills the gap.
 ACTS = {
     "zero current": "Switch the motors off and read the ammeter",
-    "zero reading": "Switch the motors off, with the shaft at rest and unloaded, and read the {}",
-    "shunt": (
-        "Replace the robot with a load and a precision shunt in series, set {} on the shunt, and read the ammeter"
-    ),
-    "strobe": "Set the motor to {} with a stroboscope and read the tachometer",
-    "timing": "Drive at {} between two light gates a measured distance apart, and compare both speeds",
+    "zero reading": "With the motors off and the shaft unloaded, read the {}",
+    "shunt": ("Replace the robot with a load and a precision shunt, set {} there, and read the ammeter"),
+    "strobe": "Set the motor to {} by stroboscope and read the tachometer",
+    "timing": "Drive at {} between two light gates, and compare both speeds",
 }
 #: Units of what they set.
 UNITS = {"shunt": "A", "strobe": "rad/s", "timing": "m/s", "zero current": ""}
@@ -68,14 +66,14 @@ DOING = {
     "run": "run",
     "backwards": "travel backwards",
     "other way": "run in the other direction",
-    "about": "reverse the slope, set with the same inclinometer, and travel forwards",
+    "about": "reverse the slope, with the same inclinometer, and travel forwards",
     "laden": "travel with {payload:g} kg",
-    "lifted": "put the robot on stands, the movers in the air, and run",
+    "lifted": "put the robot on stands and run",
     "one lifted": "put the robot on stands, {others}, and run",
     "alone": "Uncouple the {gears} and run the motors alone",
-    "braked": "Uncouple the {gears} and put a brake of {brake:g} mN·m on each motor shaft, and run",
-    "held": "Hold {shafts} in a vice and switch on for a moment,",
-    "one held": "Hold one motor's shaft in a vice, {others}, and switch on for a moment,",
+    "braked": "Uncouple the {gears}, brake each motor shaft with {brake:g} mN·m, and run",
+    "held": "Hold {shafts} in a vice and switch on briefly,",
+    "one held": "Hold one motor's shaft in a vice, {others}, and switch on briefly,",
 }
 
 
@@ -99,11 +97,11 @@ def _act(act: menu.CalibrationAct) -> str:
 
 
 def _run(run: menu.ProposedRuns) -> str:
-    level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
+    level = (run.reach.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
     slope_words = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
     read = join_words([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
-    unit = {"voltage": "V", "motor_current": "A per motor"}.get(run.imposed)
+    unit = {"voltage": "V", "motor_current": "A per motor"}.get(run.reach.imposed)
     levels = join_amounts(turning, "rpm at the motor") if unit is None else join_amounts(run.voltage, unit)
     against = f" against a brake of {join_torques(run.torque)}" if any(run.torque) else ""
     text = f"{_doing(run)}{slope_words} at {levels}{against}. Read {read}"
@@ -111,14 +109,15 @@ def _run(run: menu.ProposedRuns) -> str:
 
 
 def _doing(run: menu.ProposedRuns) -> str:
+    motors = run.reach.motors
     doing = DOING[run.doing].format(
         payload=run.payload[0],
         brake=1e3 * run.brake,
-        others="the other motor disconnected" if run.motors == 2 else "all motors but one disconnected",
-        gears="gearbox" if run.motors == 1 else "gearboxes",
-        shafts={1: "the motor's shaft", 2: "both motor shafts"}.get(run.motors, f"all {run.motors} motor shafts"),
+        others="the other motor disconnected" if motors == 2 else "all motors but one disconnected",
+        gears="gearbox" if motors == 1 else "gearboxes",
+        shafts={1: "the motor's shaft", 2: "both motor shafts"}.get(motors, f"all {motors} motor shafts"),
     )
-    return f"{run.where}: {doing}" if run.where else doing
+    return doing if run.used is None else f"{run.used.configuration}: {doing}"
 
 
 def heated_winding(temperature: float, allowed: float | None) -> str:
@@ -146,33 +145,28 @@ def instruction_for_further_runs(what: SimpleNamespace) -> str:
     if what.variable in bases.ORDERS:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
         return (
-            "Mark the driving shaft, start every run with it at the mark, and record steady travel at "
+            "Mark the driving shaft, start every run at the mark, and record steady travel at "
             f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. The part that turns at "
-            f"{what.variable} at every speed causes it"
+            f"{what.variable} causes it"
         )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
         return _repeat_instruction(happens)
-    if what.within.imposed != "voltage":
-        by_kind = _of_level(what)
-    else:
-        by_kind = {} if what.within.has_ground else _advice_for_shaft(what)
     last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its range"
-    return (_advice_by_variable(what) | by_kind).get(what.variable, last)
+    return _advice_by_variable(what).get(what.variable, last)
 
 
 def _repeat_instruction(happens: bases.Window) -> str:
     """The same runs, where something happens for a while or at one level."""
     if happens.axis == "order":
         return (
-            f"Make runs {happens.low:.0f} to {happens.high:.0f} again in another order, with as many before and "
-            "after. An error that returns depends on their conditions, else it was an event"
+            f"Repeat runs {happens.low:.0f} to {happens.high:.0f} in another order, among as many others. An error "
+            "that returns depends on their conditions"
         )
     if happens.axis != "time":
-        return f"Make the runs at {happens.words} again on another day, with as many slightly below and above"
+        return f"Repeat the runs at {happens.words} on another day, with some slightly below and above"
     return (
-        f"Repeat two runs, sampled as finely as possible from {happens.low:.3g} to {happens.high:.3g} s. In one, "
-        "switch nothing in that time"
+        f"Repeat two runs, finely sampled from {happens.low:.3g} to {happens.high:.3g} s. In one, switch nothing then"
     )
 
 
@@ -194,63 +188,58 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
 
 
 def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
-    """Advice by variable, for a vehicle with an imposed voltage."""
-    low, high, within = what.low, what.high, what.within
-    load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
-    load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
-    loaded = " and ".join(load) or "a brake or a drawbar pull"
-    volts, angle, mass = what.steps
-    by_duty = what.by_duty
-    driven = f"the supply voltage from {low:g} to {high:g} V in steps of {volts:g} V"
-    crawl = (
-        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from a crawl to {high:g} V"
-    )
+    """Advice by variable, for what is imposed on the motors and what they drive."""
+    high, within, by_duty, (volts, angle, mass) = what.high, what.within, what.by_duty, what.steps
+    speed, current = within.motor_speed, within.current
+    name, unit, usual = {
+        "voltage": ("voltage", "V", 0.0),
+        "motor_speed": ("motor speed", "rpm", speed / RPM),
+        "motor_current": ("motor current", "A", current),
+    }[within.imposed]
+    fixed, warm = f"one {name}", f"at one {name}"
+    advice = {}
+    if unit == "V":
+        fixed, warm = f"{high:g} V", f"at {what.low:g} V or less"
+        steps = (
+            _steps(what) if by_duty else f"the supply voltage from {what.low:g} to {high:g} V in steps of {volts:g} V"
+        )
+        crawl = f"the supply voltage in steps of {volts:g} V from a crawl to {high:g} V"
+        driven = crawl if within.has_ground and not by_duty else _steps(what, "crawl")
+        advice["voltage"] = (
+            f"Repeat at one slope and payload with {steps}" if within.has_ground else f"Repeat with {_steps(what)}"
+        )
+    else:
+        most = max((x / RPM if unit == "rpm" else x for x in within.levels), default=usual)
+        driven = f"the {name}{_up_to(most, what.runs, unit)}"
+    level = f"Repeat {'on the level, unladen, ' * within.has_ground}with {driven}"
+    advice |= dict.fromkeys(("speed_motor", "speed"), level)
+    if not within.has_ground:
+        top = f"{menu.round_significant(what.top):g} V" if unit == "V" else fixed
+        advice["current"] = f"Repeat at {top} with {_brake(what)}" if any(within.torques) else level
+    elif unit == "V":
+        load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
+        load += [f"a slope up to {what.slope:g} deg"] * bool(what.slope > 0)
+        loaded = " and ".join(load) or "a brake or a drawbar pull"
+        most = current * within.motors
+        advice["current"] = f"Repeat at {fixed} with {loaded}, raised in small steps, up to {most:.2g} A"
+        advice["speed"] = (
+            f"Repeat on the level, unladen, with the speed in equal steps up to {within.speed:.2g} m/s at {fixed}"
+        )
     return {
-        "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
-        "current": (
-            f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current covers no load to "
-            f"about {within.current * within.motors:.2g} A evenly"
-        ),
-        "speed_motor": f"Repeat on the level, unladen, with {crawl}",
+        **advice,
         "slope": (
-            f"Repeat at one voltage and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} "
-            "deg, and downhill"
+            f"Repeat at one {name} and payload with slopes from 0 to {what.slope:g} deg in steps of {angle:g} deg, "
+            "and downhill"
         ),
         "payload": (
-            f"Repeat at one voltage and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
-        ),
-        "speed": (
-            "Repeat on the level, unladen, with the speed in equal steps from a crawl to about "
-            f"{within.speed:.2g} m/s at {high:g} V"
+            f"Repeat at one {name} and slope with payloads from 0 to {what.payload:g} kg in steps of {mass:g} kg"
         ),
         "time": (
-            f"Record one condition for ten minutes from a cold start, at no more than {low:g} V, and again while "
-            f"warm. Watch the winding's temperature{_temperature_limit(within.hot)}"
+            f"Record ten minutes {warm} from a cold start, and again while warm. Watch the winding's "
+            f"temperature{_temperature_limit(within.hot)}"
         ),
-        "order": "Repeat the table in reverse order, with one condition after every fifth run",
+        "order": "Repeat the table in reverse order, one condition after every fifth run",
     }
-
-
-def _of_level(what: SimpleNamespace) -> dict[str, str]:
-    """Advice by variable, for an imposed speed or current of the motors."""
-    within_words = what.within
-    level = "Repeat on the level, unladen," if within_words.has_ground else "Repeat"
-    of_speed = within_words.imposed == "motor_speed"
-    most = max(within_words.levels, default=within_words.motor_speed if of_speed else within_words.current)
-    name, levels = ("motor speed", (most / RPM, "rpm")) if of_speed else ("motor current", (most, "A"))
-    turning = f"with the {name}{_up_to(levels[0], what.runs, levels[1])}"
-    words = {
-        "speed_motor": f"{level} {turning}",
-        "speed": f"{level} {turning}",
-        "slope": f"Repeat at one {name} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
-        "payload": f"Repeat at one {name} and slope with the payload from 0 to {what.payload:g} kg",
-        "time": f"Repeat at one {name} for ten minutes from a cold start, and again while warm",
-    }
-    if not within_words.has_ground:
-        words["current"] = (
-            f"{level} at one {name} with {_brake(what)}" if any(within_words.torques) else words["speed_motor"]
-        )
-    return words
 
 
 def _brake(what: SimpleNamespace) -> str:
@@ -260,28 +249,14 @@ def _brake(what: SimpleNamespace) -> str:
     return f"the brake's torque{_up_to(size * most, what.runs, unit)}"
 
 
-def _advice_for_shaft(what: SimpleNamespace) -> dict[str, str]:
-    """Advice by variable, for a shaft as the load."""
-    crawl, top = f"Repeat with {_steps(what, 'crawl')}", menu.round_significant(what.top)
-    return {
-        "voltage": f"Repeat with {_steps(what)}",
-        "speed_motor": crawl,
-        "speed": crawl,
-        "current": f"Repeat at {top:g} V with {_brake(what)}" if any(what.within.torques) else crawl,
-    }
-
-
 #: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "nothing_possible": "Every experiment of the menu is forbidden or impossible on this bench",
+    "nothing_possible": "Every experiment is forbidden or impossible on this bench",
     "no_menu": "The menu has no experiments for {word}",
     "nothing_tells": lambda names, sigma: (
-        f"No experiment of the menu separates {' and '.join(names)} by {sigma:g} σ. Repeat the runs to average "
-        "out noise, or measure one part alone"
+        f"No experiment separates {' and '.join(names)} by {sigma:g} σ. Repeat the runs, or measure one part alone"
     ),
-    "too_weak": (
-        "Runs over {variable} would show the missing term with only {sigma:.1f} σ. Repeat them to average out noise"
-    ),
+    "too_weak": ("Runs over {variable} would show the missing term with only {sigma:.1f} σ. Repeat them"),
     "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
         f"{instruction_for_further_runs(SimpleNamespace(**series))}. Read every channel. This shows how the "
@@ -291,10 +266,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"the motor speed: about {speed / RPM:.0f} rpm unloaded at {voltage:g} V, at most {limit / RPM:.0f} rpm. "
         "Raise the voltage slowly"
     ),
-    "overvoltage": "the supply: {voltage:g} V is above the highest voltage in the table, {used:g} V",
+    "overvoltage": "the supply: {voltage:g} V is above the table's highest, {used:g} V",
     "held_motor": lambda current, **heat: (
-        f"the heating: {current:.2g} A flow through a stationary, uncooled motor, and {heated_winding(**heat)}. "
-        "Switch off within seconds and let the motor cool"
+        f"the heating: {current:.2g} A flow through a stationary motor, and {heated_winding(**heat)}. Switch off "
+        "within seconds and let it cool"
     ),
     "braked_motor": lambda **heat: (
         f"the brake and the winding's temperature: {heated_winding(**heat)}. A few seconds suffice"
@@ -315,19 +290,19 @@ ISOLATED_BY = {
 }  # fmt: skip
 CHECKED_BY = {"total_current": ("zero current", "shunt"), "motor_speed": ("strobe",), "speed": ("timing",)}
 #: Test of any other channel.
-COMPARE = "Compare the instrument for the {} with a second one, at several values"
+COMPARE = "Compare the {} with a second instrument, at several values"
 #: Condition to vary, all others constant, so that a term that depends on a signal changes.
 VARY = {
-    "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
-    "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
-    "duty": "the duty at one supply voltage",
+    "speed": "the speed (the supply voltage)", "current": "the current (slope or payload)",
+    "load": "the load (slope or payload)", "slope": "the slope", "weight": "the payload",
+    "duty": "the duty",
     "configuration": "the configuration", "direction": "the direction of travel",
-    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough for one revolution",
-    THE_SIDE: "nothing: compare both sides straight and in turns both ways",
-    "position": "the position: cover the whole travel in both directions at one voltage",
-    "": "nothing: its share is the same in every run",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample one revolution finely",
+    THE_SIDE: "nothing: compare both sides, straight and in turns",
+    "position": "the position over the whole travel, in both directions",
+    "": "nothing: its share is constant",
 }  # fmt: skip
-WEIGH = "Weigh the robot, unladen and laden, and compare with the robot file"
+WEIGH = "Weigh the robot, unladen and laden"
 
 
 def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:

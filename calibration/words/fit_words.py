@@ -28,8 +28,8 @@ def feedforward_statement(found: Feedforward) -> str:
 MEANT = dict(
     zip(
         WRONG_UNITS,
-        ("per minute", "per second, while the position counts minutes", "in radians", "in rotations", "in degrees",
-         "in rotations", "in rotations per minute, while the position is in radians", "in millimetres",
+        ("per minute", "per second, with a position in minutes", "in radians", "in rotations", "in degrees",
+         "in rotations", "in rotations per minute, with a position in radians", "in millimetres",
          "in centimetres"),
         strict=True,
     )
@@ -44,12 +44,9 @@ if TYPE_CHECKING:
 
 #: Meaning of a parameter far from its prior, by the kind of result.
 FAR = {
-    "loop": "{} has an implausible value, {:.1f} prior sds from its mean. It probably absorbs a missing effect",
-    "calibration": "{} is {:.1f} prior sds from its mean. The prior or the model is wrong",
-    "edge": (
-        "{} is {:.1f} prior sds from its mean, at the edge of the searched range. Widen the prior, or question "
-        "the model"
-    ),
+    "loop": "It probably absorbs a missing effect",
+    "calibration": "The prior or the model is wrong",
+    "edge": "The search ended there. Widen the prior",
 }
 #: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "the prior of its product with the guide share"}
@@ -78,11 +75,11 @@ def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> st
     row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for static "
-            "friction, but sliding does not explain all their slip"
+            f"{row_words} are within {share:.0%} of the adhesion limit. They bound static friction from below, but "
+            "slip more than sliding explains"
         )
     if what == "jumps":
-        return f"{row_words}: the calibrated robot leaves the ground at times"
+        return f"{row_words}: the calibrated robot leaves the ground"
     return f"{row_words}: the calibrated robot has the status {what}"
 
 
@@ -91,9 +88,9 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
     if starts == 1:
         return "one search was made and did not converge" if open else "one search was made"
     if agree == starts:
-        return f"all {starts} searches end at the same optimum"
+        return f"all {starts} searches end at one optimum"
     if open == starts:
-        return f"none of {starts} searches converged. The best is shown"
+        return f"none of {starts} searches converged"
     parts = [f"{agree} of {starts} searches end at the best optimum"]
     if elsewhere:
         parts.append(f"{elsewhere} at other optima (the next best is higher by {more:.3g})")
@@ -104,9 +101,9 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
     """Progress of a search."""
-    end = "The last generation improved no further"
+    end = "The last one improved no further"
     if not settled:
-        end = "The last generation still improved, so use more --generations"
+        end = "The last one still improved: use more --generations"
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
 
 
@@ -114,7 +111,7 @@ def distance_from_prior(at: fit_notes.ReachedBound) -> str:
     """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
         return f"at its {at.bound} bound"
-    return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} the middle of its prior"
+    return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} its prior's mean"
 
 
 # --- what residuals show --------------------------------------------------------------------------------
@@ -132,11 +129,13 @@ def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
     }[test.what]
 
 
+#: Verdict on a model with large errors.
+UNDESCRIBED = "this model does not describe these runs"
 #: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
-    "undescribed": "This model does not describe these runs: {large}. Check units, signs and unused columns first",
+    "undescribed": f"{UNDESCRIBED.capitalize()}: {{large}}. Check units, signs and unused columns first",
     "not converged": "No verdict: the search did not converge ({every})",
-    "worse": "Not adequate: the fit has larger errors than the robot file as given ({every})",
+    "worse": "Not adequate: its errors exceed those of the robot file ({every})",
 }
 
 
@@ -144,7 +143,7 @@ def _misses(those: Sequence[RelativeError]) -> str:
     """`total current 74 % of its measured rms (32 % with the file as given)`."""
     miss_words = [
         f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "
-        "with the file as given)"
+        "before the fit)"
         for m in those
     ]
     return ", ".join(miss_words)
@@ -162,15 +161,15 @@ def adequacy_verdict(found: Adequacy) -> str:
     chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
     if found.adequate is None or found.p_value is None:
         return (
-            "Adequacy cannot be tested: the noise was estimated from the misfit, with only "
-            f"{found.degrees_of_freedom:.4g} degrees of freedom. State it with --noise"
+            "Adequacy cannot be tested: noise was estimated from the misfit "
+            f"({found.degrees_of_freedom:.4g} degrees of freedom). State it with --noise"
         )
     p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
     if not found.adequate:
         why = f"{chi2}, {p}" if found.noise_known else f"{p}, with estimated noise"
         return (
-            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing, which "
-            "parameters may absorb. Run mmrjax loop to find it"
+            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing. Run mmrjax "
+            "loop to find it"
         )
     if found.noise_known:
         return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
@@ -201,7 +200,7 @@ def calibration_answer(found: CalibrationResult) -> str:
             rows[c.label] = int(is_compared.sum())
             channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not channel_errors:
-        return f"{_VERDICTS[found.adequacy.adequate]}. No row has predictions before and after the fit."
+        return f"{_VERDICTS[found.adequacy.adequate]}. No row is predicted before and after the fit."
     same_rows = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same_rows else f" ({rows[label]} rows)") for label, text in channel_errors)
     row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same_rows else "the same rows"
@@ -241,7 +240,7 @@ def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that depend on a column that the model does not use."""
     subject = f"residuals of {channels.find_channel(c.channel).label}"
     range_ = f" within {c.within}" if c.within else ""
-    signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
+    signs = ", with opposite signs in both directions" if c.reversing else ""
     p = f"p = {c.p:.1g}"
     role = "a column that the model does not use" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
@@ -258,54 +257,50 @@ def residual_cluster(c: ResidualCluster) -> str:
     dots = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
         f"{subject} differ between the levels of {c.column}{range_}{signs} (simulated minus measured: "
-        f"{level_words}{dots}, {p}), {role}. Give each level its own configuration, or find what differs"
+        f"{level_words}{dots}, {p}), {role}. Give each level a configuration, or find what differs"
     )
 
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "feedforward_sign": (
-        "A positive voltage gives a negative velocity, so its sign is changed here. Set the inversion in the "
-        "robot's code."
+        "The velocity has the opposite sign of the voltage, which is changed here. Invert it in the robot's code."
     ),
     "feedforward_speed_sign": (
-        "Velocity and position have opposite signs, so that of the velocity is changed here. Invert one in the "
-        "robot's code."
+        "Velocity and position have opposite signs. The velocity's is changed here: invert one in the robot's code."
     ),
     "feedforward_unit": lambda ratio, near: (
         f"The velocity is {ratio:.4g} times the rate of the position: "
-        + (f"it is probably {MEANT[near]}" if near else "check gear ratio and wheel size in the conversion")
+        + (f"it is probably {MEANT[near]}" if near else "check gear ratio and wheel size")
         + ". The constants use the position's unit."
     ),
-    "feedforward_delay": lambda delay: (
-        f"The motion follows the voltage {1000 * delay:.0f} ms late, which the fit includes."
-    ),
+    "feedforward_delay": lambda delay: f"The motion follows the voltage {1000 * delay:.0f} ms late, which is fitted.",
     "feedforward_filter": lambda lag: (
-        f"The velocity lags the position by {1000 * lag:.0f} ms because it is filtered, so the position is "
-        "fitted. Shorten the velocity filter before you use kP."
+        f"The velocity lags the position by {1000 * lag:.0f} ms, so the position is fitted. Shorten the velocity "
+        "filter before you use kP."
     ),
     "feedforward_limit": lambda level, current: (
-        f"A current limit acts: above {level:.2g} V of accelerating voltage the acceleration no longer increases."
+        f"A current limit acts above {level:.2g} V of accelerating voltage."
         + ("" if current is None else f" The current reaches {current:.3g} A.")
         + " Those windows are left out. Lower the dynamic test's voltage, or raise the limit."
     ),
     "feedforward_skid": lambda level: (
-        f"The wheels slip: above {level:.2g} V of accelerating voltage the velocity rises faster. Those windows "
-        "are left out. Lower the dynamic test's voltage."
+        f"The wheels slip above {level:.2g} V of accelerating voltage. Those windows are left out. Lower the "
+        "dynamic test's voltage."
     ),
     "feedforward_direction": lambda forward, backward: (
-        f"kS differs by direction: {forward:.3g} V forward, {backward:.3g} V backward. A slope, a weight or a "
-        "binding gear can cause this. WPILib's kS is their mean."
+        f"kS differs by direction: {forward:.3g} V forward, {backward:.3g} V backward, as with a slope, a weight "
+        "or a binding gear. WPILib's kS is their mean."
     ),
     "feedforward_sag": lambda rest, low: (
-        f"The battery sagged from {rest:.3g} to {low:.3g} V. Without the voltage at the motor, kA and kV are too "
-        "large. Use setVoltage, or a fresh battery."
+        f"The battery sagged from {rest:.3g} to {low:.3g} V, which makes kA and kV too large. Use setVoltage, or a "
+        "fresh battery."
     ),
     "feedforward_missing": "Tests are missing: {tests}.",
     "feedforward_no_kA": lambda share, missing: (
         f"kA is not determined: its 95 % interval is ± {100 * share:.0f} %"
         + (f" ({', '.join(missing)} missing)" if missing else "")
-        + ". No feedback gains are given. Run dynamic tests with more acceleration and a faster log."
+        + ", so there are no feedback gains. Run dynamic tests with more acceleration and a faster log."
     ),
     "feedforward_gains_delayed": lambda delay, slow, prompt: (
         f"A delay of {1000 * delay:.0f} ms reduces the velocity kP from {prompt:.3g} to {slow:.3g}."
@@ -315,29 +310,28 @@ SAID: dict[str, str | Callable[..., str]] = {
         "these runs determine only combinations: "
         + ", ".join(f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs)
     ),
-    "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
+    "far_from_prior": lambda name, sds, kind: f"{name} is {sds:.1f} prior sds from its mean. {FAR[kind]}",
     "noise_off": lambda channel, factor, source: (
         f"the residuals of {channels.find_channel(channel).label if channel else 'every channel'} are {factor:.2g} "
         f"times the {source} noise. Check the noise"
     ),
-    "not_profiled": "intervals come from the linearized model, which makes them too symmetric (--profiles)",
-    "no_covariance": "the posterior has no finite covariance. Use the values, but not the intervals",
-    "no_grip": "every run slides, so only priors determine static friction and slip below its limit",
+    "not_profiled": "intervals are those of a linearized model (--profiles)",
+    "no_covariance": "the posterior has no finite covariance. Do not use the intervals",
+    "no_grip": "every run slides, so only priors determine static friction",
     "estimated_noise": lambda percent: (
-        "no noise was given, so it is estimated from the misfit: "
+        "noise is estimated from the misfit, which cannot test the model: "
         + ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
-        + ". It includes model error, so it cannot test the model"
     ),
     "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
         f"{_error_share(channel, share)} lies in the first sample after each step of the command ({rows} of {total} "
-        f"rows). Without them, the rms error falls to {100 * (1 - share) ** 0.5:.0f} %. Readings and command may be "
-        'offset in time. To fit this, set [rig] delay = "0 ± 0.02" [s]'
+        f"rows). Without them, the rms error falls to {100 * (1 - share) ** 0.5:.0f} %. Readings may be late. To fit "
+        'this, set [rig] delay = "0 ± 0.02" [s]'
     ),
     "freed_delay": lambda channel, share: (
         f"without a delay, {_error_share(channel, share)} lies in the first sample after each step of the command, "
-        "so rig.delay is fitted. To leave it out, set [rig] delay = '0 ± 0'"
+        "so rig.delay is fitted. To prevent this, set [rig] delay = '0 ± 0'"
     ),
     "shifted": lambda channel, share, shift: (
         f"{_error_share(channel, share)} is explained by readings {abs(1e3 * shift):.2g} ms "
@@ -345,29 +339,29 @@ SAID: dict[str, str | Callable[..., str]] = {
         f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s]'
     ),
     "product_alone": lambda friction, share, free: (
-        f"the readings depend only on the product {friction} x {share}. Only priors determine its factors"
+        f"the readings depend only on the product {friction} x {share}, whose factors only priors determine"
         if free
         else f"{share} is fitted with {friction} fixed, because readings depend only on their product"
     ),
     "prior_of_product": (
-        "{name} has the prior {mean:.3g} ± {sd:.2g}, which other fidelities use for its product with the guide "
-        "share. In the track model the guides carry {share:.0%} of the weight"
+        "{name} has the prior {mean:.3g} ± {sd:.2g} of its product with the guide share. In the track model the "
+        "guides carry {share:.0%} of the weight"
     ),
     "no_prediction": lambda kind, rows, total: (
-        f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because "
-        "the robot fitted to the other blocks slides. The errors exclude them"
+        f"blocks by {blocks.kind_in_words(kind)}: the errors exclude {rows} of {total} held-out rows, in which "
+        "the robot fitted to the other blocks slides"
     ),
-    "block_not_converged": "the search with one block of {kind} left out did not converge",
+    "block_not_converged": "the search without one block of {kind} did not converge",
     "agreement": search_agreement,
     "unsettled": lambda names: (
-        "the search ended before it converged. Its parameters are the best found, and their intervals are "
-        f"unreliable. These data {'do not determine ' + ', '.join(names) if names else 'determine all parameters'}"
+        "the search ended before it converged, so intervals are unreliable. These data "
+        f"{'do not determine ' + ', '.join(names) if names else 'determine all parameters'}"
     ),
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
-    "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Closer conditions would show which is right",
+    "in_pieces": "{name} has a 95 % interval of {pieces} parts",
     "generations": search_generations,
     "ended_at_edge": lambda edge: (
-        "the search ended at the edge of its range: the best member has "
+        "the search ended at the edge of its range, with "
         + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
     ),
 }

@@ -18,6 +18,7 @@ from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.settings import WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
+from calibration.words.fit_words import UNDESCRIBED
 from mmrjax import effects
 from mmrjax.effects.base import EQUATION
 from mmrjax.errors import count_noun
@@ -47,7 +48,7 @@ def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
     if said.noise:
         text = f"{text} But {'. '.join(map(describe, said.noise))}"
     if said.cluster is not None:
-        text = f"{text} {cluster_sentence(said.cluster).capitalize()}. This is a finding, so these rows are kept."
+        text = f"{text} {cluster_sentence(said.cluster).capitalize()}, so these rows are kept."
     return text
 
 
@@ -75,19 +76,20 @@ def _verdict(said: loop_notes.VerdictSummary) -> str:
         return text
     names = [_effect_and_rivals(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
-    place_sentence = (
-        "" if location is None else f" The {bases.place_in_words(location.place)} still has an unexplained error."
-    )
+    place_sentence = "" if location is None else f" The {bases.place_in_words(location.place)} still has an error."
     return f"Missing: {' and '.join(names)} ({_evidence(said)}).{in_model}{place_sentence}"
 
 
 def _evidence(said: loop_notes.VerdictSummary) -> str:
     """p-value, and the errors that remain where the refit misses a channel."""
-    remaining = [
-        f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms" for m in said.missed
-    ]
-    unseen = f", but on unseen runs it still misses {', '.join(remaining)}" * bool(remaining)
+    remaining = map(_missed, said.missed)
+    unseen = f", but it still misses {', '.join(remaining)} on unseen runs" * bool(said.missed)
     return f"family-wise p {p_value(said.p)}{unseen}"
+
+
+def _missed(m: loop_notes.MissedChannel) -> str:
+    """`total current by 10 % of its measured rms`."""
+    return f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
 
 
 def loop_answer(found: loop_notes.Headline) -> str:
@@ -107,10 +109,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
     )
     return {
         "none": f"Yes, as far as these runs show{noises}: the residuals are consistent with noise.",
-        "undescribed": f"No verdict{noises}: this model does not describe these runs.",
+        "undescribed": f"No verdict{noises}: {UNDESCRIBED}.",
         "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
-        "named": f"No: {_are_missing(laws)}{noises}.",
-        "class": f"No: {_are_missing(laws)}{noises}.",
+        **dict.fromkeys(("named", "class"), f"No: {_are_missing(laws)}{noises}."),
         "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
         "place": f"No: {lacks}{noises}.{apart} No more is established.",
     }[found.level]
@@ -142,18 +143,17 @@ def _are_missing(nouns: Sequence[str]) -> str:
 def _undescribed(said: loop_notes.VerdictSummary) -> str:
     """Sentence on a model that does not describe the runs: the misfit and the checks."""
     place_words = [
-        f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
-        + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
+        _missed(m) + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
     ]
     check = [f"unused columns that vary ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of columns"]
     if not place_words:
-        return "This model does not describe these runs: it lacks backlash. Add backlash first."
+        return f"{UNDESCRIBED.capitalize()}: it lacks backlash. Add backlash first."
     return (
-        f"This model does not describe these runs: after the refit, it misses {', '.join(place_words)}. No "
-        f"effect is named. Check first: {', and '.join(check)}."
+        f"{UNDESCRIBED.capitalize()}: after the refit, it misses {', '.join(place_words)}. Check "
+        f"first: {', and '.join(check)}."
     )
 
 
@@ -178,9 +178,9 @@ def _changed_constant(constant: str, run: int | None) -> str:
 #: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the misfit beyond noise",
-    "gain": "it changes the log likelihood of held-out runs by {0.gain:+.2g} ± {0.se:.2g} per reading",
-    "again": "it is found again in only {again:.0f} % of the fits without one block",
-    "many": "any of {many} variables or equations may be its cause",
+    "gain": "the log likelihood of held-out runs changes by {0.gain:+.2g} ± {0.se:.2g} per reading",
+    "again": "only {again:.0f} % of the fits without one block find it again",
+    "many": "{many} variables or equations may cause it",
     "run": "{changed} explains as much",
 }
 
@@ -272,7 +272,7 @@ def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.Na
         else f"{_effect_and_rivals(one)} ({support_reasons(support)})"
         for one in those
     ]
-    return f" Tentative, kept in the model because it improves predictions: {'; '.join(effect_words)}."
+    return f" Tentative, kept because it improves predictions: {'; '.join(effect_words)}."
 
 
 def verdict_line(stages: LoopStages) -> str:
@@ -292,9 +292,9 @@ def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
             f"{found.p_value:.2g})"
         ]
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
-    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:5]
+    beyond = found.beyond_chance[:5]
     if not beyond:
-        return [f"{first}. No effect explains more than chance"]
+        return [f"{first}. No effect exceeds chance"]
     if brief:
         return [f"{first}. Strongest alone: {', '.join(e.name for e in beyond)}"]
     lines = [
@@ -307,8 +307,7 @@ def ranking_lines(found: EffectRanking, brief: bool = False) -> list[str]:
 
 def regression_verdict(found: EffectRanking) -> str:
     """Answer of a ranking to a loop without a verdict: never more than a mechanism, and the base parameters."""
-    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies]
-    alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
+    alike = [e for e in found.beyond_chance if e.score >= found.beyond_chance[0].score - Settings.alternative]
     families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
     lacks = "something may be missing, but no effect explains it"
     if alike:
@@ -320,7 +319,7 @@ def regression_verdict(found: EffectRanking) -> str:
 
 
 #: Remark beside a regression that sees nothing, where the simulation does.
-DISAGREES = "simulation disagrees and decides: the refit leaves more error than chance, so something is missing"
+DISAGREES = "simulation disagrees: the refit leaves more error than chance"
 
 
 def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
@@ -455,7 +454,7 @@ def errors_of_written_robot(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block, or "No"."""
     when = 1 if found.written else 0
     if found.headline.level == "undescribed":
-        return ["No: this model does not describe these runs."]
+        return [f"No: {UNDESCRIBED}."]
     lines = [f"**These conditions**: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
     for kind, error_pair in found.errors_held_out.items():
         lines.append(f"**Another {blocks.kind_in_words(kind)}**: {_rms(error_pair[when], len(found.runs))}.")
@@ -495,16 +494,18 @@ def _conditions(columns: Mapping[str, str | float]) -> str:
 SHARE = 10.0
 
 
+def _begun_from(robot_name: str) -> str:
+    return f" from {robot_name}" if robot_name else ""
+
+
 def proposed_header(found: DiscoveryResult, robot_name: str) -> str:
     """Header of the proposed robot's file."""
-    start = f" from {robot_name}" if robot_name else ""
-    return f"found by the loop{start} with {found.runs.source}: {found.statement}"
+    return f"found by the loop{_begun_from(robot_name)} with {found.runs.source}: {found.statement}"
 
 
 def refit_header(found: DiscoveryResult, robot_name: str) -> str:
     """Header of the refitted robot's file."""
-    start = f" from {robot_name}" if robot_name else ""
-    return f"fitted by the loop{start} to {found.runs.source}, with no effect added"
+    return f"fitted by the loop{_begun_from(robot_name)} to {found.runs.source}, with no effect added"
 
 
 #: In the place of a formula.
@@ -516,11 +517,11 @@ NO_FORMULA = "no single term explains 90 % of the curve"
 REASONS = {
     "": "",
     "implausible": "every effect that explains it has an implausible size",
-    "larger": "{effects} would explain more, but only at an implausible size",
+    "larger": "{effects} would explain more, at an implausible size",
     "better curve": "a {curves} explains the data better than {effects}",
     "curve alone": "a single {curves} leaves no significant misfit",
     "none by itself": "{lost}",
-    "beside": "each effect, added to the others, explains more than chance: {strengths}",
+    "beside": "each effect explains more than chance: {strengths}",
 }
 
 
@@ -558,14 +559,14 @@ def _score_words(test: loop_notes.NameTest) -> str:
 #: Evidence against a single effect.
 DOUBTS = {
     "chance": "explains {0.root:.1f} σ{beside}, where chance alone reaches {0.needed:.1f} σ",
-    "curve": "is a worse explanation than a smooth curve in its place",
+    "curve": "explains less than a smooth curve in its place",
     "row": "depends on row {0.row} alone",
     "run": "explains no more than {changed} ({0.root_changed:.1f} σ)",
-    "blocks": "is chosen again in only {again:.0f} % of the fits without one block",
+    "blocks": "is chosen by only {again:.0f} % of the fits without one block",
     "larger": "explains less than {larger} at an implausible size",
     "remains": "leaves an error in its own equation",
     "form": "changes in size{spread} over {over_variable} ({0.varies:.1f} σ)",
-    "noise": "is only {0.offset:.1%} of readings whose noise is not stated (--noise)",
+    "noise": "is only {0.offset:.1%} of readings of unknown noise (--noise)",
 }
 
 
@@ -607,7 +608,7 @@ def support_sentence(found: DiscoveryResult) -> str:
 
 #: Reasons why an effect is not plausible.
 RULED_OUT = {
-    "power": "{0.name} would supply power instead of losing it",
+    "power": "{0.name} would supply power",
     "size": "{0.name} would have {0.size:.2g} times its largest plausible size, so check {check}",
     "edge": "{0.name} is within one sd of its largest plausible size",
 }
@@ -708,20 +709,20 @@ def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
 def copied_rows(rows: tuple[int, ...]) -> str:
     """Rows that copy earlier ones."""
     if len(rows) == 1:
-        return f"row {rows[0]} is an exact copy of an earlier one and counts once"
-    return f"rows {', '.join(map(str, rows))} are exact copies of earlier ones and count once"
+        return f"row {rows[0]} is an exact copy and counts once"
+    return f"rows {', '.join(map(str, rows))} are exact copies and count once"
 
 
 #: Reasons why rows do not count.
 UNUSED = {
-    "unusable": "are not used, because the fit slides or fails there",
-    "outliers": "are outliers that no effect explains, and are left out",
+    "unusable": "are not used: the fit slides or fails there",
+    "outliers": "are outliers that no effect explains",
 }
 
 
 def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
     """Delay of the imposed quantity, and the line for the rig's file. `ends`: it is a tenth of a run or more."""
-    why = "a longer delay is not searched. Check the clocks of the columns"
+    why = "no longer delay is searched. Check the columns' clocks"
     return (
         f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms "
         f"{'later' if delay > 0 else 'earlier'} than its column states, and "
@@ -732,12 +733,12 @@ def imposed_delay(delay: float, sd: float, ends: bool = False) -> str:
 
 #: Reason why a log does not show the states of its equations → sentence part, and what to log.
 UNSHOWN = {
-    "motion": "no channel reads a speed or an angle. For a fast answer, log one",
-    "sign": "an instrument shows only a magnitude. For a fast answer, log the sign",
-    "slack": "motor and load move apart",
-    "turn": "the robot turns",
-    "goal": "a controller gives the voltage. For a fast answer, log the duty",
-    "follower": "no channel follows the imposed speed. For a fast answer, log the current",
+    "motion": ("no channel reads a speed or an angle", "one"),
+    "sign": ("an instrument shows no sign", "it"),
+    "slack": ("motor and load move apart", ""),
+    "turn": ("the robot turns", ""),
+    "goal": ("a controller gives the voltage", "the duty"),
+    "follower": ("no channel follows the imposed speed", "the current"),
 }
 
 
@@ -761,38 +762,37 @@ def sentence_on_single_run(
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "assumed_noise": "the noise of {channels} is not given, so {usual} is assumed. Set yours with --noise",
+    "assumed_noise": "no noise is given for {channels}: {usual} is assumed. Set yours with --noise",
     "noise_from_series": noise_from_series,
     "refit_worse": (
-        "{channel}: the refit made its error larger ({stated:.0%} → {refit:.0%} of the measured rms), because "
-        "the {word} noise weights some readings too much. State it with --noise"
+        "{channel}: the refit increased its error ({stated:.0%} → {refit:.0%} of the measured rms), so the {word} "
+        "noise is wrong. State it with --noise"
     ),
     "copies": copied_rows,
     "kept_out": lambda rows, why: f"rows {', '.join(map(str, rows))} {UNUSED[why]}",
-    "phases_differ": (
-        "the phase of the wave differs between runs, so robot.toml has the mean. The wave explains {free:.0f} "
-        "σ² with a phase for each run, {held:.0f} σ² with one. Start every run at the same shaft angle"
-    ),
     "still_lacks": lambda place, variable: (
-        f"the {bases.place_in_words(place)} still has an unexplained error, which varies with the "
+        f"the {bases.place_in_words(place)} still has an error, which varies with the "
         f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
-    "unshown": lambda source, why: f"{source}: effects are simulated, in minutes, because {UNSHOWN[why]}",
-    "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted",
-    "outstanding": lambda factors, word: (
-        f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "
-        f"{word} noise. The same command without --within tests it"
+    "unshown": lambda source, why: (
+        f"{source}: effects are simulated, in minutes, because {UNSHOWN[why][0]}"
+        + f". Log {UNSHOWN[why][1]} for a fast answer" * bool(UNSHOWN[why][1])
     ),
-    "too_few_replicates": "{settled} bootstrap tables are too few for some evidence. Use --replicates 500",
+    "lost_replicates": "only {settled} of {asked} bootstrap tables were refitted",
+    "outstanding": lambda factors, word: (
+        f"no time was left to test the verdict with {' and '.join(f'{f:g}' for f in factors)} times the "
+        f"{word} noise. Run it without --within"
+    ),
+    "too_few_replicates": "{settled} bootstrap tables are too few. Use --replicates 500",
     "rests_on": sentence_on_single_run,
     "run_differs": lambda test: (
         f"{_changed_constant(test.changed, test.row)} explains {test.root_changed:.1f} σ, {test.effect} "
-        f"{test.root:.1f} σ. Check what was different in that run, or repeat it"
+        f"{test.root:.1f} σ. Check or repeat that run"
     ),
     "contradicted": (
-        "a simulation explains {gained:.0%} of the misfit, not {promised:.0%} as the equations do, so the claim "
-        "is one level lower"
+        "a simulation explains {gained:.0%} of the misfit, the equations {promised:.0%}, so the claim is one level "
+        "lower"
     ),
     "unwritten": lambda curve, gain, se: (
         f"{'the curve' if curve else 'what was found'} predicts held-out runs "

@@ -60,11 +60,7 @@ def points_studied(found: SensitivityResult) -> str:
     parts = {o.studied.tobytes(): o.studied for o in found.outputs.values() if not o.studied.all()}
     if not parts:
         return f"At {count_noun(total, 'operating point')}"
-    why = (
-        "the robot does not travel"
-        if found.method == "local"
-        else ("too many robots in the sample do not travel there")
-    )
+    why = "the robot does not travel" if found.method == "local" else "too many sampled robots do not travel there"
     fewest = min(int(x.sum()) for x in parts.values())
     if len(parts) > 1:
         return f"At {fewest} to {total} of {total} operating points, by output (others are left out, because {why})"
@@ -97,7 +93,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "sampling": lambda method, points: f"{METHODS[method]}, over {points} operating points",
     "points_left_out": lambda points, total, sampled, outputs: (
         f"{points} of {total} operating points are left out, since "
-        f"{'too many robots in the sample do' if sampled else 'the robot does'} not travel there "
+        f"{'too many sampled robots do' if sampled else 'the robot does'} not travel there "
         f"({', '.join(outputs)})"
     ),
     "sample_left_out": lambda points, share, outputs: (

@@ -12,23 +12,23 @@ from mmrjax.errors import count_noun
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
-    "battery.": "runs on the on-board battery (Source Mode 1)",
-    "motor.inductance": "a history of the starting current, sampled every 0.1 ms",
+    "battery.": "runs on the battery (Source Mode 1)",
+    "motor.inductance": "the starting current, sampled every 0.1 ms",
     "motor.inertia": "a history of the start",
     ".inertia": "a history of the start",
-    "motor.resistance_thermal": "long runs at high current with the effect winding_heating",
-    "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating",
-    ".friction.dynamic": "a history in which the movers spin faster than V_d",
-    ".friction.speed_dynamic": "a history in which the movers spin faster than V_s",
+    "motor.resistance_thermal": "long runs at high current and the effect winding_heating",
+    "motor.temperature_ambient": "several room temperatures and the effect winding_heating",
+    ".friction.dynamic": "a history with movers faster than V_d",
+    ".friction.speed_dynamic": "a history with movers faster than V_s",
     ".guide_share": "the fidelities steady and drive (in track, fit guide_friction)",
-    ".mass": "a scale, or runs whose table does not state total_mass_kg",
+    ".mass": "a scale, or runs without total_mass_kg",
 }
 #: Losses that data do not distinguish without variation of a condition.
 ALIKE = {
-    "guides": "without slopes, rolling resistance, guide friction and Coulomb losses are indistinguishable",
-    "slope": "without slopes, rolling resistance and Coulomb losses are indistinguishable",
-    "voltage": "at one voltage, constant losses and losses that grow with speed are indistinguishable",
-    "speed": "at one speed, constant losses and losses that grow with speed are indistinguishable",
+    "guides": "rolling resistance, guide friction and Coulomb losses",
+    "slope": "rolling resistance and Coulomb losses",
+    "voltage": "constant and speed-dependent losses",
+    "speed": "constant and speed-dependent losses",
 }
 
 
@@ -37,7 +37,7 @@ def would_measure(name: str) -> str:
     for key, meaning in WOULD_MEASURE.items():
         if name.startswith(key) or name.endswith(key):
             return meaning
-    return "runs under conditions in which it has an effect"
+    return "conditions in which it has an effect"
 
 
 def differing_repeats(
@@ -58,9 +58,9 @@ def differing_repeats(
     )
     if unused:
         name = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
-        return f"{reading}. {_unused(unused)}. So {name}, or, for a load, give each level its own configuration"
+        return f"{reading}. {_unused(unused)}. So {name}, or give each level of a load a configuration"
     wrong = f"{reading}. Remove the wrong row"
-    return f"{wrong}, or find what changed between these rows and has no column" if more else wrong
+    return f"{wrong}, or find what changed between them" if more else wrong
 
 
 def _unused(names: Sequence[str]) -> str:
@@ -90,8 +90,8 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     factor = abs(slope) if intercept else slope
     sentence = f"{source}, {column}: equals {start}{factor:.4g} times {other} in every row, to the last digit"
     if tied:
-        return f"{sentence}. If it is computed, remove it: the noise of {other} would count twice"
-    return f"{sentence}, so it is computed. Measure it, or remove it from the channels"
+        return f"{sentence}. If it is computed, remove it: it would count twice"
+    return f"{sentence}, so it is computed. Measure or remove it"
 
 
 def _runs(names: Names, one: str, several: str) -> str:
@@ -103,8 +103,7 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
     changes = ", ".join(f"{name} {own_value:g} instead of {nominal:g}" for name, own_value, nominal in changed)
     return (
         f"the {part} differs from the nominal robot's ({changes}), but {', '.join(kept)} still "
-        f"{'has' if len(kept) == 1 else 'have'} the nominal robot's prior. Set yours in the robot's file or with "
-        "--prior"
+        f"{'has' if len(kept) == 1 else 'have'} the nominal robot's prior. Set yours with --prior"
     )
 
 
@@ -125,31 +124,26 @@ NOT_OVER_TIME = {"sides": "a log of two sides is not fitted over time", "unfitte
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "unmeasured": lambda name: (
-        f"{name} keeps its prior value, because these data do not determine it. It needs {would_measure(name)}"
-    ),
-    "constant": lambda column, value, alike: f"{column} is {value:g} in every row: {ALIKE[alike]}",
+    "unmeasured": lambda name: f"{name} keeps its prior value. These data lack {would_measure(name)}",
+    "constant": lambda column, value, alike: f"{column} is {value:g} in every row, so {ALIKE[alike]} look the same",
     "repeats": differing_repeats,
     "larger_noise": (
-        "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much as the "
-        "{source} noise predicts, so its sd is multiplied by this. Check the repeats, or set --noise"
+        "{channel}: {pairs} pairs of repeats scatter {factor:.2g} times the {source} noise, so its sd is "
+        "multiplied by this. Check them, or set --noise"
     ),
     "unused": unused_columns,
     "no_load_gives": (
-        "{source}, {theirs}: the load's friction and constant torque leave {share:.0%} of its variance "
-        'unexplained. If a brake sets it, set [columns] load_torque_Nm = "{theirs}" in the robot\'s file, and '
-        "remove output_torque from its channels"
+        "{source}, {theirs}: the load's friction and torque leave {share:.0%} of its variance unexplained. If a "
+        'brake sets it, set [columns] load_torque_Nm = "{theirs}", and remove the channel output_torque'
     ),
     "nothing_varies": nothing_varies,
     "copied": copied_channel,
     "turned": (
-        "{source}, {theirs}: differs by {off:.2g} (rms) from the robot file's values, but by {turned:.2g} with "
-        'the opposite sign. If its sign is reversed, set [columns] {column} = {{column = "{theirs}", factor = '
-        "-1}}"
+        "{source}, {theirs}: its rms error is {off:.2g}, but {turned:.2g} with the opposite sign. To reverse it, "
+        ' set [columns] {column} = {{column = "{theirs}", factor = -1}}'
     ),
     "stiff_supply": (
-        "{column} is {value:g} in every row, so the supply is treated as stiff. If it was not measured, remove "
-        "the column"
+        "{column} is {value:g} in every row, so the supply counts as stiff. If it is not measured, remove it"
     ),
     "lost_motion": lambda source, column, reversals, width, unit, angle, stiffness: (
         f"{source}, {column}: "
@@ -158,45 +152,41 @@ SAID: dict[str, str | Callable[..., str]] = {
             f'compliant coupling. Set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
             if stiffness
             else (
-                f"at each of {reversals} reversals about {width:.2g} {unit} of motion is lost, as by backlash or "
-                f'a compliant coupling. Set backlash = "{angle:.2g} ± 30 %" (rad'
+                f"at each of {reversals} reversals about {width:.2g} {unit} of motion is lost, as by backlash. "
+                f'Set backlash = "{angle:.2g} ± 30 %" (rad'
             )
         )
-        + " at the output) in the load's table of the robot file"
+        + " at the output) in the load's table"
     ),
     "ends_early": lambda runs, lasts, share: (
         f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest"
-        f"{'' if math.isnan(share) else f', at {share:.0%} of the speed of steady travel'}, before the speed is "
-        "steady, so only priors determine the resistance to travel. Record longer"
+        f"{'' if math.isnan(share) else f', at {share:.0%} of the steady speed'}, before the speed is steady, so "
+        "only priors determine the resistance to travel. Record longer"
     ),
     "never_grips": lambda runs, share: (
-        f"{_runs(runs, 'slides', 'slide')} to the end, at {share:.0%} of the speed of the tracks or wheels. Such "
-        "runs do not measure static friction"
+        f"{_runs(runs, 'slides', 'slide')} to the end, at {share:.0%} of the speed of the tracks or wheels. This "
+        "does not show static friction"
     ),
     "thinned": (
-        "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time. Change this with "
-        "--rows, or use settle, which takes all"
+        "{source}: the fit uses {kept} of {rows} rows, evenly spaced in time. Change this with --rows, or use settle"
     ),
     "settled_runs": lambda source, why, runs, lasts: (
-        f"{source}: {NOT_OVER_TIME[why]}, so the fit uses the means of its settled runs ({runs}, {lasts:.3g} s in "
-        "all). They do not show inertias, delays or the start"
+        f"{source}: {NOT_OVER_TIME[why]}, so the fit uses its settled runs ({runs}, {lasts:.3g} s in all), "
+        "which show no inertias, delays or start"
     ),
     "few_points": (
         "{source}: a log of two sides is not fitted over time, and its settled runs ({runs}, {lasts:.3g} s in all) "
-        "have too few operating points ({points}). Hold {needed} or more different levels until all readings are "
-        "steady for {each:.2g} s. For straight travel, give one command instead of two"
+        "have only {points} operating points. Hold {needed} or more levels until all readings are steady for "
+        "{each:.2g} s. For straight travel, give one command"
     ),
-    "thinned_table": (
-        "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers refer to "
-        "them. Change this with --rows"
-    ),
+    "thinned_table": ("{source}: {kept} of {rows} rows are used and numbered anew. Change this with --rows"),
     "coarse_steps": lambda lasts, step: (
-        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Ripple with a period below ten "
-        "steps needs shorter runs"
+        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Faster ripple than ten steps needs "
+        "shorter runs"
     ),
     "stops_on_slope": (
-        "run {runs}: the motors are not driven on a slope. Time histories smooth friction at rest, so the robot "
-        "creeps at a few mm/s. Leave out rows at rest if readings are more exact"
+        "run {runs}: the motors are not driven on a slope. The simulated robot creeps there at a few mm/s. "
+        "Leave out rows at rest if they matter"
     ),
     "inherited_priors": inherited_priors,
     "off_by": sentence_on_implausible_readings,
@@ -211,21 +201,21 @@ SAID: dict[str, str | Callable[..., str]] = {
 OF_LEVELS = ("changes", "short", "settling", "accelerates")
 #: Finding and advice for each of `settling.REASONS`.
 WHY = {
-    "changes": ("the imposed quantity always changes", "hold it at each level for a while"),
-    "short": ("the level is held too briefly", "hold it longer, or set a smaller --shortest"),
-    "settling": ("still changes at the end of its level", "hold the level longer, or set a larger --drift"),
-    "accelerates": ("still accelerates at the end of its level", "hold the level longer, or set a larger --drift"),
-    "idle": ("nothing drives the motors", "nothing, settled runs need a driven motor"),
+    "changes": ("the imposed quantity always changes", "hold each level for a while"),
+    "short": ("the level is held too briefly", "hold it longer, or lower --shortest"),
+    "settling": ("still changes at the end of its level", "hold it longer, or raise --drift"),
+    "accelerates": ("still accelerates at the end of its level", "hold it longer, or raise --drift"),
+    "idle": ("nothing drives the motors", "nothing"),
     "rest": ("the drive does not move", "nothing, friction holds the drive"),
     "stuck": (
-        "shows one number for a long time: saturated or frozen",
-        "repair the instrument or change its range",
+        "is saturated or frozen",
+        "check the instrument",
     ),
     "glitches": (
-        "has many readings far from the others",
-        "repair the instrument, or log a mean of pulses",
+        "has many outliers",
+        "check the instrument, or log a mean of pulses",
     ),
-    "unread": ("no channel has enough readings", "log more readings, or remove these rows"),
+    "unread": ("no channel has enough readings", "log more, or remove these rows"),
     "undriven": ("the driver brakes or coasts", "nothing, a fit to the log uses them"),
 }
 
@@ -276,8 +266,8 @@ def levels_and_samples(found: Settled) -> str:
     """Division of samples into levels, and the samples of a level that are used."""
     return (
         f"Neighbouring samples are one level if the imposed quantity differs by less than {50 * found.drift:g} % "
-        f"or its noise. Its first samples are left out until every channel stays within {100 * found.drift:g} % "
-        "of its last value, or its noise."
+        f"or its noise. A level counts once every channel stays within {100 * found.drift:g} % of its last value, "
+        "or its noise."
     )
 
 
@@ -292,7 +282,7 @@ def sentence_on_few_settled_runs(found: Settled, fewest: int, loop: str) -> str:
         return ""
     if found.runs.turns:  # over time a turn is simulated, and not fitted
         return f"The loop needs {fewest} settled runs: hold more levels, or each longer."
-    return f"The loop needs {fewest} settled runs, so run it on the log as it is: {loop}."
+    return f"The loop needs {fewest} settled runs, so run it on the log: {loop}."
 
 
 def settle_remarks(found: Settled) -> list[str]:
@@ -307,21 +297,21 @@ def settle_remarks(found: Settled) -> list[str]:
             worst = glitch_stretches[counts.index(max(counts))]
             remarks.append(
                 f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
-                f"{count_noun(len(glitch_stretches), 'settled run')} left out of the mean, far from their "
-                f"neighbours. Most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
+                f"{count_noun(len(glitch_stretches), 'settled run')} are far from their neighbours and left out of "
+                f"the mean, most in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
                 f"({100 * max(counts) / len(worst.rows):.2g} %). Check the instrument, or log a mean of pulses"
             )
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:
             remarks.append(
-                f"{channel.column} is the rate of {angles[channel.name]}. Add {channel.name} to channels in the "
-                "rig's file to get it"
+                f"{channel.column} is the rate of {angles[channel.name]}. To get it, add {channel.name} to the "
+                "rig's channels"
             )
     wide = {name: x for name, x in found.scatter.items() if x > 0}
     for signal in (s for s in found.signals if s.channel.name in wide):
         remarks.append(
             f"{signal.channel.column}: repeated levels differ by {wide[signal.channel.name]:.2g} "
-            f"{signal.channel.unit} more than their noise, which the sds include"
+            f"{signal.channel.unit} beyond their noise, which the sds include"
         )
     return remarks

@@ -22,14 +22,12 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.quantities import HEAT, VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import BATTERY_EMPTY, CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
+from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
 from mmrjax.numerics.elementary import magnitude
 from mmrjax.undercarriage.side_contacts import GearReactions
 
 T = TypeVar("T")
 
-#: Every option of a fidelity by name, from `FidelityFacts.resolved`.
-Options = Mapping[str, float]
 #: Callback for progress; receives the finished share of the work, 0..1.
 Progress = Callable[[float], None]
 
@@ -152,7 +150,9 @@ class ImplicitSolution:
     shown: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
 
 
-def _accept_every_run(robot: Robot, conditions: Conditions, options: Options) -> None:  # results are pickled
+def _accept_every_run(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float]
+) -> None:  # results are pickled
     """Accepts every run."""
 
 
@@ -184,7 +184,7 @@ class Fidelity:
     outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
     implicit: ImplicitSolution | None = None
     histories: SimulateBatch | None = None
-    check: Callable[[Robot, Conditions, Options], None] = _accept_every_run
+    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _accept_every_run
     cautions: Callable[[Robot, Conditions], list[str]] = _without_cautions
     columns: tuple[str, ...] = ()
 
@@ -274,11 +274,6 @@ def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     backward = speed < 0
     has_asked_sign = jnp.where(backward, voltage < 0, voltage >= 0)
     return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
-
-
-def status_unless_empty(status: Array, robot: Robot, conditions: Conditions, discharge: Scalar) -> Array:
-    """A status, or `battery_empty` if the charge taken [C] has emptied the on-board battery."""
-    return jnp.where((conditions.battery > 0.5) & robot.battery.empty(discharge), BATTERY_EMPTY, status)
 
 
 def movers_slip(robot: Robot, signals: Signals) -> Array:

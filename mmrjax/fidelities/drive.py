@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import equinox as eqx
@@ -16,11 +16,9 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.base import (
     Fidelity,
     History,
-    Options,
     Progress,
     RunBatch,
     result_of_signals,
-    status_unless_empty,
     withhold_numbers,
 )
 from mmrjax.fidelities.rest import HELD, holds, standing_signals, status_moving, voltage_at_rest
@@ -28,7 +26,7 @@ from mmrjax.fidelities.steady import operating_signals
 from mmrjax.model import balances
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.driver import FAST
-from mmrjax.model.params import Scalar, Times
+from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
     BATTERY_EMPTY,
@@ -68,8 +66,8 @@ class DriveTrajectory(eqx.Module):
         result: the state at the end, with the run's status.
     """
 
-    time: Times
-    distance: Times
+    time: Float[Array, " times"]
+    distance: Float[Array, " times"]
     signals: Signals
     result: Result
 
@@ -206,7 +204,7 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
 def drive(
     robot: Robot,
     conditions: Conditions,
-    times: Times,
+    times: Float[Array, " times"],
     tolerance: float = 1e-6,
     max_steps: int = 4096,
     *,
@@ -367,7 +365,7 @@ def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: A
     voltage = voltage_at_rest(robot, conditions) if conditions.voltage_follows else end.voltage
     status = status_moving(robot, conditions, end, voltage)
     status = jnp.where(parked, STALLED, status)
-    status = status_unless_empty(status, robot, conditions, end.discharge)
+    status = jnp.where(robot.battery.emptied(conditions.battery, end.discharge), BATTERY_EMPTY, status)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
 
 
@@ -375,7 +373,7 @@ def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: A
 def drive_batch(
     robot: Robot,
     conditions: Conditions,
-    times: Times,
+    times: Float[Array, " times"],
     tolerance: float = 1e-6,
     max_steps: int = 4096,
 ) -> DriveTrajectory:
@@ -390,12 +388,14 @@ def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(conditions)
 
 
-def _run_batch(robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None) -> RunBatch:
+def _run_batch(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> RunBatch:
     return RunBatch(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
 
 
 def _run_histories(
-    robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> RunBatch:
     duration = options["duration"]  # times are denser while the current rises to its peak
     early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)

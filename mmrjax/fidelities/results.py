@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ from mmrjax.compile.compiling import compiled, computed_outside_trace, on_host
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words, count_noun
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Fidelity, History, Options, RunBatch
+from mmrjax.fidelities.base import Fidelity, History, RunBatch
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.model import channels
@@ -63,7 +63,9 @@ class PendingBatch:
         return total_mass(self.robot, self.conditions)
 
 
-def run_batch(fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Options, history: bool) -> RunBatch:
+def run_batch(
+    fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Mapping[str, float], history: bool
+) -> RunBatch:
     """Simulates a batch of any shape."""
     runs = math.prod(conditions.shape)
     if history and runs > HISTORIES:

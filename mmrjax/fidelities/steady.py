@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,11 +17,9 @@ from mmrjax.fidelities import outputs
 from mmrjax.fidelities.base import (
     Fidelity,
     ImplicitSolution,
-    Options,
     Progress,
     RunBatch,
     result_of_signals,
-    status_unless_empty,
     travel_status,
     withhold_numbers,
 )
@@ -39,6 +37,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
+    BATTERY_EMPTY,
     CODES,
     CONVERGED,
     FAILED,
@@ -291,7 +290,7 @@ def _state_at_unknowns(
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
     status = jnp.where(_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
-    status = status_unless_empty(status, robot, conditions, conditions.discharge)
+    status = jnp.where(robot.battery.emptied(conditions.battery, conditions.discharge), BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
     return signals, status, sound, residual
 
@@ -416,11 +415,13 @@ def _shown_rows(
     return jax.vmap(lambda *row: show(*row)[:2])(conditions, unknowns, found)
 
 
-def _run_batch(robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None) -> RunBatch:
+def _run_batch(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> RunBatch:
     return RunBatch(steady_batch(robot, conditions))
 
 
-def _check_run(robot: Robot, conditions: Conditions, options: Options) -> None:
+def _check_run(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     """Raises for runs without a steady state: an arm with gravity over its angle, or a turn on a slope.
 
     Such an arm turns unevenly, or hangs at an angle that its friction decides.

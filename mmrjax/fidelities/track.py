@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Fidelity, History, Options, Progress, RunBatch, flag_mask, withhold_numbers
+from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch, flag_mask, withhold_numbers
 from mmrjax.model import balances, contact, masses
 from mmrjax.model.balances import signals_of
 from mmrjax.model.conditions import Conditions
@@ -312,7 +313,9 @@ def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: track(robot, c, duration=TIME_ROLLED, rolling=True).result)(conditions)
 
 
-def _run_batch(robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None) -> RunBatch:
+def _run_batch(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> RunBatch:
     runs = track_batch(
         robot, conditions, duration=options["duration"], step=options["step"], rolling=True, progress=progress
     )
@@ -320,7 +323,7 @@ def _run_batch(robot: Robot, conditions: Conditions, options: Options, progress:
 
 
 def _run_histories(
-    robot: Robot, conditions: Conditions, options: Options, progress: Progress | None = None
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> RunBatch:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
     away, reactions = _moving_system_module(conditions).distance_and_reactions(runs.q, runs.reactions)
@@ -328,7 +331,7 @@ def _run_histories(
     return RunBatch(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 
-def _check_time_step_and_conditions(robot: Robot, conditions: Conditions, options: Options) -> None:
+def _check_time_step_and_conditions(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     check_track_runs(robot, conditions, duration=options["duration"], step=options["step"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import outputs as table_of_outputs
-from mmrjax.fidelities.base import Options, RunBatch
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.missions.profile import Profile
 from mmrjax.model import params, quantities
 from mmrjax.model.channels import Channel
@@ -127,7 +128,7 @@ def evaluate_points(
     fidelity: str,
     values: Float[Array, "points names"],
     conditions: Conditions,
-    options: Options,
+    options: Mapping[str, float],
     outputs: Names,
     profile: Profile | None = None,
 ) -> dict[str, Array]:

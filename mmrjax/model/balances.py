@@ -26,7 +26,7 @@ from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.numerics.elementary import at_least, clip, cosine, sine, value_and_slope
-from mmrjax.turning.two_sides import SIDES, GroundForceInputs, GroundForces, Stance, ground_forces, sum_of_sides
+from mmrjax.turning.two_sides import SIDES, GroundForceInputs, GroundForces, Stance, sum_of_sides
 
 #: Each balance with its unit and its equation.
 BALANCES = {
@@ -762,7 +762,7 @@ def turning_signals(
     with the load divided equally between the sides.
 
     Args:
-        loads: normal loads of both sides [N], see `turning.ground_forces`.
+        loads: normal loads of both sides [N], see `GroundForceInputs.forces`.
     """
     robot = robot.within(conditions.configuration)
     chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
@@ -778,7 +778,7 @@ def turning_signals(
         stance_loads, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral,
         motion.yaw_rate, rolling,
     )  # fmt: skip
-    contact_forces = ground_forces(inputs, loads)
+    contact_forces = inputs.forces(loads)
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill_unset(even, normal=contact_forces.normal / units, moment_lateral=contact_forces.moment / units)
     )

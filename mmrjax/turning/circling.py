@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import rest
-from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, status_unless_empty, withhold_numbers
+from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, withhold_numbers
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
@@ -418,7 +418,7 @@ def status_of_steady_motion(
     grip, load = travel.grip, jnp.sum(travel.grip.normal)
     tips = (jnp.abs(grip.moved) >= load / 2) | (jnp.abs(grip.centre) >= robot.running_gear.wheelbase / 2)
     status = jnp.where(tips, TIPS, status)
-    return status_unless_empty(status, robot, conditions, motion.discharge)
+    return jnp.where(robot.battery.emptied(conditions.battery, motion.discharge), BATTERY_EMPTY, status)
 
 
 def status_after_run(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:

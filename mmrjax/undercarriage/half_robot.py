@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.base import result_of_signals, status_unless_empty, travel_status
+from mmrjax.fidelities.base import result_of_signals, travel_status
 from mmrjax.fidelities.drive import current_after
 from mmrjax.fidelities.rest import STARTS, is_at_rest, status_with_slip, travel_direction, voltage_at_rest
 from mmrjax.fidelities.steady import steady
@@ -26,6 +26,7 @@ from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
+    BATTERY_EMPTY,
     FAILED,
     GRAVITY,
     NOT_SETTLED,
@@ -476,7 +477,7 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     status = status_with_slip(
         status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, at_rest
     )
-    status = status_unless_empty(status, robot, conditions, end.discharge)
+    status = jnp.where(robot.battery.emptied(conditions.battery, end.discharge), BATTERY_EMPTY, status)
     status = jnp.where(tipping_margin(run) < 0, TIPS, status)
     return status_unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
 

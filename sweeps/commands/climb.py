@@ -109,7 +109,7 @@ def _climb_of_configuration(
     if config.find is not None:
         grounds, all_climbs, shown_index, tried, largest = _search_largest(config.find, run)
     elif along is None:
-        grounds, all_climbs = run(np.array([size]))
+        grounds, all_climbs = run(np.array([size], float))  # NaN for a terrain
     else:
         with scale.share_progress() as told:
             derivatives = climb_derivatives(along.given, along.values, along.widths, progress=told, **integration)

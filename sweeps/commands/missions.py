@@ -14,9 +14,9 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax.fidelities import outputs
 from mmrjax.missions import mission_batch
+from mmrjax.missions import profile as mission_profile
 from mmrjax.missions.mission import Mission
 from mmrjax.missions.mission_steps import MARKS
-from mmrjax.missions.profile import PAIRS, Profile
 from mmrjax.model import balances, channels, contact, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import COULOMB_PER_MAH, lateral_ratio
@@ -117,7 +117,8 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
     names = sorted({str(name) for name in runs.configurations_named(robot)})
     capabilities.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
     highest = max(
-        (float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0
+        (float(np.abs(source.values[name]).max()) for name in mission_profile.PAIRS[1] if name in source.values),
+        default=0.0,
     )
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
     if highest > supply:
@@ -140,7 +141,7 @@ def _conditions_of_runs(
 
 
 def run_missions(
-    robot: Robot, runs: records.Runs, source: ProfileTable, conditions: Conditions, profile: Profile
+    robot: Robot, runs: records.Runs, source: ProfileTable, conditions: Conditions, profile: mission_profile.Profile
 ) -> Missions:
     """Simulates runs over a profile. The table has no conditions yet."""
     names = run.run_names(runs)

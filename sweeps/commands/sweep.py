@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import filesize
 
 from calibration.data import Json, profiles
 from calibration.data.input_errors import BadConfiguration, InputError
@@ -141,7 +142,7 @@ def dry_run(job: scale.Job, layout: StoreLayout, path: Path) -> None:
     rows = {
         "points": f"{design.points:,} ({dimensions})",
         "chunks": f"{len(blocks):,} of {blocks.points:,} points on {compiled.mesh.size} x {scale.device_kind()}",
-        "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {folder}",
+        "store": f"{filesize.decimal(layout.size)} (uncompressed); free {filesize.decimal(free)} in {folder}",
         "time": f"about {duration_text(seconds * blocks.points * len(blocks))} once compiled, "
         f"{1 / seconds:,.0f} points/s (timed here on {compiled.size:,} points). Compiling "
         f"{duration_text(max(spent[0] - spent[1], 0.0))}",
@@ -166,18 +167,9 @@ def _reject_without_space(size: int, share: float, path: Path) -> None:
     needed, (folder, free) = math.ceil(size * share) + MARGIN, _disk_of(path)
     if needed > free:
         raise BadConfiguration(
-            f"--out: results need {bytes_text(needed)} (uncompressed); {folder} has "
-            f'{bytes_text(free)} free; choose another disk, fewer points or outputs, or storage = "float32"'
+            f"--out: results need {filesize.decimal(needed)} (uncompressed); {folder} has "
+            f'{filesize.decimal(free)} free; choose another disk, fewer points or outputs, or storage = "float32"'
         )
-
-
-def bytes_text(size: float) -> str:
-    """Number of bytes as text."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            return f"{size:.3g} {unit}" if size < 1e6 else f"{size:,.0f} {unit}"
-        size /= 1000
-    raise AssertionError
 
 
 def duration_text(seconds: float) -> str:

@@ -20,15 +20,12 @@ from mmrjax.model.robot import Robot
 from sweeps import capabilities
 from sweeps.config import GridPart
 from sweeps.inputs import check_configurations
+from sweeps.options import options_of_fields
 
 G = TypeVar("G", bound=GridPart)
 
 #: Option of each axis.
-OPTIONS = {
-    "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds",
-    "motor_currents_A": "--motor-currents", "payloads_kg": "--payloads",
-    "slopes_deg": "--slopes", "surface": "--surface", "load_torques_Nm": "--load-torques",
-}  # fmt: skip
+OPTIONS = options_of_fields(GridPart)
 #: Axes that act only on vehicles, and only on loads on a shaft.
 ON_GROUND, ON_SHAFT = ("payloads_kg", "slopes_deg", "surface"), ("load_torques_Nm",)
 #: Axis of each imposed quantity (`rig.IMPOSED`).

@@ -44,17 +44,14 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
         BadConfiguration: the fidelity lacks an output, or cannot simulate a point.
     """
     profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
-    repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
-    if repeated:
-        raise BadConfiguration(f"{where}, outputs: got {repeated[0]} twice; expected each once")
-    name_clashes = [name for name in config.outputs if name in plan.design.names]
-    if name_clashes:
-        raise BadConfiguration(f"{where}, outputs: got {name_clashes[0]}, which is varied; expected outputs of a run")
     task = task_of_configuration(config, robot, profile is not None and profile.turns)
-    for name in config.outputs:
-        stated_word(name, task.attributes, f"{where}, outputs", most=3)
     rests = {**{o.name: o.rests_on for o in outputs.output_table(robot.channels)}, **capabilities.RESTS_ON}
     for name in config.outputs:
+        if config.outputs.count(name) > 1:
+            raise BadConfiguration(f"{where}, outputs: got {name} twice; expected each once")
+        if name in plan.design.names:
+            raise BadConfiguration(f"{where}, outputs: got {name}, which is varied; expected outputs of a run")
+        stated_word(name, task.attributes, f"{where}, outputs", most=3)
         if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
             raise BadConfiguration(
                 f"{where}, outputs: {name} cannot be computed, because the robot's file lacks {' and '.join(lacking)}"
@@ -116,18 +113,14 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan)
 
 def store_layout(config: Campaign, job: scale.Job) -> StoreLayout:
     """Arrays in the store of a job, with units and long names."""
-    variables = {
-        name: (scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
-        for name in job.outputs
-    }
+    attributes = job.task.attributes
+    variables = {n: (scale.KINDS.get(n, config.storage), _store_attributes(attributes[n])) for n in job.outputs}
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
     variables[STATUS] = scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}
-    planned = job.plan.axes
     coordinates = {
-        n: _store_attributes({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()
+        n: _store_attributes({"units": axis.unit, "long_name": axis.meaning}) for n, axis in job.plan.axes.items()
     }
-    for name in {axes.CONFIGURATION} & set(coordinates):
-        del coordinates[name]["units"]
+    coordinates.get(axes.CONFIGURATION, {}).pop("units", None)
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
     group_attributes = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.task.model}"}
     return StoreLayout(

@@ -72,23 +72,16 @@ def task_of_configuration(config: Campaign, robot: Robot, turns: bool = False) -
     if config.obstacle is None:
         return run_task(config.model, config.options, robot, config.profile is not None, turns)
     obstacle, attributes = config.obstacle, climb_attributes(config.obstacle)
-    own_options = (
-        {SIZE: SIZES[obstacle.kind]},
-        functools.partial(further_variation, obstacle),
-        functools.partial(compute_climbs, obstacle),
-    )
-    return Task("climb", {}, attributes, tuple(attributes), True, AT_ONCE, *own_options)
+    further, run = functools.partial(further_variation, obstacle), functools.partial(compute_climbs, obstacle)
+    return Task("climb", {}, attributes, tuple(attributes), True, AT_ONCE, {SIZE: SIZES[obstacle.kind]}, further, run)
 
 
 def run_task(
     model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
 ) -> Task:
     """Task of a run. `profiled`: over a profile, with its totals as outputs. `turns`: with both sides."""
-    facts, own_columns, usual = (
-        fidelities.fidelity_facts(model),
-        fidelities.get_fidelity(model).columns,
-        channels.channel_names(robot.channels),
-    )
+    facts, own_columns = fidelities.fidelity_facts(model), fidelities.get_fidelity(model).columns
+    usual = channels.channel_names(robot.channels)
     rows: dict[str, tuple[str, str]] = {r.name: (r.unit_shown, r.label) for r in outputs.output_table(robot.channels)}
     rows |= {name: ("", name.replace("_", " ")) for name in own_columns}
     if profiled:
@@ -96,9 +89,9 @@ def run_task(
 
         output_names = (*mission_batch.OUTPUTS, *(mission_batch.OF_TURNS if turns else ()))
         rows, usual = {r.column: (r.unit, r.label) for r in output_names}, mission_batch.USUAL
-    flags = {"flag_masks": [1 << k for k in range(len(LIMITS))], "flag_meanings": " ".join(LIMITS)}
     attributes: Attributes = {n: {"units": unit, "long_name": label} for n, (unit, label) in rows.items()}
-    attributes[FLAGS] = {"long_name": "limits exceeded", **flags}
+    masks = [1 << k for k in range(len(LIMITS))]
+    attributes[FLAGS] = {"long_name": "limits exceeded", "flag_masks": masks, "flag_meanings": " ".join(LIMITS)}
     at_once = facts.at_once(False), facts.at_once(True)
     return Task(model, options, attributes, usual, facts.slow and not profiled, at_once)
 
@@ -140,13 +133,12 @@ SIZES = {
 }
 
 
-def climb_attributes(obstacle: Obstacle) -> dict[str, Json]:
+def climb_attributes(obstacle: Obstacle) -> Attributes:
     """Outputs of a point, by name, with their attributes in a store."""
     names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
-    attributes: dict[str, Json] = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
-    del attributes[VERDICT]["units"]
-    attributes[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
-    return attributes
+    attributes: Attributes = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
+    verdicts = {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
+    return attributes | {VERDICT: {"long_name": OUTPUTS[VERDICT][1], **verdicts}}
 
 
 def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: str) -> dict[str, float]:
@@ -289,12 +281,8 @@ def _search_all(
     """
     low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
-    climbed, beyond, verdict, sizes = (
-        np.zeros(points),
-        np.full(points, high),
-        np.full(points, OVER),
-        np.full(points, low),
-    )
+    climbed, beyond, sizes = np.zeros(points), np.full(points, high), np.full(points, low)
+    verdict = np.full(points, OVER)
     for k in range(rounds):
         verdicts = run(sizes, lambda share, k=k: told((k + share) / rounds)).verdict
         is_over = verdicts == OVER

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+from pydantic import BaseModel
 
 from calibration.data import Columns, Json, Names
 from calibration.data.input_errors import BadConfiguration, BadData
@@ -34,7 +35,6 @@ from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
-from sweeps.config import Part
 from sweeps.console import print_message
 from sweeps.points.sampled_design import SAMPLE, Blocks, Design
 from sweeps.store import (
@@ -59,7 +59,7 @@ FURTHER = ("scipy", "zarr")
 Identity = dict[str, dict[str, str]]
 
 
-def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) -> Identity:
+def job_identity(config: BaseModel, robot: Robot, files: Iterable[str], device: str) -> Identity:
     """Identity of a job in sections: configuration, data, code, versions, device.
 
     Args:

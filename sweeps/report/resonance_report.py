@@ -92,17 +92,13 @@ class ResonanceResult:
         by_mode: dict[tuple[str, int], list[Resonance]] = {}
         for r in strongest_resonances(self.resonances):
             by_mode.setdefault((r.mode, r.order), []).append(r)
-        ranges = [
-            (min(r.avoid[0] for r in members), max(r.avoid[1] for r in members), members)
-            for members in by_mode.values()
-        ]
+        ranges = [(min(r.avoid[0] for r in x), max(r.avoid[1] for r in x), x) for x in by_mode.values()]
         return sorted(ranges, key=lambda x: x[0])
 
     @property
     def restless(self) -> list[tuple[float, float]]:
         """Ranges of speed in which a run did not settle [m/s], each up to half way to the neighbouring runs."""
-        ranges = []
-        speed = self.travel * MM
+        ranges, speed = [], self.travel * MM
         for payload in self.modes:
             rows = np.flatnonzero((self.table["payload_kg"] == payload) & np.isfinite(speed))
             rows = rows[np.argsort(speed[rows])]
@@ -144,55 +140,45 @@ class ResonanceResult:
         low, high = self.speeds
         if not np.isfinite(low):
             return [f"No run of {self.configuration} travels (see status)."]
-        parts = []
-        mode_resonances, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
-        if mode_resonances:
+        parts, avoid, restless, what = [], self.avoid, self.restless, self.passing.name
+        of_modes, bare = ([r for r in avoid if bool(r[2][0].mode) is has] for has in (True, False))
+        if of_modes:
             loads = "" if len(self.modes) == 1 else "at least at one payload: "
-            parts.append(f"Avoid {loads}{_ranges_in_words(mode_resonances, self.passing.name)}.")
+            parts.append(f"Avoid {loads}{_ranges_in_words(of_modes, what)}.")
         elif not bare:
-            peaks = {s.label: float(np.nanmax(self.table[f"{n}_ripple_percent"])) for n, s in SIGNALS.items()}
-            largest = ", ".join(f"{label} {ripple_percent(peak)}" for label, peak in peaks.items())
+            largest = ", ".join(
+                f"{s.label} {ripple_percent(float(np.nanmax(self.table[f'{n}_ripple_percent'])))}"
+                for n, s in SIGNALS.items()
+            )
             parts.append(
                 f"No speed to avoid between {span_text(low, high)} mm/s: no ripple peak is at a natural "
                 f"frequency (largest ripple: {largest})."
             )
         if bare:
-            also = "Ripple also peaks" if mode_resonances else "Ripple peaks"
+            also = "Ripple also peaks" if of_modes else "Ripple peaks"
+            parts.append(f"{also}, without a natural frequency nearby, at {_ranges_in_words(bare, what)}.")
+        # modes that amplify, but whose frequency varies by an octave over the position of the belt
+        varying = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
+        for name in dict.fromkeys(m.name for m in varying):
+            same = [m for m in varying if m.name == name]
+            least, most = min(m.low for m in same), max(m.high for m in same)
             parts.append(
-                f"{also}, without a natural frequency nearby, at {_ranges_in_words(bare, self.passing.name)}."
+                f"{name.capitalize()} has no single frequency: {span_text(least, most, 1)} Hz, depending on the "
+                "belt's position."
             )
-        for name, lowest, highest in self._spread():
-            parts.append(
-                f"{name.capitalize()} has no single frequency: {span_text(lowest, highest, 1)} Hz, depending on "
-                "the belt's position."
-            )
-        if self.restless:
-            spans = ", ".join(span_text(*x) for x in self.restless)
-            parts.append(f"Not every run settles at {spans} mm/s.")
-        if self.avoid or self.restless:
+        if restless:
+            parts.append(f"Not every run settles at {', '.join(span_text(*x) for x in restless)} mm/s.")
+        if avoid or restless:
             free = ", ".join(span_text(*x) for x in self.quiet)
             parts.append(
                 f"Speeds without these problems: {free} mm/s." if free else "No speed is without these problems."
             )
-        if self.passing.name == "teeth":
+        if what == "teeth":
             parts.append(
                 "Without grousers on the ground, the belt's teeth cause the ripple, one every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
         return parts
-
-    def _spread(self) -> list[tuple[str, float, float]]:
-        """Modes that amplify but vary by an octave over the position of the belt, with their range [Hz]."""
-        amplifying_modes = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
-        names = dict.fromkeys(m.name for m in amplifying_modes)
-        return [
-            (
-                n,
-                min(m.low for m in amplifying_modes if m.name == n),
-                max(m.high for m in amplifying_modes if m.name == n),
-            )
-            for n in names
-        ]
 
     def to_json(self) -> Json:
         """`result.json`."""
@@ -245,13 +231,13 @@ def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], what: s
     most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
     texts = []
     for low, high, members in sorted(most, key=lambda r: r[0]):
-        first, last = min(r.frequencies[0] for r in members), max(r.frequencies[1] for r in members)
-        meets = f"{members[0].mode} at {span_text(first, last, 1)} Hz meets " if members[0].mode else ""
-        order = f"{members[0].order} × {what}" if members[0].order else f"{span_text(first, last, 1)} Hz"
+        mode, order = members[0].mode, members[0].order
+        hertz = span_text(min(r.frequencies[0] for r in members), max(r.frequencies[1] for r in members), 1) + " Hz"
+        meets = f"{mode} at {hertz} meets " * bool(mode) + (f"{order} × {what}" if order else hertz)
         how = ", ".join(f"{SIGNALS[r.signal].label} {ripple_percent(100 * r.ripple)}" for r in members)
-        texts.append(f"{span_text(low, high)} mm/s ({meets}{order}, ripple up to: {how})")
-    others_text = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
-    return "; ".join(texts) + others_text
+        texts.append(f"{span_text(low, high)} mm/s ({meets}, ripple up to: {how})")
+    more = len(ranges) - len(most)
+    return "; ".join([*texts, *[f"{more} more on the map"] * bool(more)])
 
 
 def span_text(low: float, high: float, unit: float = MM) -> str:
@@ -267,29 +253,37 @@ UNFOLDED = 30
 
 def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
     """Report of a resonance map."""
-    first, *others = found.sentences
-    passing = found.passing
+    (first, *others), passing = found.sentences, found.passing
     lead = f"**{found.configuration}**, slope {found.slope_deg:g}°, {found.surface}; {found.read.size} runs."
     values = passing.name, 1000 * passing.travel
     figure = catalogue.figure("resonance.map", found, finding=found.statement(), words=values)
     endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
-    peak_rows = [
+    strong = found.strong
+    peaks = [
         (
-            Cell(SIGNALS[p.signal].label, "bad" if p in found.strong else ""), p.payload,
-            p.speed / MM, f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none",
-            p.frequency, p.mode or "none",
+            Cell(SIGNALS[p.signal].label, "bad" if p in strong else ""), p.payload, p.speed / MM,
+            f"{p.low / MM:.0f} to {p.high / MM:.0f}", 100 * p.ripple, 100 * p.rise, p.order or "none", p.frequency,
+            p.mode or "none",
         )
         for p in found.peaks
     ]  # fmt: skip
-    peaks = catalogue.table("resonance.peaks_found", peak_rows)
-    end_note = catalogue.note("resonance.ended", 100 * TAIL)
-    folded = count_noun(len(peaks.rows), "peak") if len(peaks.rows) > UNFOLDED else ""
-    rows = []
-    for payload, modes in found.modes.items():
-        for m in modes:
-            low_high = f"{m.low:.1f} to {m.high:.1f}"
-            numbers = (m.frequency, low_high, m.natural, m.damping, 100 * m.share, 100 * m.positions)
-            rows.append((payload, m.name, *(Cell(x, "" if m.resonant else "none") for x in numbers)))
+    frequencies = [
+        (
+            payload, m.name,
+            *(
+                Cell(x, "" if m.resonant else "none")
+                for x in (
+                    m.frequency, f"{m.low:.1f} to {m.high:.1f}", m.natural, m.damping, 100 * m.share,
+                    100 * m.positions,
+                )
+            ),
+        )
+        for payload, modes in found.modes.items()
+        for m in modes
+    ]  # fmt: skip
+    of_modes = catalogue.note("resonance.modes"), catalogue.table("resonance.frequencies", frequencies)
+    about_peaks = catalogue.note("resonance.peaks", passing.name, 100 * MATTERS)
+    folded = count_noun(len(peaks), "peak") if len(peaks) > UNFOLDED else ""
     return Document(
         "Which speeds to avoid",
         first,
@@ -299,17 +293,9 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
             figure if found.read.any() else catalogue.note("resonance.still"),
         ),
         (
-            Section(
-                "Natural frequencies",
-                (catalogue.note("resonance.modes"), catalogue.table("resonance.frequencies", rows)),
-                "modes",
-            ),
-            Section(
-                "Peaks of ripple against speed",
-                (catalogue.note("resonance.peaks", passing.name, 100 * MATTERS),),
-                "peaks",
-            ),
-            Section("", (peaks,), folded=folded),
-            Section("How the runs ended", (end_note, endings), "ended"),
+            Section("Natural frequencies", of_modes, "modes"),
+            Section("Peaks of ripple against speed", (about_peaks,), "peaks"),
+            Section("", (catalogue.table("resonance.peaks_found", peaks),), folded=folded),
+            Section("How the runs ended", (catalogue.note("resonance.ended", 100 * TAIL), endings), "ended"),
         ),
     )

@@ -95,13 +95,10 @@ def settled_ends_of_runs(problem: Problem) -> SettledEnds:
             if len(these) < FEWEST:
                 continue
             readings[k, c] = measured[these, c].mean()
-            halves = np.array_split(measured[these, c], 2)
-            change = abs(halves[1].mean() - halves[0].mean())
-            noise = 2 * np.median(sd[these, c]) / np.sqrt(len(these))
-            size = abs(readings[k, c])
-            if change < max(CHANGE * size, CHANGE_SD * noise):
-                mean[k, c] = readings[k, c]
-                error[k, c] = max(noise / 2, FLOOR * size)
+            first, second = np.array_split(measured[these, c], 2)
+            noise, size = 2 * np.median(sd[these, c]) / np.sqrt(len(these)), abs(readings[k, c])
+            if abs(second.mean() - first.mean()) < max(CHANGE * size, CHANGE_SD * noise):
+                mean[k, c], error[k, c] = readings[k, c], max(noise / 2, FLOOR * size)
     conditions = observe.conditions
     if observe.varying:
         rows = np.array([s.rows[0] for s in ends])
@@ -176,11 +173,11 @@ def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
     """
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
-    parts = filled.reshape(-1, TOGETHER, points.shape[1])
-    first_misfits = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
+    first_part, *parts = filled.reshape(-1, TOGETHER, points.shape[1])
+    first_misfits = _reading_misfits(problem, first_part)  # compiles the program
     with Threads(CORES) as cores:
-        misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
-    by_row = np.sum(np.concatenate([np.asarray(x) for x in misfits])[: len(points)] ** 2, 2)
+        misfits = [first_misfits, *cores.map(lambda part: _reading_misfits(problem, part), parts)]
+    by_row = np.sum(np.concatenate(misfits)[: len(points)] ** 2, 2)
     summed = np.zeros((len(points), len(observe.rows_of)))
     np.add.at(summed.T, np.asarray(observe.run), by_row.T)
     by_run = np.where(np.isfinite(summed), summed, np.inf)
@@ -221,13 +218,12 @@ def _coordinate_of_value(problem: Problem, k: int, value: float) -> float:
 def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
     """Fits to the settled ends: one at each adhesion of the grid, and one with a free adhesion."""
     names = problem.coordinates.names
-    statics = [k for k, n in enumerate(names) if n.endswith(STATIC)]
     ends = settled_ends_of_runs(problem)
     mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
     ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
     pinned, is_pinned = np.zeros((len(ADHESIONS), len(names))), np.zeros((len(ADHESIONS), len(names)), bool)
-    for k in statics:
+    for k in (k for k, n in enumerate(names) if n.endswith(STATIC)):
         pinned[:, k], is_pinned[:, k] = [_coordinate_of_value(problem, k, x) for x in ADHESIONS], True
     fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(is_pinned)))
     free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(is_pinned.shape, bool)))
@@ -243,11 +239,10 @@ def _slides_at_end(problem: Problem, ends: SettledEnds) -> np.ndarray:
     turning, travelling = (
         ends.shown[:, channels.channel_index(c, problem.channels)] for c in ("motor_speed", "speed")
     )
-    robot = problem.base
-    radius = np.array([float(c.radius) for c in robot.configurations.members])
+    radius = np.array([float(c.radius) for c in problem.base.configurations.members])
     circumference = radius[np.asarray(ends.conditions.configuration)] * turning
     with np.errstate(invalid="ignore", divide="ignore"):
-        slip = 1 - travelling / (circumference / float(robot.gearbox.ratio))
+        slip = 1 - travelling / (circumference / float(problem.base.gearbox.ratio))
     return np.nan_to_num(slip) > SLIDES
 
 

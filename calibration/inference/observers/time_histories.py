@@ -46,6 +46,7 @@ from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import GOALS
+from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals
 from mmrjax.numerics.linear_equations import solve
@@ -330,12 +331,8 @@ class Histories(Observer):
             speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
             stretches = [s for s in stretches if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
         settled_readings = [_medians(measured[s.after(time, 0.5)]) for s in stretches]
-        first = np.array([s.rows[0] for s in stretches], int)
-        return (
-            runs.where(first),
-            np.reshape(settled_readings, (-1, measured.shape[1])),
-            np.array([s.lasts for s in stretches]),
-        )
+        first, lasts = np.array([s.rows[0] for s in stretches], int), np.array([s.lasts for s in stretches])
+        return runs.where(first), np.reshape(settled_readings, (-1, measured.shape[1])), lasts
 
     @classmethod
     def identity(cls, runs: Runs) -> Names:
@@ -377,28 +374,20 @@ class Histories(Observer):
         simulated = jax.vmap(lambda c, t: histories.linearise_run(robot, c, t))(self.conditions, self.times)
         return dataclasses.replace(self, known=simulated)
 
-    def whole(self, robot: Robot) -> Signals:
-        """Signals of each run at each instant, shape (runs, instants)."""
-        whole_runs = jax.vmap(lambda c, t, k: histories.history_signals(robot, c, t, k))(
-            self.conditions, self.times, self.known
-        )
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole_runs)
-
-    def at_rows(self, whole: Signals) -> Signals:
-        """Signals at each row."""
-        return jax.tree.map(lambda x: x[self.run, self.instant], whole)
+    def signals_and_angle(self, robot: Robot) -> tuple[Signals, Array]:
+        """Signals of a robot in each row, and the angle of its driving shaft since the start of the run [rad]."""
+        run_signals = jax.vmap(lambda c, t, k: histories.history_signals(robot, c, t, k))
+        signals = run_signals(self.conditions, self.times, self.known)
+        signals = jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), signals)
+        speed = jnp.asarray(signals.speed_wheel)
+        angle_steps = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
+        angle = jnp.concatenate([jnp.zeros((len(angle_steps), 1)), jnp.cumsum(angle_steps, 1)], 1)
+        return jax.tree.map(lambda x: x[self.run, self.instant], (signals, angle))
 
     @property
     def time(self) -> Float[Array, " rows"]:
         """Time of each row since the start of its run [s]."""
         return self.times[self.run, self.instant]
-
-    def angle(self, whole: Signals) -> Float[Array, " rows"]:
-        """Angle of the driving shaft in each row since the start of its run [rad]."""
-        speed = jnp.asarray(whole.speed_wheel)
-        angle_steps = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
-        angle = jnp.concatenate([jnp.zeros((len(angle_steps), 1)), jnp.cumsum(angle_steps, 1)], 1)
-        return angle[self.run, self.instant]
 
     @property
     def of_rows(self) -> Any:
@@ -452,6 +441,21 @@ class Histories(Observer):
         some = np.flatnonzero(drive != 0) if (drive != 0).any() else np.arange(1)
         cases = np.unique(np.stack([rows.configuration, *key, braked], 1)[some], axis=0, return_index=True)[1]
         return run_grids.conditions_of_rows(dataclasses.replace(rows, **levels), some[cases])
+
+    def late(self, steps: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
+        """Values within steps at the time of each row minus the delay of the rig.
+
+        Args:
+            steps: arguments of `StepCourse.read` for every step, shape (runs, steps, ...) each.
+            rig: rig with the delay.
+        """
+
+        def of_run(times: Array, steps: tuple[Array, ...], time: Array) -> Array:
+            step, share = rig.before(times, time)
+            return StepCourse.read(tuple(x[step] for x in steps), share)
+
+        of_runs = jax.vmap(of_run)(self.times, steps, self.time[self.rows_of])
+        return _to_rows(of_runs, self.rows_of, len(self.run))
 
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
@@ -753,10 +757,9 @@ def _readings_within_steps(robot: Robot, steps: StepCourse) -> tuple[Array, ...]
 @functools.partial(compiled, options=OVER_TIME)
 def _shaft_motion(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
     """Angle of the driving shaft, back-EMF and directions of travel in each row."""
-    whole_runs = observe.whole(robot)
-    rows = observe.at_rows(whole_runs)
+    rows, angle = observe.signals_and_angle(robot)
     ways = {name: jnp.broadcast_to(getattr(rows, name), jnp.shape(rows.speed_motor)) for name in WAYS}
-    return observe.angle(whole_runs), jnp.asarray(rows.voltage_back), ways
+    return angle, jnp.asarray(rows.voltage_back), ways
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -779,15 +782,7 @@ def _scan_delays(problem: Problem, z: Array, scanned: Array, values: Array) -> t
 
     def one(value: Array) -> tuple[Array, Array]:
         coordinates = jnp.where(scanned, value, z)
-        rig = problem.robot(coordinates).rig
-
-        def of_run(times: Array, steps: tuple[Array, ...], time: Array) -> Array:
-            """Readings at the time of each row minus the delay of the rig, and their derivatives."""
-            step, share = rig.before(times, time)
-            return StepCourse.read(tuple(x[step] for x in steps), share)
-
-        of_runs = jax.vmap(of_run)(observe.times, steps, observe.time[observe.rows_of])
-        late = _to_rows(of_runs, observe.rows_of, len(observe.run))
+        late = observe.late(steps, problem.robot(coordinates).rig)
         error = data.weight * (late[..., 0] - data.measured) / data.sd
         finite = jnp.all(jnp.isfinite(late), -1)
         error = jnp.where(finite, error, MISSING * data.weight)
@@ -859,5 +854,4 @@ def _responses(
     defects, by_effects = observe.changes(robot, probes, effects, jnp.float32)  # hundreds of megabytes for a long log
     signatures = _to_rows(by_effects, observe.rows_of, len(scale)) * scale[..., None]
     signatures, defects = (linearization.finite_or_zero(x) for x in (signatures.reshape(scale.size, -1), defects))
-    runs = observe.whole(robot)
-    return signatures, defects, observe.at_rows(runs), observe.angle(runs)
+    return signatures, defects, *observe.signals_and_angle(robot)
