@@ -259,14 +259,11 @@ def parameters() -> str:
         "Parameters of the packaged robot: nominal value ± standard deviation of the prior, SI unit, meaning, bounds "
         "of a fit, source. `mmrjax explain NAME` prints the equation too. `--set NAME=VALUE` changes one."
     )
-    fixed = {name: (f"{low:g} to {high:g}", what) for name, (low, high, what) in robot_file.COUNTS.items()}
-    fixed |= {
-        name: (f"{low:g} to {high:g} {unit}", what) for name, (low, high, unit, what) in robot_file.RATINGS.items()
-    }
-    fixed |= {name: ("true or false", what) for name, what in robot_file.SWITCHES.items()}
-    fixed |= {name: (" or ".join(allowed), what) for name, (allowed, what) in robot_file.CHOICES.items()}
     keys = ["| key | allowed | meaning |", "|---|---|---|"]
-    keys += [f"| `{name}` | {allowed} | {what.strip('()')} |" for name, (allowed, what) in fixed.items()]
+    keys += [
+        f"| `{name}` | {robot_file.allowed_setting(name)} | {meaning} |"
+        for name, (_, _, meaning) in robot_file.SETTINGS.items()
+    ]
     others = (
         "## Keys that no fit frees",
         "Counts, ratings by makers, switches and choices. Robot files and `--set` take them.",

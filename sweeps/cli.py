@@ -666,13 +666,13 @@ def _report_failure(error: BaseException) -> int:
     if isinstance(error, InputError):
         return _print_failure(str(error), error.exit_code)
     if isinstance(error, typer.Abort | KeyboardInterrupt):
-        advice = "no run folder was written"
-        if "sweep" in sys.argv[1:2]:
-            advice = "the same command and --out resume after the last complete chunk"
-        if "calibrate" in sys.argv[1:2]:
-            advice = "the same command and --out resume a population after its last generation"
-        if "loop" in sys.argv[1:2]:
-            advice = "the same command and --out resume after the last complete stage"
+        kept = {
+            "sweep": "after the last complete chunk",
+            "calibrate": "a population after its last generation",
+            "loop": "after the last complete stage",
+        }
+        resumed = [kept[command] for command in sys.argv[1:2] if command in kept]
+        advice = f"the same command and --out resume {resumed[0]}" if resumed else "no run folder was written"
         return _print_failure(f"interrupted; {advice}", INTERRUPTED)
     if _memory_exhausted(error):
         return _print_failure("out of memory; use a smaller --chunk, fewer rows, or more memory", 2)

@@ -37,9 +37,9 @@ def load_robot(config: RobotPart) -> RobotFile:
     Raises:
         BadConfiguration: the robot does not exist, or its file or a change is rejected.
     """
-    notes: list[str] = []
-    file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
-    robot = robot_file.change_robot(file.robot, config.set, where="--set", notes=notes)
+    file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects))
+    robot = robot_file.change_robot(file.robot, config.set, where="--set")
+    notes = [*file.remarks, *robot_file.battery_remarks(robot, config.set, "--set")]
     if robot.rig.follows_goal and not (
         type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
     ):

@@ -53,16 +53,22 @@ def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
 
 
 def least_squares(log):
-    """Next speed on speed, voltage and direction: the exact law of a held voltage."""
+    """Next speed on speed, voltage and direction: the exact law of a held voltage. Returns constants and sds."""
     rows = []
     for name in TESTS:
         v, u = log.velocity[log.run == name], log.voltage[log.run == name]
         moves = np.flatnonzero((np.abs(v[:-1]) > 1.0) & (np.abs(v[1:]) > 1.0))
         rows += [(v[k + 1], v[k], u[k], np.sign(v[k])) for k in moves]
-    after, *of = np.array(rows).T
-    speed, voltage, direction = np.linalg.lstsq(np.transpose(of), after, rcond=None)[0]
-    kV = (1 - speed) / voltage
-    return np.array([-direction / voltage, kV, -kV * STEP / np.log(speed)])
+    y, x = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+    solved, cost, *_ = np.linalg.lstsq(x, y, rcond=None)
+
+    def constants(b):
+        kV = (1 - b[0]) / b[1]
+        return np.array([-b[2] / b[1], kV, -kV * STEP / np.log(b[0])])
+
+    jacobian = np.array([(constants(solved + d) - constants(solved - d)) / 2e-7 for d in 1e-7 * np.eye(3)]).T
+    spread = cost / (len(y) - 3) * np.linalg.inv(x.T @ x)
+    return constants(solved), np.sqrt(np.diag(jacobian @ spread @ jacobian.T))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -70,7 +76,8 @@ def test_constants_are_those_of_an_independent_least_squares(seed):
     log, true = simulated(seed)
     found = fit_feedforward(log)
     values, sds = np.array([*found.constants.values()]), np.array([*found.sds.values()])
-    assert (np.abs(values - least_squares(log)) < sds).all()
+    other, spread = least_squares(log)
+    assert (np.abs(values - other) < spread).all()
     assert (np.abs(values - true) < 4 * sds).all()
     assert not found.remarks
 

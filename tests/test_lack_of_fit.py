@@ -137,7 +137,7 @@ def test_no_test_of_residuals_decides_before_the_fit_is_one(
     found = judge_adequacy(made, as_stated, sd, estimated=unknown, converged=converged)
     assert (found.obstacle, found.adequate) == (obstacle, adequate) and len(found.misses) == 3
     if obstacle:
-        assert "as given" in found.statement and "Adequate" not in found.statement
+        assert "before the fit" in found.statement and "Adequate" not in found.statement
         assert ("total current 56 %" in found.statement) == (missed > 0)
 
 

@@ -193,7 +193,7 @@ def test_a_delay_is_freed_if_the_error_lies_after_the_steps(tmp_path, monkeypatc
 
     for place, name, stand_in in (
         (calibration.multistart, "search_one_by_one", search),
-        (calibration, "_search", lambda runs, base, posed, noise, *_: (search(posed, noise, None), None)),
+        (calibration, "_search", lambda setting, posed, *_: (search(posed, None, None), None)),
         (calibration.scans, "place_at_minimum", lambda problem, starts: starts),
         (calibration.optimizers, "observe_at", lambda *_: SimpleNamespace(reading=runs.measured() + off)),
         (calibration, "_calibration_result", lambda setting, search, *_: (setting, search)),

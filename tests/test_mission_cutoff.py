@@ -235,14 +235,12 @@ def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
 
 def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 2.9\n")
-    notes = []
-    robot_file.read_robot(tmp_path / "low.toml", notes=notes)
-    assert notes == [
+    assert robot_file.parse_robot_file(tmp_path / "low.toml").remarks == (
         "low.toml, battery.voltage_cutoff: 2.9 V is below the 3.41 V of an empty cell without load: it acts only "
-        "beyond 10.4 A"
-    ]
-    read_rig(tmp_path, "[battery]\nvoltage_cutoff = 3.45\n", "low.toml", notes=(quiet := []))
-    assert quiet == []
+        "beyond 10.4 A",
+    )
+    (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 3.45\n")
+    assert robot_file.parse_robot_file(tmp_path / "low.toml").remarks == ()
 
 
 def test_a_mission_that_begins_below_its_cut_off_is_refused(tmp_path, mmrjax):

@@ -599,7 +599,7 @@ def test_example_of_the_page_reads(tmp_path, text):
 def test_every_key_of_robot_files_is_in_the_reference(robot):
     parameters = (ROBOT_FILES.parent / "parameters.md").read_text(encoding="utf-8")
     own = {p.name for p in params.walk_parameters(robot)}
-    fixed = {*robot_file.COUNTS, *robot_file.RATINGS, *robot_file.SWITCHES, *robot_file.CHOICES}
+    fixed = {*robot_file.SETTINGS}
     lacking = {name for name in own | fixed if f"`{name}`" not in parameters}
     shaft = {field.name for field in dataclasses.fields(Shaft) if "spec" in field.metadata}
     keys = {*rig_file.KEYS, *rig_file.LINEAR, *shaft, *configuration_tables._KINDS}

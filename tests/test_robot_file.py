@@ -259,15 +259,15 @@ def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
 
 
 def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
-    read_rig(tmp_path, "[battery]\ncurvature = 1e-8\n", "up.toml", notes=(notes := []))
-    assert notes == [
+    path = text_file(tmp_path / "up.toml", "[battery]\ncurvature = 1e-8\n")
+    assert robot_file.parse_robot_file(path).remarks == (
         "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises after 87.7 % of its "
-        "capacity is taken (capacity_curve: 7920 C)"
-    ]
-    robot = robot_file.change_robot(
-        paper_robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := [])
+        "capacity is taken (capacity_curve: 7920 C)",
     )
-    assert quiet == [] and robot.battery.voltage_empty == paper_robots.nominal().battery.voltage_empty
+    values = {"battery.capacity": 30_670.0}
+    robot = robot_file.change_robot(paper_robots.nominal(), values, where="--set")
+    assert not robot_file.battery_remarks(robot, values, "--set")
+    assert robot.battery.voltage_empty == paper_robots.nominal().battery.voltage_empty
 
 
 def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):

@@ -139,9 +139,8 @@ def test_commands_are_held_and_readings_on_one_clock_stay_as_they_are():
         "command": signal([0.5, 2.5], [7.0, 8.0]),
         "slow": signal([1.25, 3.75], [10.0, 20.0]),
     }
-    time, values, notes = one_clock.signals_on_one_grid(
-        "log", chosen, lambda c: c == "command", lambda c: c != "command", ""
-    )
+    measured = {"current", "speed", "slow"}
+    time, values, notes = one_clock.signals_on_one_grid("log", chosen, {"command"}, measured, "")
     assert_array_equal(time, np.arange(5.0))  # the row before the first command is left out
     assert_array_equal(values["current"], np.arange(1.0, 6) ** 2)
     assert_array_equal(values["command"], [7, 7, 8, 8, 8])
@@ -158,12 +157,12 @@ def test_a_slow_reading_is_on_the_straight_line_in_the_row_nearest_to_its_sample
 def test_samples_that_are_recorded_late_are_sorted_by_their_stamps():
     time = np.r_[0.0, 1, 2, 4, 3, 5, 6, 7]
     late = Signal("late", 8, lambda: 10 * time, clock=Clock("c", lambda: time, "s"))
-    found, values, notes = one_clock.signals_on_one_grid("log", {"late": late}, lambda c: False, lambda c: True, "")
+    found, values, notes = one_clock.signals_on_one_grid("log", {"late": late}, set(), {"late"}, "")
     assert_array_equal(values["late"], 10 * np.arange(8.0))
     assert found.tolist() == list(range(8)) and "1 sample of c arrived late" in notes[0]
     back = Signal("back", 60, lambda: np.zeros(60), clock=Clock("c", lambda: np.tile(np.arange(30.0), 2), "s"))
     with refused("log, c: goes back from 29 to 0 s at sample 31"):
-        one_clock.signals_on_one_grid("log", {"back": back}, lambda c: False, lambda c: True, "")
+        one_clock.signals_on_one_grid("log", {"back": back}, set(), {"back"}, "")
 
 
 @pytest.mark.parametrize(

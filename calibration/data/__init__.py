@@ -14,5 +14,7 @@ if TYPE_CHECKING:
 Columns: TypeAlias = "dict[str, np.ndarray]"
 #: Content of a JSON object.
 Json: TypeAlias = dict[str, Any]
+#: Columns with other names in a source: name in this program, name in the source, factor from its unit.
+Mapped: TypeAlias = tuple[tuple[str, str, float], ...]
 #: Priors of parameters by name: mean and sd [SI].
 Priors: TypeAlias = Mapping[str, tuple[float, float]]

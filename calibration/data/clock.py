@@ -38,27 +38,20 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
     """
     same_run = np.diff(run) == 0
     step = np.where(same_run, np.diff(count), 0.0)
-    rows_of_falls = np.flatnonzero(step < 0)
-    if not rows_of_falls.size or not (step > 0).any():
+    falls = np.flatnonzero(step < 0)
+    if not falls.size or not (step > 0).any():
         return count, 0.0
     usual = float(np.median(step[step > 0]))
     for period in PERIODS:
-        across = step[rows_of_falls] + period
+        across = step[falls] + period
         is_counter = period < 2**15 or not (count % 1).any()
-        if (
-            is_counter
-            and count.min() >= 0
-            and count.max() < period
-            and (np.abs(across) <= LACKING * usual).all()
-            and (across >= 0).all()
-        ):
+        is_within = count.min() >= 0 and count.max() < period
+        if is_counter and is_within and ((across >= 0) & (across <= LACKING * usual)).all():
             wraps = np.zeros(len(count))
-            wraps[rows_of_falls + 1] = 1.0
+            wraps[falls + 1] = 1.0
             total = np.cumsum(wraps)
-            first_row_of_run = np.zeros(len(count), int)
-            first_row_of_run[1:][~same_run] = np.flatnonzero(~same_run) + 1
-            begins = total[np.maximum.accumulate(first_row_of_run)]  # wraps before the recording of each row began
-            return count + period * (total - begins), period
+            first_row_of_run = np.maximum.accumulate(np.where(np.r_[False, ~same_run], np.arange(len(count)), 0))
+            return count + period * (total - total[first_row_of_run]), period
     return count, 0.0
 
 
@@ -74,23 +67,19 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     """
     if len(time) < 3:
         return time, 0.0
-    begins = np.flatnonzero(np.concatenate([[True], (np.diff(time) != 0) | (np.diff(run) != 0)]))
+    begins = np.flatnonzero(np.r_[True, (np.diff(time) != 0) | (np.diff(run) != 0)])
     rows = np.diff(np.append(begins, len(time)))
     if (rows - 1).sum() < SHARED * len(time) or (np.diff(time)[np.diff(run) == 0] < 0).any():
         return time, 0.0
-    stamps, recording = time[begins], run[begins]
-    step = np.diff(stamps)
-    step = np.append(step, np.nan)
-    step[np.append(np.diff(recording) != 0, True)] = np.nan
+    step = np.append(np.where(np.diff(run[begins]) == 0, np.diff(time[begins]), np.nan), np.nan)
     usual = float(np.nanmedian(step)) if np.isfinite(step).any() else np.nan
     rows_per_stamp = float(np.median(rows))
     inner_rows = rows[1:-1] if len(rows) > 4 else rows
     if not np.isfinite(usual) or (np.abs(inner_rows - rows_per_stamp) > 1).mean() > ODD:
         return time, 0.0
-    row_step = np.where(np.isfinite(step), step, usual) / rows
-    row_step = np.minimum(row_step, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)
+    row_step = np.minimum(np.where(np.isfinite(step), step, usual) / rows, usual / rows_per_stamp * 1.5)
     index = np.arange(len(time)) - np.repeat(begins, rows)
-    return np.repeat(stamps, rows) + index * np.repeat(row_step, rows), float(rows.mean())
+    return time + index * np.repeat(row_step, rows), float(rows.mean())
 
 
 #: Day assumed for a time without a date, and length of a day [s].
@@ -111,15 +100,11 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     for raw in arrays.values:
         empty = empty[missing_readings(raw, empty)]
     if len(arrays) > len(empty) > 0:
-        is_kept = np.ones(len(arrays), bool)
-        is_kept[empty] = False
-        arrays = arrays.rows(
-            is_kept,
-            f"left out: {count_noun(len(empty), 'row')} without any reading. Row numbers count only the others",
-        )
-    column_names = [None if m is None else m.column for m in meanings]
-    clock = next((raw for c, raw in zip(column_names, arrays.values, strict=True) if c in TIME), None)
-    if clock is None or "run_id" in column_names or not len(arrays):
+        note = f"left out: {count_noun(len(empty), 'row')} without any reading. Row numbers count only the others"
+        arrays = arrays.rows(~np.isin(np.arange(len(arrays)), empty), note)
+    by_name = {m.column: raw for m, raw in zip(meanings, arrays.values, strict=True) if m is not None}
+    clock = next((by_name[column] for column in TIME if column in by_name), None)
+    if clock is None or "run_id" in by_name or not len(arrays):
         return arrays
     count = column_numbers(clock)
     filled_rows = np.flatnonzero(count != 0)
@@ -144,18 +129,17 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
         meaning: meaning of the column.
         runs: `run_id` of each cell. None: all cells belong to one run.
     """
-    factor = meaning.value(1.0)
-    clock = (
-        np.array([_date_seconds(cell) for cell in raw])
-        if isinstance(raw, list) and ":" in raw[0]
-        else np.full(1, np.nan)
-    )
+    factor, notes = meaning.value(1.0), list[str]()
+    names, run = np.array([""]), np.zeros(len(raw), int)
+    if runs is not None:
+        names, run = np.unique(runs, return_inverse=True)
+    clock = np.full(1, np.nan)
+    if isinstance(raw, list) and ":" in raw[0]:
+        clock = np.array([_date_seconds(cell) for cell in raw])
     of_day = bool(np.isfinite(clock).all())
-    names, run = (np.array([""]), None) if runs is None else np.unique(runs, return_inverse=True)
-    notes: Names = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
-        count, notes = _unwrap_clock(name, meaning, column_numbers(raw), run)
+        count, notes = _unwrap_clock(f"{name}: {meaning.shown}", column_numbers(raw), run)
         clock = count * factor
         of_day = bool((clock > high).all())
         if of_day and clock[0] > EPOCH[1]:
@@ -163,58 +147,49 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
             if unit is None:
                 return raw, ()
             clock = clock * PARTS[unit]
-            notes = (*notes, f"{name}: {meaning.shown} is read as {unit} since 1970, judging by its size")
+            notes.append(f"{name}: {meaning.shown} is read as {unit} since 1970, judging by its size")
         if not of_day and not ((low <= clock) & (clock <= high)).all():
             return raw, ()
-    run = np.zeros(len(clock), int) if run is None else run
     if isinstance(raw, list):
         _add_days_after_midnight(clock, raw, run)
-    start_time = np.full(len(names), np.inf)
-    if len(names) > 1:
+    start_time = np.full(len(names), clock.min())
+    if len(names) > 1:  # takes ten times as long
+        start_time[:] = np.inf
         np.minimum.at(start_time, run, clock)
-    else:  # in a tenth of the time
-        start_time[:] = clock.min()
     if not start_time.any():
-        return (clock / factor if notes else raw), notes
-    passed = np.round(clock - start_time[run], 9) / factor
+        return (clock / factor if notes else raw), tuple(notes)
     if of_day:
-        return passed, (
-            *notes,
-            f"{name}: {meaning.shown} is a time of day, counted from the first row of each run",
-        )
-    run_index = run[np.flatnonzero(start_time[run])[0]]
-    time_words = f"{start_time[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
-    return passed, (
-        *notes,
-        f"{name}: {meaning.shown} begins at {time_words}, and counts from the first row of a run. If it began "
-        "earlier, add a row without readings then",
-    )
-
-
-def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
-    """Times of a clock with wraps and shared time stamps removed, and notes on both."""
-    step = np.diff(count)
-    if not len(step) or (step > 0).all() or not np.isfinite(step).all():
-        return count, ()
-    notes = []
-    recording = np.zeros(len(count), int) if run is None else run
-    count, period = unwrap_counter(count, recording)
-    if period:
-        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}. The wraps are removed")
-    count, rows = spread_shared_stamps(count, recording)
-    if rows:
+        notes.append(f"{name}: {meaning.shown} is a time of day, counted from the first row of each run")
+    else:
+        first = run[np.flatnonzero(start_time[run])[0]]
+        run_words = f" in run {names[first]}" if names[first] else ""
         notes.append(
-            f"{name}: {meaning.shown} repeats, {rows:.3g} rows per time stamp. Rows are spaced evenly between stamps"
+            f"{name}: {meaning.shown} begins at {start_time[first] / factor:g}{run_words}, and counts from the first "
+            "row of a run. If it began earlier, add a row without readings then"
         )
-    return count, tuple(notes)
+    return np.round(clock - start_time[run], 9) / factor, tuple(notes)
+
+
+def _unwrap_clock(place: str, count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Times of a clock with wraps and shared time stamps removed, and notes on both."""
+    step, notes = np.diff(count), list[str]()
+    if (step > 0).all() or not np.isfinite(step).all():
+        return count, notes
+    count, period = unwrap_counter(count, run)
+    if period:
+        notes.append(f"{place} wraps at {period:.10g}. The wraps are removed")
+    count, rows = spread_shared_stamps(count, run)
+    if rows:
+        notes.append(f"{place} repeats, {rows:.3g} rows per time stamp. Rows are spaced evenly between stamps")
+    return count, notes
 
 
 def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
     """Adds a day [s] to times without a date after they fall back by more than half a day within their run."""
     last_time: dict[int, float] = {}
     for k, (x, run_index) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
-        if _is_time_without_date(cells[k]) and run_index in last_time:
-            clock[k] = x = x + _DAY * max(math.floor((last_time[run_index] - x) / _DAY + 0.5), 0)
+        if _is_time_without_date(cells[k]):
+            clock[k] = x = x + _DAY * max(math.floor((last_time.get(run_index, x) - x) / _DAY + 0.5), 0)
         last_time[run_index] = x
 
 
@@ -287,14 +262,12 @@ def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray
     """True for rows of runs in which one of these columns changes, shape (rows,). Default: all columns that may
     change.
     """
-    columns = changing_columns(runs) if columns is None else columns
     varies = np.zeros(len(runs), bool)
     if not runs.sampled:
         return varies
-    _, run = np.unique(runs.run_names, return_inverse=True)
-    first_row_of_run = np.unique(run, return_index=True)[1][run]
-    for column in (c for c in columns if runs.has(c)):
-        differs = runs[column] != runs[column][first_row_of_run]
+    _, first_rows, run = np.unique(runs.run_names, return_index=True, return_inverse=True)
+    for column in changing_columns(runs) if columns is None else filter(runs.has, columns):
+        differs = runs[column] != runs[column][first_rows[run]]
         varies |= np.bincount(run, differs)[run] > 0
     return varies
 
@@ -328,12 +301,8 @@ def divide_run(
 
 def intervals_by_run(runs: Runs) -> list[list[ConstantInterval]]:
     """Intervals of constant conditions for every run, in the order of the runs' names."""
-    stretches = []
-    time, volts = runs["time_s"], applied_drive(runs)
-    columns = [runs[c] for c in changing_columns(runs)]
-    for name in np.unique(runs.run_names):
-        stretches.append(divide_run(runs.in_order(name), time, columns, volts))
-    return stretches
+    volts, columns = applied_drive(runs), [runs[c] for c in changing_columns(runs)]
+    return [divide_run(runs.in_order(name), runs["time_s"], columns, volts) for name in np.unique(runs.run_names)]
 
 
 def course_of_each_row(runs: Runs) -> np.ndarray:
@@ -342,9 +311,9 @@ def course_of_each_row(runs: Runs) -> np.ndarray:
     The name is short because the whole sequence, with thousands of changes in each row, would take gigabytes.
     """
     courses, names = np.full(len(runs), "", dtype=object), dict[str, str]()
-    if rows_of_varying_runs(runs).any():
-        columns = changing_columns(runs)
-        for run in (r for r in intervals_by_run(runs) if len(r) > 1):
+    columns = changing_columns(runs)
+    for run in intervals_by_run(runs) if rows_of_varying_runs(runs).any() else ():
+        if len(run) > 1:
             descriptions = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
             name = names.setdefault("; ".join(descriptions), f"course {len(names) + 1}")
             courses[np.concatenate([s.rows for s in run])] = name

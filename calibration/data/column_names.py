@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -24,8 +25,15 @@ from calibration.data.columns import (
     Column,
     Layout,
 )
-from calibration.data.input_errors import BadData, allowed_words, parse_number
-from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
+from calibration.data.input_errors import BadData, allowed_words
+from calibration.data.named_arrays import (
+    NamedArrays,
+    Raw,
+    cell_number,
+    column_numbers,
+    column_texts,
+    missing_readings,
+)
 from mmrjax.model import channels, quantities
 from mmrjax.model.robot import Robot
 
@@ -51,11 +59,7 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
     tolerance = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
     above = numbers > low if meaning.column in layout.deviation_columns else numbers >= low - tolerance * abs(low)
     refused = ~(above & (numbers <= high + tolerance * abs(high)))
-    if meaning.column != layout.imposed_column and meaning.column in (
-        *layout.measured_columns,
-        *layout.deviation_columns,
-        *DUTY,
-    ):
+    if meaning.column != layout.imposed_column and meaning.column in _may_be_empty(layout):
         refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
     np.clip(numbers, low, high, out=numbers)
     if meaning.as_named:
@@ -63,6 +67,11 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
     if meaning.quantity.percent and meaning.unit == quantities.PERCENT:  # not proportional
         return np.array([meaning.value(x) for x in numbers.tolist()]), refused
     return numbers * meaning.factor * meaning.quantity.units[meaning.unit], refused
+
+
+def _may_be_empty(layout: Layout) -> Names:
+    """Columns whose cells may be empty."""
+    return (*layout.measured_columns, *layout.deviation_columns, *DUTY)
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
@@ -88,13 +97,10 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
         allowed = _allowed_words(column, cell, layout)
     else:
         low, high = meaning.limits()
-        hint = _hint_about_cell(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
+        hint = _hint_about_cell(meaning, cell, hints, _may_be_empty(layout))
         more_than = "more than " if column in layout.deviation_columns else ""
-        allowed = f"{more_than}{low:g} to {high:g}"
-        try:
-            parse_number(cell)
-        except ValueError:
-            allowed = f"a number, {allowed}"
+        number = "a number, " if math.isnan(cell_number(cell)) and cell.lower() != "nan" else ""
+        allowed = f"{number}{more_than}{low:g} to {high:g}"
     return f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}"
 
 
@@ -106,29 +112,25 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
     if not units or meaning.factor != 1.0:
         return ""
     columns_by_unit = {unit: column for column, unit in quantity.columns().items()}
-    try:
-        value = parse_number(cell)
-    except ValueError:
-        match = _WITH_UNIT.fullmatch(cell)
-        return "" if match is None else _unit_hint(match[1], match[2], column_unit, columns_by_unit)
-    is_far = abs(value) > FAR * max(map(abs, quantity.limits(column_unit)))
-    if is_far and meaning.column in DUTY:
+    in_unit = column_unit or "shares of 1"
+    value = cell_number(cell)
+    match = _WITH_UNIT.fullmatch(cell) if math.isnan(value) else None
+    if match is not None:  # a unit is written next to the number
+        unit = quantities.unit_in_column(match[2])
+        if unit == column_unit:
+            return f"write {match[1]}, since the unit is in the column's name; "
+        if unit in columns_by_unit:
+            return f"write numbers without units, in {in_unit}, or name the column {columns_by_unit[unit]}; "
+        return f"write only the number{f', in {column_unit}' if column_unit else ''}; "
+    if not abs(value) > FAR * max(map(abs, quantity.limits(column_unit))):
+        return ""
+    if meaning.column in DUTY:
         return "is the command scaled? divide it by its maximum, in a log with [columns] duty = {column, factor}; "
     for unit, column in columns_by_unit.items():
         low, high = quantity.limits(unit)
-        if is_far and unit != column_unit and low <= value <= high:
+        if unit != column_unit and low <= value <= high:
             return f"is it in {unit or 'shares of 1'}? then name the column {column}; "
     return ""
-
-
-def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """Advice on a unit written next to a number. `mine`: unit of the column. `named`: columns by unit."""
-    unit = quantities.unit_in_column(written)
-    if unit == mine:
-        return f"write {value}, since the unit is in the column's name; "
-    if unit in named:
-        return f"write numbers without units, in {mine or 'shares of 1'}, or name the column {named[unit]}; "
-    return f"write only the number{f', in {mine}' if mine else ''}; "
 
 
 #: Most columns of a table that a message names.
@@ -147,14 +149,22 @@ def match_column_names(
     Raises:
         BadData: a name occurs twice.
     """
-    matched_names, notes = _match_case(name, header, layout, inferred)
-    repeated = sorted({c for c in matched_names if matched_names.count(c) > 1})
-    if repeated:
-        raise BadData(
-            f"{name}: column {repeated[0]} is present {matched_names.count(repeated[0])} times; expected once"
-        )
+    every = dataclasses.replace(layout, channels=channels.EVERY)
+    spelled: dict[str, set[str]] = {}
+    for column in (every if inferred else layout).spellings():
+        spelled.setdefault(column.casefold(), set()).add(column)
+    matched_names, notes = [], []
+    for column in header:
+        meant = spelled.get(column.casefold(), set())
+        if column not in meant and len(meant) == 1 and not meant & set(header):
+            (right,) = meant
+            notes.append(f"{name}: column {column} is read as {right}")
+            column = right
+        matched_names.append(column)
+    repeated = min((c for c in matched_names if matched_names.count(c) > 1), default=None)
+    if repeated is not None:
+        raise BadData(f"{name}: column {repeated} is present {matched_names.count(repeated)} times; expected once")
     if inferred or of_turns:
-        every = dataclasses.replace(layout, channels=channels.EVERY)
         present = {m.column for m in every.meanings(name, matched_names) if m is not None}
         turns = of_turns and {*layout.sides, *VOLTS, *HEADING} & present
         more = channels.EVERY if inferred else channels.OF_TURNS if turns else ()
@@ -163,43 +173,30 @@ def match_column_names(
     return matched_names, layout, tuple(notes)
 
 
-def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
-    """Header with the capitals of the known column names, and notes on changed names."""
-    full_layout = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
-    spelled: dict[str, set[str]] = {}
-    for column in full_layout.spellings():
-        spelled.setdefault(column.casefold(), set()).add(column)
-    columns_found, notes = [], []
-    for column in header:
-        meant = spelled.get(column.casefold(), set())
-        if column not in meant and len(meant) == 1 and not meant & set(header):
-            (right,) = meant
-            notes.append(f"{name}: column {column} is read as {right}")
-            column = right
-        columns_found.append(column)
-    return columns_found, tuple(notes)
-
-
 def check_header(
     name: str, header: list[str], meanings: list[Column | None], measured: bool, battery: bool, layout: Layout
 ) -> None:
-    mapped_columns = {m.column for m in meanings if m is not None}
+    """Rejects a header that lacks a column, or has a misspelt one.
+
+    Raises:
+        BadData: a required column or every channel is missing, or a name is close to a known one.
+    """
+    present = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
     if not layout.complete:  # names of other channels are not misspellings
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
-    _check_names_of_sides(name, strange, mapped_columns, layout)
-    required = layout.required(measured=measured, battery=battery)
-    if layout.imposed_column == SPEED and mapped_columns & set(layout.sides):  # the sides' speeds are imposed
-        required = tuple(c for c in required if c != SPEED)
-        if SPEED in mapped_columns:
+    _check_names_of_sides(name, strange, present, layout)
+    supplied = set()  # required columns that follow from others
+    if layout.imposed_column == SPEED and present & set(layout.sides):  # the sides' speeds are imposed
+        supplied.add(SPEED)
+        if SPEED in present:
             raise BadData(f"{name}: column {SPEED} in addition to {', '.join(layout.sides)}; keep one of them")
-    if mapped_columns & set(VOLTS):  # the supply's voltage is the larger one
-        required = tuple(c for c in required if c != SUPPLY)
-    if (
-        not layout.complete and "surface" in mapped_columns
-    ):  # it determines the configuration if all surfaces belong to one
-        required = tuple(c for c in required if c != "configuration")
-    for column in (c for c in (*required, *layout.measured_columns) if c not in mapped_columns):
+    if present & set(VOLTS):  # the supply's voltage is the larger one
+        supplied.add(SUPPLY)
+    if not layout.complete and "surface" in present:  # its labels may belong to one configuration
+        supplied.add("configuration")
+    required = [c for c in layout.required(measured=measured, battery=battery) if c not in supplied]
+    for column in (c for c in (*required, *layout.measured_columns) if c not in present):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
             suggestion = f"; did you mean {close[0]}?" if close else ""
@@ -207,22 +204,23 @@ def check_header(
                 suggestion = "; the columns that drive the sides can be named under [columns]: " + ", ".join(
                     f'{volts} = "motor_{volts}"' for volts in VOLTS
                 )
-            elif column == SUPPLY and CURRENT in mapped_columns and not close:
+            elif column == SUPPLY and CURRENT in present and not close:
                 suggestion = f'; record it, or set imposed = "motor_current" if {CURRENT} is commanded'
+            advice = "" if close else _advice_on_unknown_columns(strange, column)
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{suggestion} (required: {', '.join(required)})"
-                + ("" if close else _advice_on_unknown_columns(strange, column))
+                f"{advice}"
             )
-    if measured and not any(c in mapped_columns for c in layout.measured_columns):
-        expected = ", ".join(layout.measured_columns)
+    if measured and present.isdisjoint(layout.measured_columns):
         other = _advice_on_unknown_columns(strange, layout.measured_columns[0])
-        turning = {c.column: c.name for c in channels.OF_TURNS}
-        if of_turns := [c for c in strange if c in turning]:
-            names = ", ".join(f'"{turning[c]}"' for c in of_turns)
-            other = f"; {', '.join(of_turns)}: set channels = [{names}] in the robot's file"
+        turning = {c.column: c.name for c in channels.OF_TURNS if c.column in strange}
+        if turning:
+            names = ", ".join(f'"{channel}"' for channel in turning.values())
+            other = f"; {', '.join(turning)}: set channels = [{names}] in the robot's file"
+        expected = ", ".join(layout.measured_columns)
         raise BadData(f"{name}: no column with readings; expected at least one of {expected}{other}")
     for column in strange:
-        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in mapped_columns], 1, 0.85)
+        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in present], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
@@ -238,10 +236,10 @@ def unread_channel_notes(name: str, robot: Robot, unread: Collection[str]) -> Na
         channel = next((c for c in channels.EVERY if own_column in c.columns()), None)
         if logger_column in unread and channel is not None:
             braked = channel.name == "output_torque" and not robot.has_ground
+            cure = ", or assign the column to load_torque_Nm if a brake sets this torque" * braked
             notes.append(
                 f"{name}, {logger_column}: not read, because the robot file assigns it to {own_column}, and "
-                f'"channels" does not list {channel.name}. Add it there'
-                + (", or assign the column to load_torque_Nm if a brake sets this torque" if braked else "")
+                f'"channels" does not list {channel.name}. Add it there{cure}'
             )
     return tuple(notes)
 
@@ -275,23 +273,19 @@ def _advice_on_unknown_columns(strange: list[str], column: str) -> str:
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
     """Rejects columns that name a side by another word, or in another part of the name."""
 
-    def sorted_words(column: str) -> list[str]:
-        return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
+    def sorted_words(column: str) -> tuple[str, ...]:
+        return tuple(sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_")))
 
-    columns_of_sides = {
-        tuple(sorted_words(c)): c for c in layout.known() if set(channels.SIDES) & set(sorted_words(c))
-    }
+    of_sides = {sorted_words(c): c for c in layout.known() if {*channels.SIDES} & {*sorted_words(c)}}
+    turns = {*SIDES} <= {*of_sides.values()} and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
     for column in strange:
-        meant = columns_of_sides.get(tuple(sorted_words(column)))
+        meant = of_sides.get(sorted_words(column))
         if meant is not None and meant not in stated:
             raise BadData(
                 f"{name}: column {column}: the sides are called left and right; rename it to {meant}, or set "
                 f'[columns] {meant} = "{column}" in the robot\'s file'
             )
         side = next((side for side in channels.SIDES if side in sorted_words(column)), None)
-        turns = set(SIDES) <= set(columns_of_sides.values()) and not stated.isdisjoint(
-            c.column for c in channels.OF_TURNS
-        )
         if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
             raise BadData(
                 f"{name}: column {column}: if it is the voltage of the {side} side, rename it to "
@@ -301,31 +295,24 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
 
 def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     """Rejects a column whose name or source states a unit other than the one in which it is read."""
-    units_below_header = [""] * len(meanings)
-    for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
-        if meaning is None or meaning.column in WORDS:
+    places = ("in its name", f"in {arrays.units_from}")
+    for stated_unit, meaning in zip(arrays.units or [""] * len(meanings), meanings, strict=True):
+        if meaning is None or abs(meaning.factor) != 1.0:  # a factor states the unit
             continue
-        known_units = meaning.quantity.columns().values()
-        if unit and unit not in known_units and abs(meaning.factor) == 1.0:  # a factor states the unit
-            allowed = ", ".join(filter(None, known_units))
+        by_unit = {unit: column for column, unit in meaning.quantity.columns().items()}
+        source_unit = "" if meaning.column in WORDS else stated_unit
+        if source_unit and source_unit not in by_unit:
+            allowed = ", ".join(filter(None, by_unit))
             raise BadData(
-                f"{arrays.name}, {meaning.shown}: got {unit} in {arrays.units_from}; "
+                f"{arrays.name}, {meaning.shown}: got {source_unit} in {arrays.units_from}; "
                 f"expected {f'one of {allowed}' if allowed else 'none'}; correct or remove it"
             )
-        units_below_header[j] = unit
-    for stated_below, meaning in zip(units_below_header, meanings, strict=True):
-        if meaning is None or abs(meaning.factor) != 1.0:
-            continue
-        columns_by_unit = {unit: column for column, unit in meaning.quantity.columns().items()}
-        for unit_text, place_words in (
-            (quantities.unit_at_end(meaning.shown, columns_by_unit), "in its name"),
-            (stated_below, f"in {arrays.units_from}"),
-        ):
-            if unit_text and unit_text != meaning.unit:
-                mapped = meaning.shown not in (meaning.column, columns_by_unit[meaning.unit])
-                remedy = f'state [columns] {columns_by_unit[unit_text]} = "{meaning.shown}" in the robot\'s file'
+        for unit, place in zip((quantities.unit_at_end(meaning.shown, by_unit), source_unit), places, strict=True):
+            if unit and unit != meaning.unit:
+                remedy = f"name it {by_unit[unit]}"
+                if meaning.shown not in (meaning.column, by_unit[meaning.unit]):
+                    remedy = f'state [columns] {by_unit[unit]} = "{meaning.shown}" in the robot\'s file'
                 raise BadData(
-                    f"{arrays.name}: column {meaning.shown} states {unit_text} {place_words}, and is read in "
-                    f"{meaning.unit or 'shares of 1'}; "
-                    f"{remedy if mapped else f'name it {columns_by_unit[unit_text]}'}, or correct the unit"
+                    f"{arrays.name}: column {meaning.shown} states {unit} {place}, and is read in "
+                    f"{meaning.unit or 'shares of 1'}; {remedy}, or correct the unit"
                 )

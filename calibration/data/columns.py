@@ -8,7 +8,7 @@ import functools
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from calibration.data import Names
+from calibration.data import Mapped, Names
 from calibration.data.input_errors import BadData
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -61,10 +61,6 @@ WORDS = tuple(label.column for label in quantities.LABELS)
 
 #: Least similarity for one column name to count as a misspelling of another.
 ALIKE = 0.6
-
-
-def _reading_and_deviation(channel: Channel) -> tuple[Quantity, Quantity]:
-    return channel, channel.deviation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +120,7 @@ class Layout:
     inherits: bool = True
     configurations: Names = ()
     instruments: tuple[Instrument, ...] = ()
-    mapped: tuple[tuple[str, str, float], ...] = ()
+    mapped: Mapped = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
     supply: float = 0.0
 
@@ -142,19 +138,16 @@ class Layout:
         return cls(*choices, robot.channels, supply)
 
     @property
-    def uses_paper_conditions(self) -> bool:
-        """True if the robot is driven like the paper's robot, so that the conditions of Table 8 apply."""
-        return self.inherits and self.has_ground and self.imposed == "voltage"
-
-    @property
     def complete(self) -> bool:
-        """True if tables must contain every condition. Otherwise a missing condition has its usual value."""
-        return self.uses_paper_conditions
+        """True if the robot is driven like the paper's robot, so that the conditions of Table 8 apply and tables must
+        contain every condition. Otherwise a missing condition has its usual value.
+        """
+        return self.inherits and self.has_ground and self.imposed == "voltage"
 
     @property
     def crosses_zero(self) -> bool:
         """True if readings may cross zero. Errors are then relative to the channel's size instead of the reading."""
-        return not self.uses_paper_conditions or not set(channels.OF_TURNS).isdisjoint(self.channels)
+        return not self.complete or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @functools.cached_property
     def idle(self) -> Names:
@@ -214,10 +207,8 @@ class Layout:
 
     def quantities(self) -> dict[str, Quantity]:
         """Quantity of each column, including conditions that do not act on the load."""
-        shown_channels = [
-            c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)
-        ]
-        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown_channels for q in _reading_and_deviation(c)))
+        shown = [c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)]
+        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown for q in (c, c.deviation)))
         known_columns = {*self.known(), *ON_GROUND, *ON_SHAFT}
         return {q.column: q for q in rows if q.column in known_columns}
 
@@ -228,48 +219,38 @@ class Layout:
             BadData: two columns hold the same quantity.
         """
         by_name = self._by_name
-        mapped_columns = {
-            column: (own_column, factor) for own_column, column, factor in self.mapped if column in header
-        }
-        taken = {_standard_name(by_name, own_column) for own_column, _ in mapped_columns.values()}
-        meanings_found: list[Column | None] = []
+        mapped = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
+        unread = {name for c in channels.EVERY for q in (c, c.deviation) for name in q.columns()} if mapped else set()
+        taken = {by_name[mine].column for mine, _ in mapped.values() if mine in by_name}
+        meanings: list[Column | None] = []
         for column in header:
-            if column in mapped_columns:
-                own_column, factor = mapped_columns[column]
-                meant = by_name.get(own_column)
-                if meant is None and own_column in {
-                    name
-                    for channel in channels.EVERY
-                    for q in _reading_and_deviation(channel)
-                    for name in q.columns()
-                }:  # a channel that is not read
-                    meanings_found.append(None)
-                    continue
-                if meant is None:
-                    raise BadData(
-                        f"{source}: the robot's file reads {own_column} from column {column}; mmrjax has no column "
-                        f"{own_column} (known: {', '.join(self.known())})"
-                    )
-                meanings_found.append(dataclasses.replace(meant, shown=column, factor=factor))
-            else:
+            if column not in mapped:
                 meant = by_name.get(column)
-                meanings_found.append(None if meant is None or meant.column in taken else meant)
+                meanings.append(None if meant is None or meant.column in taken else meant)
+                continue
+            mine, factor = mapped[column]
+            meant = by_name.get(mine)
+            if meant is None and mine not in unread:
+                raise BadData(
+                    f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column {mine} "
+                    f"(known: {', '.join(self.known())})"
+                )
+            meanings.append(None if meant is None else dataclasses.replace(meant, shown=column, factor=factor))
         first: dict[str, Column] = {}
-        for meaning in filter(None, meanings_found):
+        for meaning in filter(None, meanings):
             twin = first.setdefault(meaning.column, meaning)
             if meaning.shown != twin.shown:
                 raise BadData(
                     f"{source}: columns {twin.shown} and {meaning.shown} have the same meaning; keep one of them"
                 )
-        return meanings_found
+        return meanings
 
     @functools.cached_property
     def _by_name(self) -> Mapping[str, Column]:
         """Every possible column name, in any unit, with its quantity."""
-        quantities_by_name = self.quantities().values()
         return {
             name: Column(quantity, name, unit)
-            for quantity in quantities_by_name
+            for quantity in self.quantities().values()
             for name, unit in quantity.columns().items()
         }
 
@@ -285,26 +266,24 @@ class Layout:
         Args:
             stated: columns that the table already has, which are left out.
         """
-        ignored_columns = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
-        lacking = {
-            column: quantity for column, quantity in self.quantities().items() if column not in ignored_columns
+        ignored = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
+        spelled = {
+            s: (column, unit)
+            for column, q in self.quantities().items()
+            if column not in ignored
+            for s, unit in q.columns().items()
         }
-        spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
         unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})
         pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
         close = difflib.get_close_matches(name.casefold(), [s.casefold() for s in pool], 1, ALIKE)
         if close:
             return next(s for s in pool if s.casefold() == close[0])
-        conditions_in_unit = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
-        return conditions_in_unit[0] if len(conditions_in_unit) == 1 else ""
+        in_unit = [s for s in pool if unit and spelled[s][0] not in self.measured_columns]
+        return in_unit[0] if len(in_unit) == 1 else ""
 
     def expected(self, column: str) -> str:
         """Name of the column, and its name in the source if the robot file states one."""
-        mapped_column = next(
-            (their for mine, their, _ in self.mapped if _standard_name(self._by_name, mine) == column), None
-        )
-        return column if mapped_column is None else f"{column} (in the robot's file: {mapped_column})"
-
-
-def _standard_name(by_name: Mapping[str, Column], name: str) -> str:
-    return by_name[name].column if name in by_name else name
+        for mine, theirs, _ in self.mapped:
+            if mine == column or (mine in self._by_name and self._by_name[mine].column == column):
+                return f"{column} (in the robot's file: {theirs})"
+        return column

@@ -14,10 +14,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
+import numpy as np
 
 from calibration.data import Json, Names, rig_file
 from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration, stated_as, stated_names, stated_word
+from calibration.data.input_files import flat_table
 from calibration.data.table import Runs, configuration_on_surface
 from mmrjax.errors import allowed_words
 from mmrjax.model import params
@@ -67,41 +69,32 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     """
     if not runs.has("surface") or not robot.has_ground:
         return robot
-    pairs = list(dict.fromkeys(zip(runs["configuration"].tolist(), runs["surface"].tolist(), strict=True)))
+    pairs = dict.fromkeys(zip(runs["configuration"].tolist(), runs["surface"].tolist(), strict=True))
     members = dict(robot.configurations.items())
     labelled = SURFACES if robot.rig.scales_adhesion else ()
     leaders: dict[str, str] = {}
     for configuration in dict.fromkeys(c for c, _ in pairs):
-        labels = [label for c, label in pairs if c == configuration]
-        own_names = [x for x in labels if x not in labelled or configuration_on_surface(configuration, x) in members]
-        present = [
-            configuration_on_surface(configuration, x)
-            for x in own_names
-            if configuration_on_surface(configuration, x) in members
-        ]
-        if not own_names or (len(labels) == 1 and not present) or (configuration not in members and not present):
+        on = {label: configuration_on_surface(configuration, label) for c, label in pairs if c == configuration}
+        separate = [name for label, name in on.items() if label not in labelled or name in members]
+        present = [name for name in separate if name in members]
+        is_member = configuration in members
+        if not separate or (not present and (len(on) == 1 or not is_member)):
             continue
-        is_kept = configuration in members and len(own_names) < len(labels)
-        pattern = members[configuration] if configuration in members else members[present[0]]
-        names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own_names))
-        if configuration in members and not is_kept:  # replaces the configuration
-            members = {
-                n: m for key, value in members.items()
-                for n, m in (
-                    [(n, members.get(n, pattern)) for n in names] if key == configuration else [(key, value)]
-                )
-            }  # fmt: skip
+        is_kept = is_member and len(separate) < len(on)
+        pattern = members[configuration if is_member else present[0]]
+        added = {name: members.get(name, pattern) for name in separate}
+        if is_member and not is_kept:  # they replace the configuration
+            parts = [added if name == configuration else {name: load} for name, load in members.items()]
+            members = {name: load for part in parts for name, load in part.items()}
         else:
-            members |= {n: members.get(n, pattern) for n in names}
-        first = configuration if is_kept else names[0]
-        leaders |= {n: first for n in names if n != first}
+            members |= added
+        first = configuration if is_kept else separate[0]
+        leaders |= {name: first for name in added if name != first}
     rig = dataclasses.replace(robot.rig, surfaces=tuple(leaders.items()))
-    with_surfaces = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
-    priors = values_of_surface_configurations(
-        {name: (mean, sd) for name, mean, sd in rig.priors}, with_surfaces, runs
-    )
+    robot = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
+    priors = values_of_surface_configurations({name: (mean, sd) for name, mean, sd in rig.priors}, robot, runs)
     rig = dataclasses.replace(rig, priors=tuple((name, *value) for name, value in priors.items()))
-    return dataclasses.replace(with_surfaces, rig=rig)
+    return dataclasses.replace(robot, rig=rig)
 
 
 def values_of_surface_configurations(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
@@ -110,11 +103,7 @@ def values_of_surface_configurations(stated: Mapping[str, V], robot: Robot, runs
     Args:
         robot: as returned by `with_surface_configurations`.
     """
-    by_name: dict[str, V] = {}
-    for name, value in stated.items():
-        for new in names_of_surfaces([name], robot, runs):
-            by_name[new] = value
-    return by_name
+    return {new: value for name, value in stated.items() for new in names_of_surfaces([name], robot, runs)}
 
 
 def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[str]:
@@ -122,43 +111,36 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
 
     A parameter of the ground becomes one parameter for each surface. Any other becomes that of the first surface.
     """
-    names_found: list[str] = []
+    new_names: list[str] = []
     for name in names:
         configuration, _, key = name.partition(".")
-        is_replaced = configuration not in robot.configurations and configuration in (
-            runs["configuration"] if runs.has("surface") else ()
-        )
-        if not is_replaced:
-            names_found.append(name)
+        rows = runs["configuration"] == configuration if runs.has("surface") else np.zeros(0, bool)
+        if configuration in robot.configurations or not rows.any():
+            new_names.append(name)
             continue
-        surface_names = runs["surface"][runs["configuration"] == configuration]
-        on = [
-            n
-            for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in surface_names)
-            if n in robot.configurations
-        ]
-        names_found += [f"{n}.{key}" for n in (on if key.startswith((GROUND, "*")) else on[:1])]
-    return names_found
+        on = dict.fromkeys(configuration_on_surface(configuration, s) for s in runs["surface"][rows])
+        present = [n for n in on if n in robot.configurations]
+        new_names += [f"{n}.{key}" for n in present[: None if key.startswith((GROUND, "*")) else 1]]
+    return new_names
 
 
 #: Kinds of movers, and the `on_tracks` of each.
 MOVERS = {"tracks": 1.0, "wheels": 0.0}
 #: Names that a configuration cannot have, because robot files use them as keys.
 TAKEN = (
-    *(
-        "schema",
-        "base",
-        "sides",
-        "configurations",
-        "battery",
-        "motor",
-        "gearbox",
-        "running_gear",
-        "driver",
-        "rig",
-        "controller",
-    ),
-    *("effects", *rig_file.KEYS),
+    "schema",
+    "base",
+    "sides",
+    "configurations",
+    "battery",
+    "motor",
+    "gearbox",
+    "running_gear",
+    "driver",
+    "rig",
+    "controller",
+    "effects",
+    *rig_file.KEYS,
 )
 _KINDS = ("load", "like", "movers")
 _EXAMPLE = 'configurations = ["rover"]'
@@ -194,35 +176,36 @@ def loads_from_tables(
         raise BadConfiguration(
             f"{where}: no load is defined; add a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
         )
-    names = _names(content.pop("configurations", usual), where)
-    nothing = f', or set base = "{rig_file.NONE}" for a rig that is described completely in this file'
+    names = _names(content.pop("configurations", usual), f"{where}, configurations")
     for name in load_names:
         if name not in names and set(_KINDS) & set(content[name]):
+            nothing = f', or set base = "{rig_file.NONE}" for a rig that is described completely in this file'
             raise BadConfiguration(
                 f"{where}, {name}: not one of the configurations {', '.join(names)}; add it to configurations = "
                 f"[...]{'' if base is None else nothing}"
             )
+    # An invalid number of drives is rejected later.
+    sides = content.get("sides", 1.0 if base is None else float(base.sides))
+    sides = float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
     by_name: dict[str, Load] = {}
     missing: list[str] = []
     linear: set[str] = set()
     for name in names:
         table_place = f"{where}, {name}"
         table = stated_as(content.get(name, {}), dict, table_place, f"a table [{name}]")
-        kind = _load_kind(table, table_place)
+        kind, lacking = _load_kind(table, table_place), list[str]()
         if kind == "linear":
-            rig_file.linear_to_shaft(table, name, table_place, sds, _number_of_drives(content, base))
+            rig_file.linear_to_shaft(table, name, table_place, sds, sides)
             linear.add(name)
-        if kind in ("linear", "shaft"):
-            by_name[name], lacking = _blank_shaft(table)
+        if kind != "vehicle":
+            by_name[name] = Shaft(inertia=0.0, loss_coulomb=0.0)
+            lacking = _missing_parameters(by_name[name], table)
         elif base is None:
-            by_name[name], lacking = _blank_vehicle(table, table_place, _number_of_drives(content, base))
+            by_name[name], lacking = _blank_vehicle(table, table_place, sides)
         else:
-            by_name[name], lacking = _chassis_of_base(base, name, table, table_place), []
-        if lacking and base is not None:
-            raise BadConfiguration(
-                f"{table_place}: without a base, the load must be described completely; {_list_in_words(lacking)} "
-                "missing"
-            )
+            by_name[name] = _chassis_of_base(base, name, table, table_place)
+        if base is not None:
+            _reject_incomplete(f"{table_place}: without a base, the load must be described completely", lacking)
         missing += [f"{name}.{key}" for key in lacking]
     shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
     vehicles = [name for name in names if name not in shafts]
@@ -241,50 +224,33 @@ def resolve_likes(content: Json, where: str) -> None:
         BadConfiguration: a `like` names no other table, or a table that has a `like` itself.
     """
     tables = {n: dict(table) for n, table in content.items() if n not in TAKEN and isinstance(table, dict)}
-    own_names = [name for name, table in tables.items() if "like" not in table]
+    complete = [name for name, table in tables.items() if "like" not in table]
     for name, table in tables.items():
         if "like" in table:
-            like = table.pop("like")
-            stated_word(like, own_names, f"{where}, {name}.like")
+            like = stated_word(table.pop("like"), complete, f"{where}, {name}.like")
             content[name] = _merge_tables(tables[like], table)
 
 
-def _merge_tables(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
+def _merge_tables(below: Json, above: Json) -> Json:
     """Two tables merged into one. Entries of `above` take precedence."""
-    merged = {
-        key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
-    }
-    return {**below, **above, **{key: _merge_tables(value, above[key]) for key, value in merged.items()}}
+    merged = below | above
+    for key, value in below.items():
+        if isinstance(value, dict) and isinstance(merged[key], dict):
+            merged[key] = _merge_tables(value, merged[key])
+    return merged
 
 
 def _load_kind(table: Json, where: str) -> str:
     """Kind of load that a table states, a vehicle by default."""
     if "load" not in table:
         return "vehicle"
-    load = table.pop("load")
-    stated_word(load, rig_file.LOADS, f"{where}.load")
+    load = stated_word(table.pop("load"), rig_file.LOADS, f"{where}.load")
     for key in ("like", "movers"):
         if load != "vehicle" and key in table:
             raise BadConfiguration(f"{where}: load = {load!r} and {key} contradict each other; keep one")
-    if load == "vehicle":
-        table.setdefault("movers", "wheels") if "like" not in table else None
-    return str(load)
-
-
-def _number_of_drives(content: Mapping[str, Any], base: Robot | None) -> float:
-    """Number of drives that a file states. An invalid value is rejected later."""
-    sides = content.get("sides", 1.0 if base is None else float(base.sides))
-    return float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
-
-
-def _blank_shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
-    """Shaft before the parameters of its table are applied, and the required parameters that the table lacks."""
-    missing = [
-        field.name
-        for field in dataclasses.fields(Shaft)
-        if "spec" in field.metadata and field.default is dataclasses.MISSING and field.name not in table
-    ]
-    return Shaft(inertia=0.0, loss_coulomb=0.0), missing
+    if load == "vehicle" and "like" not in table:
+        table.setdefault("movers", "wheels")
+    return load
 
 
 def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]:
@@ -303,27 +269,23 @@ def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list
         radius=0.0,
         inertia=0.0,
     )
-    defaults_of_kind = rig_file.vehicle_defaults(on_tracks > 0.5, table, sides)
-    missing = [
-        p.name
-        for p in params.walk_parameters(nothing)
-        if p.name not in defaults_of_kind and not _table_states(table, p.name)
-    ]
-    return params.replace(
-        nothing, {name: params.as_float(value) for name, value in defaults_of_kind.items()}
-    ), missing
+    values = flat_table(table)
+    defaults = rig_file.vehicle_defaults(on_tracks > 0.5, values, sides)
+    missing = [p.name for p in params.walk_parameters(nothing) if p.name not in {**defaults, **values}]
+    return params.replace(nothing, {name: params.as_float(value) for name, value in defaults.items()}), missing
 
 
 def _movers(stated: Any, where: str) -> float:
     return MOVERS[stated_word(stated, MOVERS, f"{where}.movers")]
 
 
-def _list_in_words(names: list[str]) -> str:
-    return f"{', '.join(names)} {'are' if len(names) > 1 else 'is'}"
+def _reject_incomplete(beginning: str, missing: list[str]) -> None:
+    if missing:
+        verb = "are" if len(missing) > 1 else "is"
+        raise BadConfiguration(f"{beginning}; {', '.join(missing)} {verb} missing")
 
 
 def _names(stated: Any, where: str) -> Names:
-    where = f"{where}, configurations"
     names = stated_names(stated, where, f"a list of at least one name, such as {_EXAMPLE}")
     for name in names:
         if names.count(name) > 1:
@@ -347,21 +309,25 @@ def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassi
         return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
         pattern = dataclasses.replace(have.members[0], on_tracks=_movers(movers, where))
-        defaults = dict(_parameter_defaults(pattern))
-        missing = [name for name, default in defaults.items() if default is None and not _table_states(table, name)]
-        if missing:
-            raise BadConfiguration(
-                f"{where}: with movers instead of like, the configuration must be described "
-                f"completely; {_list_in_words(missing)} missing"
-            )
-        known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
-        return params.replace(pattern, known_values)
+        _reject_incomplete(
+            f"{where}: with movers instead of like, the configuration must be described completely",
+            _missing_parameters(pattern, table),
+        )
+        return params.replace(
+            pattern, {n: params.as_float(x) for n, x in _parameter_defaults(pattern) if x is not None}
+        )
     if name in have:
         return have[name]
     raise BadConfiguration(
         f'{where}: the base has no such configuration; set like = "{have.names[0]}" (one of {", ".join(have)}), '
         'or movers = "tracks" or "wheels" and its parameters'
     )
+
+
+def _missing_parameters(component: eqx.Module, table: Json) -> list[str]:
+    """Parameters of a component without a default that its table lacks."""
+    values = flat_table(table)
+    return [name for name, default in _parameter_defaults(component) if default is None and name not in values]
 
 
 def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:
@@ -372,11 +338,3 @@ def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tup
             yield f"{prefix}{field.name}", None if field.default is dataclasses.MISSING else float(field.default)
         elif isinstance(value, eqx.Module):
             yield from _parameter_defaults(value, f"{prefix}{field.name}.")
-
-
-def _table_states(table: Mapping[str, Any], name: str) -> bool:
-    """True if a table states a parameter, given by its dotted name."""
-    head, _, key = name.partition(".")
-    if not key:
-        return head in table
-    return isinstance(table.get(head), dict) and _table_states(table[head], key)

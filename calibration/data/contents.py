@@ -85,39 +85,28 @@ def inspect_source(source: str | Path | Any) -> FileContents:
     Raises:
         BadData: the file does not exist, cannot be read, or has no columns.
     """
-    contents_found = _source(source)
-    times: dict[int, tuple[np.ndarray, str] | str] = {}
-    clocks = {id(s.clock) for s in contents_found.signals if s.clock is not None}
-    clock_signals = (
-        s for s in contents_found.signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None
-    )
-    table = None if clocks else next(clock_signals, None)  # the time column of a table
-    clock = None if table is None else Clock(table.path, table.load, _unit_of_time(table.name) or "")
-    facts = tuple(
-        _facts(signal, signal.clock or (None if signal is table else clock), times)
-        for signal in contents_found.signals
-    )
-    notes = list(contents_found.notes)
-    for signal in contents_found.signals:
-        time = times.get(id(signal.clock)) if signal.clock is not None else None
-        if isinstance(time, str) and f"{contents_found.name}: {time}" not in notes:
-            notes.append(f"{contents_found.name}: {time}")
-    preset = presets_file.recognise_preset([s.path for s in contents_found.signals])
+    contents = _source(source)
+    name, signals, notes = contents.name, contents.signals, [*contents.notes]
+    clocks = {id(s.clock) for s in signals if s.clock is not None}
+    table = clock = None
+    if not clocks:  # the time column of a table
+        table = next((s for s in signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None), None)
+    if table is not None:
+        clock = Clock(table.path, table.load, _unit_of_time(table.name) or "")
+    times: dict[int, np.ndarray | str] = {}
+    facts = tuple(_facts(s, s.clock or (None if s is table else clock), times) for s in signals)
+    faults = (times.get(id(s.clock)) for s in signals if s.clock is not None)
+    notes += dict.fromkeys(f"{name}: {fault}" for fault in faults if isinstance(fault, str))
+    preset = presets_file.recognise_preset([s.path for s in signals])
     if len(clocks) > 1:
         notes.append(
-            f"{contents_found.name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the "
-            "densest channel"
+            f"{name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the densest channel"
         )
-    constant_signals = {fact.path for fact in facts if fact.least == fact.greatest}
-    read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
-    moving = sorted(
-        read, key=lambda signal: signal.path in constant_signals
-    )  # of several, the first one that changes
-    lines = dict(_proposed_columns(moving))
-    proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
-    return FileContents(
-        contents_found.name, contents_found.kind, facts, tuple(notes), preset, () if preset else proposed
-    )
+    read = [dataclasses.replace(s, refused=f.refused) for s, f in zip(signals, facts, strict=True)]
+    constant = {fact.path for fact in facts if fact.least == fact.greatest}
+    lines = dict(_proposed_columns(sorted(read, key=lambda s: s.path in constant)))  # of several, one that changes
+    proposed = () if preset else tuple(lines[s.path] for s in signals if s.path in lines)
+    return FileContents(name, contents.kind, facts, tuple(notes), preset, proposed)
 
 
 def _source(source: Any) -> Source:
@@ -158,10 +147,9 @@ def _unit_of_time(name: str) -> str | None:
     return "ms" if plain_name == "ms_today" else unit_of_clock(plain_name)
 
 
-def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarray, str] | str]) -> SignalFacts:
-    facts = SignalFacts(
-        signal.path, signal.unit, signal.length, signal.refused, clock="" if clock is None else clock.name
-    )
+def _facts(signal: Signal, clock: Clock | None, times: dict[int, np.ndarray | str]) -> SignalFacts:
+    clock_name = "" if clock is None else clock.name
+    facts = SignalFacts(signal.path, signal.unit, signal.length, signal.refused, clock=clock_name)
     if signal.refused or not signal.length:
         return facts
     try:
@@ -170,67 +158,61 @@ def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarra
         return dataclasses.replace(facts, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
     if values.dtype.kind in "US":
         return dataclasses.replace(facts, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
-    if values.dtype.kind in "mM":
-        values = values.astype(np.int64)
-    values = np.asarray(values, float)
-    finite = np.isfinite(values)
-    ends = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (np.nan, np.nan)
-    facts = dataclasses.replace(facts, least=ends[0], greatest=ends[1], missing=int((~finite).sum()))
-    if clock is None:
-        return facts
-    if id(clock) not in times:
-        times[id(clock)] = _seconds(clock)
-    time = times[id(clock)]
-    if isinstance(time, str) or len(time[0]) != len(values):
-        return facts
-    steps = np.diff(time[0])
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
-    return dataclasses.replace(facts, rate=1 / usual, gaps=float((steps > GAP * usual).sum()))
+    values = np.asarray(values.astype(np.int64) if values.dtype.kind in "mM" else values, float)
+    finite = values[np.isfinite(values)]
+    if len(finite):
+        facts = dataclasses.replace(facts, least=float(finite.min()), greatest=float(finite.max()))
+    rate = gaps = np.nan
+    if clock is not None:
+        time = times[id(clock)] = times[id(clock)] if id(clock) in times else _seconds(clock)
+        if not isinstance(time, str) and len(time) == len(values):
+            step, usual = np.diff(time), one_clock.usual_step(time)
+            rate, gaps = 1 / usual, float((step > GAP * usual).sum())
+    return dataclasses.replace(facts, missing=len(values) - len(finite), rate=rate, gaps=gaps)
 
 
-def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
+def _seconds(clock: Clock) -> np.ndarray | str:
+    """Times of a clock [s], or the reason why they cannot be used."""
     try:
-        time, _, unit, _ = one_clock.clock_seconds(clock)
+        time, *_ = one_clock.clock_seconds(clock)
     except BadData as error:
         return str(error)
     rows_of_falls = np.flatnonzero(np.diff(time) < 0)
-    if rows_of_falls.size:
-        return f"{clock.name} goes back at sample {rows_of_falls[0] + 2}"
-    return time, unit
+    return f"{clock.name} goes back at sample {rows_of_falls[0] + 2}" if rows_of_falls.size else time
 
 
 def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
     spelled = set(Layout(channels=channels.EVERY).spellings())
     row_signals = [s for s in signals if s.clock is None and not s.refused]
-    time_signal = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
-    clock = time_signal or next((s for s in row_signals if _is_rising_count(s)), None)
+    stated = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
+    clock = stated or next((s for s in row_signals if _is_rising_count(s)), None)
     other_signals = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
-        unit = _unit_of_time(clock.name) or ("s" if clock.words else one_clock.guessed_unit(clock.load()))
-        elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
+        count = None if clock.words else np.asarray(clock.load(), float)
+        stated_unit = _unit_of_time(clock.name)
+        unit = stated_unit or ("s" if count is None else one_clock.guessed_unit(count))
         line = f'time_{unit} = "{clock.path}"'
-        if time_signal is None and elapsed is not None:
-            seconds_per_unit = proposals.seconds_per_count(other_signals, np.asarray(clock.load(), float))
-            question = f"compared with a position, it counts {1 / seconds_per_unit:.3g} per second"
-            if math.isnan(seconds_per_unit):
-                seconds_per_unit, question = UNITS[unit], "unit of the counts? give the seconds per count"
-            seconds_per_unit = float(f"{seconds_per_unit:.3g}")
-            elapsed = np.asarray(clock.load(), float) * seconds_per_unit
-            line = f'time_s = {{column = "{clock.path}", factor = {seconds_per_unit:g}}}  # {question}'
-        elif not _unit_of_time(clock.name) and elapsed is not None and unit != "s":
-            step = np.diff(elapsed)
-            usual = float(np.median(step[step > 0])) if (step > 0).any() else np.nan
-            line += f"  # unit not stated: in {unit}, rows are {usual:.3g} s apart. Check it"
+        if count is not None:
+            elapsed = count * UNITS[unit]
+        if stated is None and count is not None:
+            per_count = proposals.seconds_per_count(other_signals, count)
+            question = f"compared with a position, it counts {1 / per_count:.3g} per second"
+            if math.isnan(per_count):
+                per_count, question = UNITS[unit], "unit of the counts? give the seconds per count"
+            per_count = float(f"{per_count:.3g}")
+            elapsed = count * per_count
+            line = f'time_s = {{column = "{clock.path}", factor = {per_count:g}}}  # {question}'
+        elif not stated_unit and elapsed is not None and unit != "s":
+            step = one_clock.usual_step(elapsed)
+            line += f"  # unit not stated: in {unit}, rows are {step:.3g} s apart. Check it"
         if not (clock.name in spelled and clock.name.startswith("time_")):
             yield clock.path, line
 
     def seconds(signal: Signal) -> np.ndarray | None:
-        if signal.clock is None:
-            return elapsed
-        clock_seconds = _seconds(signal.clock)
-        return None if isinstance(clock_seconds, str) else clock_seconds[0]
+        time = elapsed if signal.clock is None else _seconds(signal.clock)
+        return None if isinstance(time, str) else time
 
     yield from proposals.propose_columns(other_signals, spelled, seconds)
 

@@ -48,20 +48,18 @@ def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Nam
         BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
             is higher than the supply's.
     """
-    voltage_columns = [c for c in VOLTS if c in columns]
-    if not voltage_columns:
+    stated = [c for c in VOLTS if c in columns]
+    if not stated:
         return ()
     if battery:
         raise BadData(
-            f"{name}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
-            f"{' and '.join(SIDES)} instead"
+            f"{name}: column {stated[0]} together with --battery, whose voltage falls; give {' and '.join(SIDES)} "
+            "instead"
         )
     check_commands_of_sides(name, columns, VOLTS, (*SIDES, *DUTY))
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
-    exceeds_supply = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
-    if exceeds_supply.any():
-        side, row = (int(k[0]) for k in np.nonzero(exceeds_supply))
+    for side, row in np.argwhere(np.abs(volts) > np.abs(supply) * (1 + ROUNDED))[:1].tolist():
         raise BadData(
             f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
             f"expected no more than {SUPPLY}, or remove that column: the larger of the two side voltages is then "
@@ -104,43 +102,40 @@ def check_turns(runs: Runs) -> None:
     left, right = runs.of_sides
     for quantity in ("motor_speed", "motor_current"):
         pair = [channels.find_channel(f"{quantity}_{side}") for side in channels.SIDES]
-        if not all(c in runs.channels and runs.has(c.column) for c in pair):
-            continue
-        left_value, right_value = (runs[c.column] for c in pair)
-        drive = right - left
-        if any(runs.layout.magnitude(c.name) for c in pair):
-            left_value, right_value, drive = np.abs(left_value), np.abs(right_value), np.abs(right) - np.abs(left)
-        columns = f"{pair[0].column} and {pair[1].column}"
-        _refuse_against(
-            runs, columns, (left_value, right_value), right_value - left_value, drive,
-            "the larger value on the faster side; left and right columns of one quantity are exchanged",
-        )  # fmt: skip
+        if all(c in runs.channels and runs.has(c.column) for c in pair):
+            values, drive = np.stack([runs[c.column] for c in pair]), right - left
+            if any(runs.layout.magnitude(c.name) for c in pair):
+                values, drive = np.abs(values), np.abs(right) - np.abs(left)
+            _refuse_against(
+                runs, " and ".join(c.column for c in pair), values, values[1] - values[0], drive,
+                "the larger value on the faster side; left and right columns of one quantity are exchanged",
+            )  # fmt: skip
     for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):
         _refuse_against(
-            runs, yaw, (runs[yaw],), runs[yaw], right - left,
+            runs, yaw, runs[yaw][None], runs[yaw], right - left,
             f"a positive value if the right side is faster: reverse its sign with [columns] {yaw} = {{column, "
             "factor = -1}, or exchange the columns of the sides",
         )  # fmt: skip
 
 
 def _refuse_against(
-    runs: Runs, column: str, shown: tuple[np.ndarray, ...], readings: np.ndarray, drive: np.ndarray, expected: str
+    runs: Runs, column: str, shown: np.ndarray, readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
     """Rejects readings whose sign is mostly opposite to that of their drive. The message names the clearest row.
 
     Args:
-        shown: values of the columns in every row.
+        shown: values of the columns, shape (columns, rows).
     """
     counts = np.isfinite(readings) & (np.abs(drive) > CLEAR * np.max(np.abs(drive), initial=0.0))
     against = counts & (readings * drive < 0)
     if counts.sum() < FEWEST or against.sum() <= MOSTLY * counts.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    both_values, at = (" and ".join(f"{float(f'{x[row]:.4g}'):g}" for x in sides) for sides in (shown, runs.of_sides))
+    got, driven = (" and ".join(f"{float(f'{x:.4g}'):g}" for x in both[:, row]) for both in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
-        f"{runs.source} row {row + 1}, {column}: got {both_values} although the left and right sides are driven at "
-        f"{at} {unit} (as in {against.sum()} of {counts.sum()} rows); expected {expected}"
+        f"{runs.place(row)}, {column}: got {got} although the left and right sides are driven at {driven} "
+        f"{unit} (as in {against.sum()} of {counts.sum()} rows); expected {expected}"
     )
 
 
@@ -188,14 +183,20 @@ def check_contradictions(runs: Runs, robot: Robot) -> Runs:
             Also if the stated voltage cannot turn the motors at the imposed speed, a position wraps, an angle or a
             position changes its unit, or time goes back.
     """
-    _check_mass(runs, robot)
-    if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
-        raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
+    for name in np.unique(runs.configurations_named(robot)) if robot.has_ground else ():
+        is_known = name in robot.configurations and not runs.has("total_mass_kg")
+        if is_known and float(robot.configurations[str(name)].mass) <= 0:
+            raise BadData(
+                f"{runs.source}: no column total_mass_kg, and the robot's file has no mass for {name}; a vehicle "
+                "needs one of the two"
+            )
     if runs.turns:
+        if why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)})):
+            raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
         check_turns(runs)
     if misplaced := misplaced_levers(runs, robot):
         row, column, why = misplaced
-        raise BadData(f"{runs.source} row {row + 1}, {column}: {why}")
+        raise BadData(f"{runs.place(row)}, {column}: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
         for column in (SUPPLY, "motor_voltage_V"):
             _check_voltage(runs, robot, column)
@@ -239,30 +240,11 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
         return row, lever_columns[0], reason_without_levers(robot, runs["configuration"][row])
     levers = robot.running_gear.levers
     low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
+    limits = f"{low:g} to {high:g}, the range of the robot's levers (running_gear.levers.angle_least, angle_most)"
     for name in lever_columns:
-        out_of_range = (runs[name] < low - 1e-9) | (runs[name] > high + 1e-9)
-        if out_of_range.any():
-            row = int(np.argmax(out_of_range))
-            return (
-                row,
-                name,
-                (
-                    f"got {runs[name][row]:g}; expected {low:g} to {high:g}, the range of the robot's levers "
-                    "(running_gear.levers.angle_least, angle_most)"
-                ),
-            )
+        for row in np.flatnonzero((runs[name] < low - 1e-9) | (runs[name] > high + 1e-9))[:1].tolist():
+            return row, name, f"got {runs[name][row]:g}; expected {limits}"
     return None
-
-
-def _check_mass(runs: Runs, robot: Robot) -> None:
-    if not robot.has_ground or runs.has("total_mass_kg"):
-        return
-    for name in np.unique(runs.configurations_named(robot)):
-        if name in robot.configurations and float(robot.configurations[str(name)].mass) <= 0:
-            raise BadData(
-                f"{runs.source}: no column total_mass_kg, and the robot's file has no mass for {name}; a vehicle "
-                "needs one of the two"
-            )
 
 
 def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
@@ -275,25 +257,21 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
         return
     voltage = runs[column]
     back_emf = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
-    voltage_forward = (
-        np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back_emf)
-    )
-    if column == SUPPLY and (voltage > 0).all():
-        voltage_forward = np.abs(voltage)
+    is_magnitude = runs.layout.magnitude(MAGNITUDES.get(column, "")) or (column == SUPPLY and (voltage > 0).all())
+    voltage_forward = np.abs(voltage) if is_magnitude else voltage * np.sign(back_emf)
     read = CURRENTS if robot.knows(VOLTAGE) else ()
     current = next((c for c in read if runs.has(c) and not runs.layout.magnitude(CURRENTS[c])), None)
     if current is not None:
         motors = float(robot.sides) if current == "total_current_A" else 1.0
-        voltage_forward = voltage_forward - np.nan_to_num(runs[current]) / motors * float(
-            robot.motor.resistance
-        ) * np.sign(back_emf)
+        drop = np.nan_to_num(runs[current]) / motors * float(robot.motor.resistance)
+        voltage_forward = voltage_forward - drop * np.sign(back_emf)
     tells = np.abs(back_emf) > LEAST
     wrong = tells & (voltage_forward < TOO_SMALL * np.abs(back_emf))
     if wrong.sum() > (0 if current else MOST_BRAKING * np.sum(tells)):
         row = int(np.argmax(wrong))
+        fault = "with the wrong sign" if voltage_forward[row] < 0 else "too small"
         why = (
-            f" at an imposed {SPEED} of {runs[SPEED][row]:g}, "
-            f"{'with the wrong sign' if voltage_forward[row] < 0 else 'too small'} for the motors' back-EMF of "
+            f" at an imposed {SPEED} of {runs[SPEED][row]:g}, {fault} for the motors' back-EMF of "
             f"{float(f'{back_emf[row]:.3g}'):g} V; check both columns and motor.torque_constant in the robot's file"
         )
         check_rows(runs.source, runs.columns, [(column, wrong, why)])
@@ -315,7 +293,7 @@ def time_goes_back(runs: Runs, before: int, row: int) -> BadData:
     """Error of a run whose time falls from one row to the next, both counted from 0."""
     time = runs["time_s"]
     return BadData(
-        f"{runs.source} row {row + 1}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each "
+        f"{runs.place(row)}, time_s: goes back from {time[before]:g} to {time[row]:g} s; give each "
         "recording its own run_id, or sort the rows"
     )
 
@@ -334,36 +312,32 @@ def unwrap_angle(runs: Runs, column: str) -> Runs:
     readings, is_angle, unit = runs[column].copy(), column == "output_angle_deg", column.rpartition("_")[2]
     one, note = "an angle" if is_angle else "a position", ""
     for name in np.unique(runs.run_names):
-        run_rows = runs.in_order(name)
-        run_rows = run_rows[np.isfinite(readings[run_rows])]
-        angle = readings[run_rows]
-        step = np.diff(angle)
+        rows = runs.in_order(name)
+        rows = rows[np.isfinite(readings[rows])]
+        step = np.diff(readings[rows])
         if step.size < 2:
             continue
-        usual = np.maximum(np.median(np.abs(step)), _median_of_neighbours(np.abs(step)))
-        large = np.abs(step) > UNUSUAL * usual
+        size = np.abs(step)
+        usual = np.maximum(np.median(size), _median_of_neighbours(size))
+        is_turn = np.abs(size - 2 * HALF_TURN) <= UNUSUAL * usual
+        large = size > UNUSUAL * usual
         if is_angle:
             returns = np.minimum(*(np.abs(step + np.roll(step, k)) for k in (1, -1))) < HALF_TURN  # a wrong reading
-            large &= (np.abs(step) > HALF_TURN) & ((np.abs(step) < 2 * HALF_TURN + UNUSUAL * usual) | ~returns)
+            large &= (size > HALF_TURN) & ((size < 2 * HALF_TURN + UNUSUAL * usual) | ~returns)
         else:
-            large &= (np.abs(step) > np.ptp(angle) / 2) & (step * _median_of_neighbours(step) < 0)
-        jumps = np.flatnonzero(large)
-        if jumps.size:
-            row, time_steps = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
-            gap, is_turn = time_steps[jumps[0]], np.abs(np.abs(step) - 2 * HALF_TURN) <= UNUSUAL * usual
-            if is_angle and is_turn[jumps].all() and gap <= GAP * np.median(time_steps):
-                readings[run_rows] = np.unwrap(angle, period=2 * HALF_TURN)
-                note = (
-                    f"{runs.source} row {row + 1}, {column}: wraps at {2 * HALF_TURN:g} {unit}. The wraps are removed"
-                )
-                continue
-            why = f"like {one} that wraps or changes its unit; expected {one} that keeps counting"
-            if gap > GAP * np.median(time_steps):
-                why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
-            raise BadData(
-                f"{runs.source} row {row + 1}, {column}: jumps by {float(f'{step[jumps[0]]:.4g}'):g} {unit} from the "
-                f"sample before, {why}"
-            )
+            large &= (size > np.ptp(readings[rows]) / 2) & (step * _median_of_neighbours(step) < 0)
+        if not large.any():
+            continue
+        jump, time_steps = int(np.argmax(large)), np.diff(runs["time_s"][rows])
+        place = f"{runs.place(rows[jump + 1])}, {column}"
+        why = f"like {one} that wraps or changes its unit; expected {one} that keeps counting"
+        if time_steps[jump] > GAP * np.median(time_steps):
+            why = f"{float(f'{time_steps[jump]:.3g}'):g} s earlier; give each recording its own run_id"
+        elif is_angle and is_turn[large].all():
+            readings[rows] = np.unwrap(readings[rows], period=2 * HALF_TURN)
+            note = f"{place}: wraps at {2 * HALF_TURN:g} {unit}. The wraps are removed"
+            continue
+        raise BadData(f"{place}: jumps by {float(f'{step[jump]:.4g}'):g} {unit} from the sample before, {why}")
     if not note:
         return runs
     return dataclasses.replace(runs, columns={**runs.columns, column: readings}, notes=(*runs.notes, note))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
 import csv
+import functools
 import hashlib
 import itertools
 import math
@@ -50,11 +52,10 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     content = input_files.csv_bytes(path, name)
     if len(content) >= LONG and (plain := _read_plain_table(name, content)) is not None:
         return plain
-    decoded, encoded = decode_text(name, content)
-    input_files.check_memory(name, CELL * sum(decoded.count(mark) for mark in (",", *SEPARATORS)))
-    lines = drop_comments([line for line in decoded.splitlines() if line.strip()])
-    rows, notes = split_cells(name, lines)
-    header, body = (rows[0], rows[1:]) if rows else ([], [])
+    text, encoded = decode_text(name, content)
+    input_files.check_memory(name, CELL * sum(text.count(mark) for mark in (",", *SEPARATORS)))
+    rows, notes = split_cells(name, drop_comments([line for line in text.splitlines() if line.strip()]))
+    header, *body = rows or [[]]
     input_files.check_declared(name, len(header))
     units = row_of_units(header, body[0]) if body else ()
     if units:
@@ -64,7 +65,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     return NamedArrays(
         name,
         tuple(column or f"column {k}" for k, column in enumerate(header, 1)),
-        tuple(map(list, zip(*body, strict=True))) if body else tuple([] for _ in header),
+        tuple(map(list, zip(*body, strict=True))) or tuple([] for _ in header),
         units,
         notes=(*encoded, *notes),
         digest=hashlib.sha256(content).hexdigest(),
@@ -112,22 +113,17 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
         )
     except pa.ArrowInvalid:  # a row of different length, or bytes that are not UTF-8
         return None
-    values: list[Raw] = []
-    empty = None
-    for column in table.columns:
-        blank = compute.equal(column, "")
-        empty = blank if empty is None else compute.and_(empty, blank)
-        try:
-            column_values = column.cast(pa.float64()).to_numpy()
-        except pa.ArrowInvalid:  # some cell states no number
-            column_values = np.full(1, np.nan)
-        values.append(
-            [cell_word(cell.strip()) for cell in column.to_pylist()]
-            if np.isnan(column_values).any()
-            else column_values
-        )
-    if empty is None or compute.any(empty).as_py():  # rows with only separators
+    blank = [compute.equal(column, "") for column in table.columns]
+    if compute.any(functools.reduce(compute.and_, blank)).as_py():  # rows with only separators
         return None
+    values: list[Raw] = []
+    for column in table.columns:
+        try:
+            numbers = column.cast(pa.float64()).to_numpy()
+        except pa.ArrowInvalid:  # some cell states no number
+            numbers = np.full(1, np.nan)
+        is_plain = not np.isnan(numbers).any()
+        values.append(numbers if is_plain else [cell_word(cell.strip()) for cell in column.to_pylist()])
     return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
 
 
@@ -158,13 +154,10 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
             return content.decode("utf-16"), (f"{name}: is read as UTF-16",)
         return content.decode("utf-8-sig"), ()
     except UnicodeDecodeError as error:
-        message = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
-    try:
-        if not _CONTROLS.search(content):
-            return content.decode("cp1252"), (f"{name}: is not in UTF-8, so it is read as Windows-1252",)
-    except UnicodeDecodeError:
-        pass
-    raise BadData(message)
+        with contextlib.suppress(UnicodeDecodeError):
+            if not _CONTROLS.search(content):
+                return content.decode("cp1252"), (f"{name}: is not in UTF-8, so it is read as Windows-1252",)
+        raise BadData(f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8") from error
 
 
 def drop_comments(lines: Sequence[str]) -> list[str]:
@@ -218,24 +211,21 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
         return rows, ()
     note = f"{name}: columns are separated by {SEPARATORS[mark]}"
     columns = list(itertools.zip_longest(*rows[1:], fillvalue=""))
+    titles = [*rows[0], *["a column"] * len(columns)]
     commas, points, below = ([[*filter(x.fullmatch, column)] for column in columns] for x in (_COMMA, _POINT, _BELOW))
     expectation = "expected decimal commas or decimal points, without thousands separators"
-    for j, (comma, point) in enumerate(zip(commas, points, strict=True)):
+    for title, comma, point in zip(titles, commas, points, strict=False):
         if comma and point:
-            raise BadData(f"{name}, {_column(rows, j)}: got {comma[0]} and {point[0]}; {expectation}")
+            raise BadData(f"{name}, {title}: got {comma[0]} and {point[0]}; {expectation}")
     for marked, other in ((points, commas), (commas, points)):
-        elsewhere = next((f"{cells[0]} in {_column(rows, k)}" for k, cells in enumerate(other) if cells), "")
-        for j, written in enumerate(marked):
-            if written and (elsewhere or below[j]) and all(map(_THOUSANDS.fullmatch, written)):
+        elsewhere = next((f"{cells[0]} in {title}" for title, cells in zip(titles, other, strict=False) if cells), "")
+        for title, written, small in zip(titles, marked, below, strict=False):
+            if written and (elsewhere or small) and all(map(_THOUSANDS.fullmatch, written)):
                 raise BadData(
-                    f"{name}, {_column(rows, j)}: got {written[0]} next to "
-                    f"{elsewhere or 'whole numbers below a thousand'}; {expectation}"
+                    f"{name}, {title}: got {written[0]} next to {elsewhere or 'whole numbers below a thousand'}; "
+                    f"{expectation}"
                 )
     if not any(commas):
         return rows, (f"{note}; read so",)
     body = ([cell.replace(",", ".") if _COMMA.fullmatch(cell) else cell for cell in row] for row in rows[1:])
     return [rows[0], *body], (f"{note}, and numbers have decimal commas",)
-
-
-def _column(rows: list[list[str]], j: int) -> str:
-    return rows[0][j] if j < len(rows[0]) else "a column"

@@ -41,19 +41,16 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, tuple[float, float, flo
     if not runs.has("total_mass_kg"):
         return {}
     configuration_index = runs.configurations(robot)
-    own_masses = runs["total_mass_kg"] - runs["payload_kg"]
-    low, high = next(
-        p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
-    ).spec.bounds
-    wrong, payload = (own_masses < low) | (own_masses > high), runs["payload_kg"]
+    total, payload = runs["total_mass_kg"], runs["payload_kg"]
+    own = total - payload
+    low, high = params.parameters_by_name(robot.configurations.members[0])["mass"].spec.bounds
     end = f"expected {low:g} to {high:g} kg without the payload"
     why = lambda row: f" with a payload of {payload[row]:g} kg; {end}"  # noqa: E731
-    check_rows(runs.source, runs.columns, [("total_mass_kg", wrong, why)])
+    check_rows(runs.source, runs.columns, [("total_mass_kg", (own < low) | (own > high), why)])
     masses = {}
     for index in np.unique(configuration_index):
-        is_own_row = configuration_index == index
-        m = own_masses[is_own_row]
-        constant = bool(np.ptp(runs["total_mass_kg"][is_own_row]) <= MASS_ROUNDING)
+        rows = configuration_index == index
+        m, constant = own[rows], bool(np.ptp(total[rows]) <= MASS_ROUNDING)
         median = round(float(np.median(m)), 6)
         masses[robot.configurations.names[index]] = (median, float(m.min()), float(m.max()), constant)
     return masses
@@ -80,7 +77,7 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     for name, (median, low, high, constant) in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
         if high - low > MASS_ROUNDING:
-            why = "; does total_mass_kg exclude the payload?" if constant else ""
+            why = "; does total_mass_kg exclude the payload?" * constant
             notes.append(
                 f"{name}: total_mass_kg minus payload_kg varies from {low:.4g} to {high:.4g} kg. robot.toml "
                 f"contains the median, {median:.4g} kg, so it does not reproduce the fit in other rows{why}"
@@ -90,15 +87,14 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
                 f"{name}: the table states {median:.6g} kg without payload, the robot's file {mass:.6g} "
                 f"kg. {median:.6g} kg is used, and written to robot.toml"
             )
-    of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):
         of_table5 = rows_of_scaled_adhesion(robot, runs["configuration"], runs["surface"])
-    other_surfaces = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
-    if other_surfaces:
-        notes.append(
-            f"the table has runs on {', '.join(other_surfaces)}: the written friction is for {BENCH}. Simulate with "
-            f"--surface {other_surfaces[0]} to use the fitted values"
-        )
+        others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH]
+        if others:
+            notes.append(
+                f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}. Simulate with "
+                f"--surface {others[0]} to use the fitted values"
+            )
     return notes
 
 
@@ -139,17 +135,15 @@ def common_step(readings: np.ndarray) -> float:
     if levels.size < FEWEST:
         return 0.0
     step, largest = 0.0, float(np.ptp(levels))
-    for difference in np.diff(levels):
-        a, b = float(difference), step
+    for difference in np.diff(levels).tolist():
+        a, b = difference, step
         while b > ROUNDING * largest:
-            remainder = a - b * round(a / b)
-            a, b = b, abs(remainder)
+            a, b = b, abs(a - b * round(a / b))
         step = a
         if step < SMALLEST * largest:
             return 0.0
     ladder = largest < (levels.size + 0.5) * step and np.min(np.abs(levels)) < 1.5 * step
-    set_by_hand = ladder and np.ptp(counts) == 0
-    return 0.0 if set_by_hand else step
+    return 0.0 if ladder and np.ptp(counts) == 0 else step
 
 
 def display_step(readings: np.ndarray, channel: Channel) -> float:
@@ -180,9 +174,8 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
     Args:
         columns: columns of the table, in their units.
     """
-    runs_backward = any(
-        (columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns
-    )
+    drives = [columns[c] for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns]
+    runs_backward = any((drive < 0).any() for drive in drives)
     inferred = []
     for instrument in instruments:
         channel = channels.find_channel(instrument.channel)
@@ -198,10 +191,10 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """Robot with the instruments inferred from its table."""
-    rig_instruments = robot.rig.instruments
-    all_instruments = runs.layout.instruments if any(i.free for i in rig_instruments) else rig_instruments
-    channel_names = {i.channel for i in all_instruments}
-    all_instruments = (*all_instruments, *(i for i in runs.layout.instruments if i.channel not in channel_names))
-    if all_instruments == rig_instruments:
+    stated, of_table = robot.rig.instruments, runs.layout.instruments
+    instruments = of_table if any(i.free for i in stated) else stated
+    named = {i.channel for i in instruments}
+    instruments = (*instruments, *(i for i in of_table if i.channel not in named))
+    if instruments == stated:
         return robot
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=all_instruments))
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=instruments))

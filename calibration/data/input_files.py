@@ -181,6 +181,15 @@ def toml_text(path: Path, where: str | Path) -> str:
         raise BadConfiguration(f"{where}: not a readable TOML file ({error}); save it in UTF-8") from error
 
 
+def flat_table(content: Json, prefix: str = "") -> Json:
+    """Values of a table and its subtables by dotted name."""
+    flat: Json = {}
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        flat |= flat_table(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return flat
+
+
 def toml_content(text: str, where: str | Path) -> Json:
     """Keys and tables of a TOML text.
 

@@ -123,8 +123,7 @@ class Posterior:
                 )
         with np.errstate(invalid="ignore"):  # NaN from a damaged file is rejected below
             robot_at_mean = self.at(np.asarray(self.mean))
-        sd = np.asarray(self.sd)
-        for name, value, width in zip(self.names, robot_at_mean, sd, strict=True):
+        for name, value, width in zip(self.names, robot_at_mean, self.sd, strict=True):
             if not abs(values[name] - value) <= APART * width + 1e-6 * abs(value):  # also if one is NaN
                 raise BadData(
                     f"{where}: {name} is {values[name]:.6g} in the robot; expected {value:.6g}, the centre of "
@@ -145,25 +144,25 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
     from scipy.io import netcdf_file
 
     p, square = posterior, ("coordinate", "coordinate_2")
-    numbers = {
-        "mean": (p.mean, "of z"),
-        "location": (p.location, "u at z = 0, the parameter or its logarithm"),
-        "spread": (p.spread, "du/dz"),
-        "low": (p.low, "least u"),
-        "high": (p.high, "greatest u"),
-        "softness": (p.softness, "width of the smooth transition at the bounds, as a fraction of the spread"),
-        "value": (p.at(p.mean)[: len(p)], "parameter at the mean [SI]"),
-        "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
-        "covariance": (p.covariance, "covariance of z"),
+    words_by_name = {
+        "mean": "of z",
+        "location": "u at z = 0, the parameter or its logarithm",
+        "spread": "du/dz",
+        "low": "least u",
+        "high": "greatest u",
+        "softness": "width of the smooth transition at the bounds, as a fraction of the spread",
+        "value": "parameter at the mean [SI]",
+        "sd": "standard deviation of the parameter, to first order [SI]",
+        "covariance": "covariance of z",
     }
+    computed = {"value": p.at(p.mean)[: len(p)], "sd": p.sd[: len(p)]}
     with netcdf_file(path, "w", version=2) as file:
         file.schema = SCHEMA
         file.title = "posterior of a calibrated robot, normal in z: u = location + spread z"
 
-        def put(name: str, values: Any, kind: str, dimensions: Names, words: str | None) -> None:
-            texts = kind == "S"  # strings as rows of characters
-            values = np.asarray([x.encode() for x in values] if texts else values, kind)
-            if texts:
+        def put(name: str, values: Any, kind: str, words: str, *dimensions: str) -> None:
+            values = np.asarray([x.encode() for x in values] if kind == "S" else values, kind)
+            if kind == "S":  # strings as rows of characters
                 dimensions = (*dimensions, f"string{values.itemsize}")
                 values = values.view("S1").reshape(len(values), -1)
             for dimension, size in zip(dimensions, values.shape, strict=True):
@@ -171,18 +170,20 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
                     file.createDimension(dimension, size)
             variable = file.createVariable(name, values.dtype, dimensions)
             variable[:] = values
-            if words is not None:
+            if words:
                 variable.long_name = words
 
-        put("coordinate", p.coordinates, "S", square[:1], None)
-        for name, (values, words) in numbers.items():
-            put(name, values, "f8", square[: np.ndim(values)], words)
-        put("kind", p.kinds, "S", square[:1], "transformation of u")
-        put("units", p.units, "S", square[:1], "of the parameter")
+        put("coordinate", p.coordinates, "S", "", "coordinate")
+        for name, words in words_by_name.items():
+            values = computed[name] if name in computed else getattr(p, name)
+            put(name, values, "f8", words, *square[: np.ndim(values)])
+        put("kind", p.kinds, "S", "transformation of u", "coordinate")
+        put("units", p.units, "S", "of the parameter", "coordinate")
         if p.tied:
-            put("tied", [t[0] for t in p.tied], "S", ("follower",), "follows another")
-            put("tied_to", [t[1] for t in p.tied], "i4", ("follower",), "its index")
-            put("tied_ratio", [t[2] for t in p.tied], "f8", ("follower",), "ratio to that")
+            followers, indices, ratios = zip(*p.tied, strict=True)
+            put("tied", followers, "S", "follows another", "follower")
+            put("tied_to", indices, "i4", "its index", "follower")
+            put("tied_ratio", ratios, "f8", "ratio to that", "follower")
 
 
 def read_posterior(path: Path | str) -> Posterior:
@@ -199,25 +200,24 @@ def read_posterior(path: Path | str) -> Posterior:
     try:
         with xr.open_dataset(path, engine="scipy") as data:
             data.load()
-        posterior = _posterior_of_dataset(data)
+        p = _posterior_of_dataset(data)
     except Exception as error:  # a damaged file can make the reader raise anything
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise BadData(f"{path}: not a readable posterior ({why})") from error
-    size = len(posterior)
+    size, ratios = len(p), [ratio for *_, ratio in p.tied]
     is_valid = (
-        posterior.covariance.shape == (size, size)
+        p.covariance.shape == (size, size)
         and all(
-            np.isfinite(x).all() for x in (posterior.covariance, posterior.mean, posterior.location, posterior.spread)
+            np.isfinite(x).all() for x in (p.covariance, p.mean, p.location, p.spread, p.softness, np.array(ratios))
         )
-        and np.isfinite(posterior.softness).all()
-        and not (np.isnan(posterior.low).any() or np.isnan(posterior.high).any())
-        and all(0 <= k < size and np.isfinite(ratio) for _, k, ratio in posterior.tied)
-        and np.linalg.eigvalsh(posterior.covariance).min() >= -1e-9 * max(np.abs(posterior.covariance).max(), 1e-300)
-        and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
+        and not np.isnan([p.low, p.high]).any()
+        and all(0 <= k < size for _, k, _ in p.tied)
+        and np.linalg.eigvalsh(p.covariance).min() >= -1e-9 * max(np.abs(p.covariance).max(), 1e-300)
+        and set(p.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not is_valid:
         raise BadData(f"{path}: a number is missing, invalid or out of range; write the file again")
-    return posterior
+    return p
 
 
 def _words(values: Any) -> Names:
@@ -229,26 +229,26 @@ def _posterior_of_dataset(data: Any) -> Posterior:
         raise ValueError(f"schema {data.attrs.get('schema')}, expected {SCHEMA}")
     tied: tuple[tuple[str, int, float], ...] = ()
     if "tied" in data:
-        parts = (_words(data["tied"]), data["tied_to"].values.tolist(), data["tied_ratio"].values.tolist())
-        tied = tuple(zip(*parts, strict=True))
-    columns = ("mean", "location", "spread", "low", "high", "softness")
-    numbers = {k: np.asarray(data[k].values, float) for k in columns}
+        tied = tuple(
+            zip(
+                _words(data["tied"]), data["tied_to"].values.tolist(), data["tied_ratio"].values.tolist(), strict=True
+            )
+        )
     return Posterior(
         coordinates=_words(data["coordinate"]),
         units=_words(data["units"]),
-        covariance=np.asarray(data["covariance"].values, float),
         kinds=_words(data["kind"]),
         tied=tied,
-        **numbers,
+        **{name: np.asarray(data[name].values, float) for name in ("covariance", *_NUMBERS)},
     )
+
+
+#: Arrays with a number for each coordinate.
+_NUMBERS = ("mean", "location", "spread", "low", "high", "softness")
 
 
 def join_posteriors(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
     """Joint posterior of several sets of coordinates. `covariance`: of all coordinates."""
-    fields = {
-        f: np.concatenate([getattr(p, f) for p in parts])
-        for f in ("mean", "location", "spread", "low", "high", "softness")
-    }
     tied: list[tuple[str, int, float]] = []
     offset = 0
     for p in parts:
@@ -260,5 +260,5 @@ def join_posteriors(parts: Sequence[Posterior], covariance: np.ndarray) -> Poste
         covariance=covariance,
         kinds=tuple(k for p in parts for k in p.kinds),
         tied=tuple(tied),
-        **fields,
+        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in _NUMBERS},
     )

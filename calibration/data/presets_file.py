@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import re
-import string
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from calibration.data import Names, input_files
+from calibration.data import Json, Mapped, Names, input_files
 from calibration.data.columns import Layout
 from calibration.data.input_errors import (
     BadConfiguration,
@@ -83,8 +82,8 @@ class Preset:
     header: Names = ()
 
     def mapped(
-        self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] | None = None
-    ) -> tuple[tuple[tuple[str, str, float], ...], Names]:
+        self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] = lambda name: True
+    ) -> tuple[Mapped, Names]:
         """Columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
@@ -94,12 +93,11 @@ class Preset:
         mapped, notes = [], []
         for column in self.columns:
             present = [name for name in map(found, column.theirs) if name is not None]
-            if has_readings is not None and len(present) > 1:
-                present = [name for name in present if has_readings(name)] or present
             if present:
-                mapped.append((column.mine, present[0], column.factor))
+                name = next(filter(has_readings, present), present[0]) if len(present) > 1 else present[0]
+                mapped.append((column.mine, name, column.factor))
                 if column.note:
-                    notes.append(f"{self.name}: {present[0]}, read as {column.mine}, {column.note}")
+                    notes.append(f"{self.name}: {name}, read as {column.mine}, {column.note}")
             elif self.name not in PACKAGED:  # packaged presets have columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
@@ -109,7 +107,7 @@ class Preset:
         read = (c for c in self.columns if any(_matches_any(pattern, {name}) for pattern in c.theirs))
         return next(read, PresetColumn("", ()))
 
-    def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
+    def check_needed(self, mapped: Mapped, imposed: str, name: str) -> None:
         """Rejects a source that lacks a column without which its imposed column is useless.
 
         Args:
@@ -122,14 +120,17 @@ class Preset:
         """
         present = {own_column: pattern for own_column, pattern, _ in mapped}
         by_name = {column.mine: column for column in self.columns}
-        for own_column in present:
-            if own_column == imposed and (needs := by_name[own_column].needs) and needs not in present:
-                missing_words = " or ".join(by_name[needs].theirs)
-                raise BadData(
-                    f"{name}: has no {missing_words}; --columns {self.name} needs it for {needs}, because "
-                    f"{present[own_column]} alone does not give the motor voltage; record {missing_words}, or "
-                    "set imposed to the speed or the current in the rig's file"
-                )
+        if imposed in present and (needs := by_name[imposed].needs) and needs not in present:
+            missing_words = " or ".join(by_name[needs].theirs)
+            raise BadData(
+                f"{name}: has no {missing_words}; --columns {self.name} needs it for {needs}, because "
+                f"{present[imposed]} alone does not give the motor voltage; record {missing_words}, or set imposed "
+                "to the speed or the current in the rig's file"
+            )
+
+
+#: Preset without columns.
+NONE = Preset("", ())
 
 
 def preset_of_table(columns: Mapping[str, Any]) -> Preset:
@@ -151,24 +152,23 @@ def find_preset(stated: str | Path) -> Preset:
         BadConfiguration: there is no such preset or file, a number is missing or unknown, or as in `parse_preset`.
     """
     name, *others = str(stated).split(SEPARATOR)
-    number_values: dict[str, float] = {}
-    for preset in others:
-        key, equals, text = (part.strip() for part in preset.partition("="))
+    numbers: dict[str, float] = {}
+    for entry in others:
+        key, equals, text = (part.strip() for part in entry.partition("="))
         try:
-            number_values[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
+            numbers[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
         except ValueError as error:
-            given_text = f"{key}{equals}{text}"
             raise BadConfiguration(
-                f"--columns {name}: got {given_text}; expected a name and a number, such as pole_pairs=7"
+                f"--columns {name}: got {key}{equals}{text}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
-        return parse_preset(_packaged_text(name), name, number_values)
+        return parse_preset(_packaged_text(name), name, numbers)
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
             f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
         )
-    return parse_preset(input_files.toml_text(path, path.name), path.name, number_values)
+    return parse_preset(input_files.toml_text(path, path.name), path.name, numbers)
 
 
 def recognise_preset(names: Sequence[str]) -> str:
@@ -177,14 +177,12 @@ def recognise_preset(names: Sequence[str]) -> str:
     Args:
         names: names of the source's columns, or paths of its signals.
     """
-    best, most_matches = "", OF_A_PRESET - 1
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
+    matches = {"": OF_A_PRESET - 1}
     for name in PACKAGED:
-        preset = find_preset(SEPARATOR.join([name, *(f"{key}=1" for key in numbers_to_state(name))]))
-        count = sum(any(_matches_any(pattern, ends) for pattern in column.theirs) for column in preset.columns)
-        if count > most_matches:
-            best, most_matches = name, count
-    return best
+        columns = parse_preset(_packaged_text(name), name, dict.fromkeys(numbers_to_state(name), 1.0)).columns
+        matches[name] = sum(any(_matches_any(pattern, ends) for pattern in column.theirs) for column in columns)
+    return max(matches, key=lambda name: matches[name])
 
 
 def _matches_any(theirs: str, names: set[str]) -> bool:
@@ -214,7 +212,7 @@ def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
     return _parsed(input_files.toml_content(text, where), where, given)
 
 
-def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) -> Preset:
+def _parsed(content: Json, where: str, given: Mapping[str, float]) -> Preset:
     for key in content:
         stated_word(key, KEYS, where, f"got the key {key}")
     numbers = _preset_numbers(content.get("ask", {}), where, given)
@@ -227,12 +225,11 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     layout = Layout(channels=channels.EVERY)
     spellings, entries = layout.spellings(), []
     for own_column, patterns in columns.items():
+        place = f"{where}, columns.{own_column}"
         if own_column not in spellings:
             names_text = allowed_words(own_column, spellings, shown=layout.known())
-            raise BadConfiguration(
-                f"{where}, columns.{own_column}: no such column of a table; {names_text}; other units are allowed too"
-            )
-        entries.append(_parse_column(own_column, patterns, f"{where}, columns.{own_column}", numbers))
+            raise BadConfiguration(f"{place}: no such column of a table; {names_text}; other units are allowed too")
+        entries.append(_parse_column(own_column, patterns, place, numbers))
     return Preset(where, tuple(entries), header)
 
 
@@ -256,9 +253,8 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
                 f"--columns {where}: {key} is missing, the {table['about']}; give it as --columns "
                 f"{where}{SEPARATOR}{key}=7"
             )
-        value = given.get(key, table.get("usual"))
-        numbers[key] = stated_number(value, f"{where}, {key}")
-        if numbers[key] == 0 and key in given and "usual" not in table:
+        numbers[key] = stated_number(given.get(key, table.get("usual")), f"{where}, {key}")
+        if numbers[key] == 0 and "usual" not in table:
             raise BadConfiguration(f"--columns {where}, {key}: got 0; expected a number that is not 0")
     return numbers
 
@@ -271,37 +267,30 @@ def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, floa
     column = table.get("column")
     names = stated_names([column] if isinstance(column, str) else column, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
-    for key in ("per", "times"):
+    for key, power in (("per", -1), ("times", 1)):
         if key in table:
             wrong = f"got {table[key]}; expected one of the numbers defined under [ask]"
             value = numbers[stated_word(table[key], numbers, f"{where}.{key}", wrong)]
-            if key == "per" and not value:
+            if power < 0 and not value:
                 raise BadConfiguration(f"{where}.{key}: {table[key]} is 0; expected a number that is not 0")
-            factor = factor * value if key == "times" else factor / value
+            factor *= value**power
     if not factor:
         raise BadConfiguration(f"{where}.factor: got 0; expected a number that is not 0")
     texts = {key: stated_as(table.get(key, ""), str, f"{where}.{key}", expected) for key, expected in TEXTS.items()}
     sign_bit = stated_count(table.get("sign_bit", 0), f"{where}.sign_bit", 0, 63)
     zero = stated_number(table.get("zero", 0.0), f"{where}.zero")
-    theirs = tuple(_fill_in_numbers(name, where, numbers) for name in names)
+    theirs = tuple(_fill_in_numbers(name, numbers) for name in names)
     return PresetColumn(mine, theirs, factor, sign_bit=sign_bit, zero=zero, **texts)
 
 
-def _fill_in_numbers(name: str, where: str, numbers: Mapping[str, float]) -> str:
+def _fill_in_numbers(name: str, numbers: Mapping[str, float]) -> str:
     """Name of a column, with numbers in place of the names in braces."""
-    try:
-        field_names = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
-    except ValueError:
-        return name
-    for field in field_names:
-        if field in numbers:
-            name = name.replace(f"{{{field}}}", f"{numbers[field]:g}")
+    for key, number in numbers.items():
+        name = name.replace(f"{{{key}}}", f"{number:g}")
     return name
 
 
-def merge_columns(
-    first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
-) -> tuple[tuple[str, str, float], ...]:
+def merge_columns(first: Mapped, others: Mapped) -> Mapped:
     """Columns of two tables. `first` takes precedence if both state a column or read the same source column."""
     first = tuple(first)
     used_names = {_name_without_unit(own_column) for own_column, _, _ in first} | {theirs for _, theirs, _ in first}

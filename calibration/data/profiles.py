@@ -233,26 +233,31 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
         row_text = "one row" if body else "a header and no rows"
         raise BadData(f"{name}: got {row_text}; expected at least two rows, the last of which ends the mission")
     delimited.check_row_lengths(name, header, body)
-    cells = _CellReader(
-        name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"]
-    )
-    time = _time(cells)
-    if why := sides_error(list(cells.columns), cells.has(MODES[SPEED]), cells.called):
+    texts = {field: [row[header.index(column)] for row in body] for field, (column, _) in columns.items()}
+    for field in (*HELD, SURFACE):
+        if field in texts and not settings["linear"]:  # no segment follows the last row
+            texts[field][-1] = texts[field][-1] or texts[field][-2]
+    cells = _CellReader(name, columns, texts, settings["linear"])
+    time = cells.values("time")
+    for row in (np.flatnonzero(np.diff(time) <= 0)[:1] + 1).tolist():
+        cells.refuse("time", row, f"more than {cells.text('time', row - 1)} of the row before")
+    if why := sides_error(list(columns), MODES[SPEED] in columns, cells.called):
         raise BadData(f"{name}: {why}")
     modes, driven = _modes_and_demands(cells)
     demand = driven.pop("demand")
-    values = {field: cells.held(field) for field in HELD if field in columns} | driven
+    values = {field: cells.values(field) for field in HELD if field in columns} | driven
     if len(time) * settings["cycles"] > LONGEST:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
-    return ProfileTable(
-        name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
-        digest, settings["begins"], notes,
-    )  # fmt: skip
+    for row, label in enumerate(texts.get(SURFACE, [])):
+        if label not in SURFACES:
+            cells.refuse(SURFACE, row, f"one of these; {allowed_words(label, SURFACES)}")
+    surfaces = tuple(texts[SURFACE]) if SURFACE in texts else None
+    return ProfileTable(name, time, modes, demand, values, surfaces, digest=digest, notes=notes, **settings)
 
 
 def _header_settings(name: str, comments: list[str]) -> Json:
-    """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`. Other comment
-    lines are ignored.
+    """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`: `linear`,
+    `cycles` and `begins` of `ProfileTable`. Other comment lines are ignored.
     """
     header_settings: Json = {}
     for line in comments:
@@ -276,9 +281,9 @@ def _header_settings(name: str, comments: list[str]) -> Json:
         raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
     begins = {}
     for key, (field, least, greatest, unit_size) in STARTS.items():
-        value = header_settings.get(key)
-        if value is None:
+        if key not in header_settings:
             continue
+        value = header_settings[key]
         if not is_number(value) or not least <= value <= greatest:
             raise BadData(f"{name}, {key}: got {value!r}; expected a number, {least:g} to {greatest:g}")
         begins[field] = unit_size * value
@@ -291,25 +296,20 @@ def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]
     Raises:
         BadData: a column or unit is unknown, a field occurs twice, or time is missing.
     """
-    columns_known: dict[str, tuple[str, str]] = {
-        column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
-    }
-    columns_found: dict[str, tuple[str, str]] = {}
+    fields = {column: (key, unit) for key, q in QUANTITIES.items() for column, unit in q.columns().items()}
+    fields |= {column: (column, "") for column in (MODE, SURFACE)}
+    columns: dict[str, tuple[str, str]] = {}
     for column in header:
-        if column in (MODE, SURFACE):
-            field, unit = column, ""
-        elif column in columns_known:
-            field, unit = columns_known[column]
-        else:
+        if column not in fields:
             _refuse_column(name, column)
-        if field in columns_found:
-            first = columns_found[field][0]
+        field, unit = fields[column]
+        first, _ = columns.setdefault(field, (column, unit))
+        if header.count(column) > 1 or first != column:
             column_words = f"column {column} twice" if column == first else f"columns {first} and {column}"
             raise BadData(f"{name}: got {column_words}; expected one of them")
-        columns_found[field] = (column, unit)
-    if "time" not in columns_found:
+    if "time" not in columns:
         raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard_columns())}")
-    return columns_found
+    return columns
 
 
 def _standard_columns() -> list[str]:
@@ -332,26 +332,20 @@ def _refuse_column(name: str, column: str) -> NoReturn:
 
 @dataclasses.dataclass(frozen=True)
 class _CellReader:
-    """Cells of a file by column, read one at a time."""
+    """Cells of a file by field, and the column and unit of each field."""
 
     source: str
     columns: dict[str, tuple[str, str]]
-    cells: dict[str, list[str]]
+    texts: dict[str, list[str]]
     linear: bool
-
-    def __len__(self) -> int:
-        return len(next(iter(self.cells.values())))
-
-    def has(self, field: str) -> bool:
-        return field in self.columns
 
     def called(self, field: str) -> str:
         """Column of a field in the file, or else its usual column."""
-        return self.columns[field][0] if self.has(field) else next(iter(QUANTITIES[field].columns()))
+        return self.columns[field][0] if field in self.columns else next(iter(QUANTITIES[field].columns()))
 
     def text(self, field: str, row: int) -> str:
         """The cell of a field, empty if the file has no such column."""
-        return self.cells[self.columns[field][0]][row] if self.has(field) else ""
+        return self.texts[field][row] if field in self.texts else ""
 
     def refuse(self, field: str, row: int, allowed: str) -> NoReturn:
         cell_text = self.text(field, row) or "an empty cell"
@@ -371,34 +365,9 @@ class _CellReader:
         value = quantity.value(number, unit)
         return value * quantity.factor if isinstance(quantity, Channel) else value
 
-    def held(self, field: str) -> np.ndarray:
-        """Numbers of a required column. If values are held between rows, the last row may be empty."""
-        last_row = len(self) - 1
-        held_values: list[float] = []
-        for row in range(len(self)):
-            ends = row == last_row and not self.linear and not self.text(field, row)
-            held_values.append(held_values[-1] if ends else self.value(field, row))
-        return np.array(held_values)
-
-    def surfaces(self) -> Names | None:
-        if not self.has(SURFACE):
-            return None
-        labels_found: list[str] = []
-        for row in range(len(self)):
-            name = self.text(SURFACE, row)
-            if not name and row == len(self) - 1 and not self.linear:
-                name = labels_found[-1]
-            if name not in SURFACES:
-                self.refuse(SURFACE, row, f"one of these; {allowed_words(name, SURFACES)}")
-            labels_found.append(name)
-        return tuple(labels_found)
-
-
-def _time(cells: _CellReader) -> np.ndarray:
-    time = np.array([cells.value("time", row) for row in range(len(cells))])
-    for row in np.flatnonzero(np.diff(time) <= 0)[:1] + 1:
-        cells.refuse("time", int(row), f"more than {cells.text('time', int(row) - 1)} of the row before")
-    return time
+    def values(self, field: str) -> np.ndarray:
+        """Numbers of a required column."""
+        return np.array([self.value(field, row) for row in range(len(self.texts[field]))])
 
 
 def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
@@ -408,45 +377,43 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
     second demand is an error.
     """
     modes: list[str] = []
-    shares = [field for field in DEMANDS if DEMANDS[field] == MODES[VOLTAGE] and cells.has(field)]
-    wholes = ["demand", *([YAW_RATE] if cells.has(YAW_RATE) else [])]
-    full = {name: 1.0 if name == "duty" else 0.0 for name in shares}
-    shares_found = {name: np.full(len(cells), full.get(name, 0.0)) for name in (*shares, *wholes)}
-    for row in range(len(cells)):
-        mode_before = modes[-1] if modes else ""
+    shares = [f for f in DEMANDS if DEMANDS[f] == MODES[VOLTAGE] and f in cells.columns]
+    with_yaw_rate = YAW_RATE in cells.columns
+    usual = {field: float(field == "duty") for field in (*shares, "demand", *[YAW_RATE] * with_yaw_rate)}
+    rows = len(cells.texts["time"])
+    values_by_field = {field: np.full(rows, value) for field, value in usual.items()}
+    for row in range(rows):
+        before = modes[-1] if modes else ""
         filled = [field for field in DEMANDS if cells.text(field, row)]
-        ends = {field for field in filled if cells.linear and mode_before == DEMANDS[field]}
-        mode = _mode_of_row(cells, row, mode_before, [f for f in filled if f not in ends] or filled)
+        ends = [field for field in filled if cells.linear and before == DEMANDS[field]]
+        mode = _mode_of_row(cells, row, before, [f for f in filled if f not in ends] or filled)
         demands = [field for field in filled if DEMANDS[field] == mode]
-        _check_demands(
-            cells, row, mode_before, mode, demands, [f for f in filled if f not in demands and f not in ends]
-        )
+        others = [field for field in filled if field not in (*demands, *ends)]
+        _check_demands(cells, row, row < rows - 1 or cells.linear, before, mode, demands, others)
         modes.append(mode)
-        if row and cells.linear:  # default end of the ramp to this row
-            for name in wholes:
-                shares_found[name][row] = 0.0 if mode in CONTROLLED else shares_found[name][row - 1]
-            for name in shares:
-                shares_found[name][row] = full[name] if mode == MODES[VOLTAGE] else shares_found[name][row - 1]
-        for field in (*(f for f in ends if f not in demands), *demands):
-            shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
+        for field, values in values_by_field.items() if row and cells.linear else ():  # usual end of a ramp
+            is_demanded = mode == MODES[VOLTAGE] if field in shares else mode in CONTROLLED
+            values[row] = usual[field] if is_demanded else values[row - 1]
+        for field in (*ends, *demands):
+            values_by_field["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
         speed, has_yaw_rate = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-        if has_yaw_rate and mode != speed and not (cells.linear and mode_before == speed):
+        if has_yaw_rate and mode != speed and not (cells.linear and before == speed):
             cells.refuse(YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, not mode {mode}")
-        if cells.has(YAW_RATE) and not has_yaw_rate and mode == speed and (cells.linear or row < len(cells) - 1):
+        if with_yaw_rate and not has_yaw_rate and mode == speed and (cells.linear or row < rows - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
         if has_yaw_rate:
-            shares_found[YAW_RATE][row] = cells.value(YAW_RATE, row)
-    return tuple(modes), shares_found
+            values_by_field[YAW_RATE][row] = cells.value(YAW_RATE, row)
+    return tuple(modes), values_by_field
 
 
 def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -> str:
     """Mode of a row, as stated or as implied by its demand. If no row has a demand, the motors are off."""
-    mode_text = cells.text(MODE, row)
-    if mode_text and mode_text not in MODES:
-        cells.refuse(MODE, row, f"one of these; {allowed_words(mode_text, MODES)}")
-    columns = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
-    mode = mode_text or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
-    if not mode and row == len(cells) - 1:
+    mode = cells.text(MODE, row)
+    if mode and mode not in MODES:
+        cells.refuse(MODE, row, f"one of these; {allowed_words(mode, MODES)}")
+    columns = [cells.columns[field][0] for field in DEMANDS if field in cells.columns]
+    mode = mode or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
+    if not mode and row == len(cells.texts["time"]) - 1:
         mode = before
     if not mode:
         raise BadData(
@@ -456,31 +423,35 @@ def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -
     return mode
 
 
-def _check_demands(cells: _CellReader, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
-    """Rejects a row with two demands or none, and a ramp between different kinds of demand."""
+def _check_demands(
+    cells: _CellReader, row: int, is_required: bool, before: str, mode: str, demands: list[str], others: list[str]
+) -> None:
+    """Rejects a row with two demands or none, and a ramp between different kinds of demand.
+
+    Args:
+        is_required: False if no segment follows the row.
+    """
+    where = f"{cells.source} row {row + 1}"
     if others:
-        cell_place = cells.columns[others[0]][0]
-        other = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
+        other = cells.columns[demands[0]][0] if demands and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{cells.source} row {row + 1}, {cell_place}: got {cells.text(others[0], row)} in addition to {other}; "
+            f"{where}, {cells.columns[others[0]][0]}: got {cells.text(others[0], row)} in addition to {other}; "
             "expected one demand per row"
         )
-    pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())
-    ends = row == len(cells) - 1 and not cells.linear
-    for field in pair:
-        if mode == MODES[VOLTAGE] and field not in own and not ends:
+    for field in next((pair for pair in PAIRS if pair[0] in cells.columns), ()):
+        if mode == MODES[VOLTAGE] and field not in demands and is_required:
             cells.refuse(field, row, "a value for each side")
     if mode not in CONTROLLED:
         return
-    if not cells.has(mode):
+    if mode not in cells.columns:
         raise BadData(
-            f"{cells.source} row {row + 1}, mode: got {mode}; expected a column with that demand, such as "
+            f"{where}, mode: got {mode}; expected a column with that demand, such as "
             f"{next(iter(QUANTITIES[mode].columns()))}"
         )
-    if not own and (cells.linear or row < len(cells) - 1):
+    if not demands and is_required:
         cells.refuse(mode, row, f"the demand of mode {mode}")
     if cells.linear and before in CONTROLLED and before != mode:
         raise BadData(
-            f"{cells.source} row {row + 1}: goes from a demanded {before} to a demanded {mode} although "
-            "between_rows is linear; expected one kind of demand, or a braking or coasting row between"
+            f"{where}: goes from a demanded {before} to a demanded {mode} although between_rows is linear; expected "
+            "one kind of demand, or a braking or coasting row between"
         )

@@ -106,27 +106,18 @@ def propose_columns(
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
     spelled_stems = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
-    known_units = {unit for units in columns.values() for unit in units.values()} - {
-        "",
-        "s",
-        "ms",
-        "us",
-        "ns",
-        "min",
-        "h",
-    }
-    units = [_stated_unit(signal, known_units) for signal in signals]
-    count = collections.Counter(units)
-    pool = [
-        candidate
-        for signal, unit in zip(signals, units, strict=True)
-        if signal.name not in spelled
-        and (unit is None or unit in known_units)
-        and (candidate := _candidate_of_signal(signal, unit, count[unit] == 1, columns)) is not None
-    ]
-    units_of = dict(zip((signal.path for signal in signals), units, strict=True))
+    known_units = {unit for units in columns.values() for unit in units.values()}
+    known_units -= {"", "s", "ms", "us", "ns", "min", "h"}
+    stated = {signal.path: _stated_unit(signal, known_units) for signal in signals}
+    count = collections.Counter(stated[signal.path] for signal in signals)
+    candidates = (
+        _candidate_of_signal(signal, stated[signal.path], count[stated[signal.path]] == 1, columns)
+        for signal in signals
+        if signal.name not in spelled and stated[signal.path] in {None, *known_units}
+    )
+    pool = [candidate for candidate in candidates if candidate is not None]
     groups: dict[str, list[ColumnCandidate]] = {}
-    for candidate in _currents_by_duty(_candidates_by_rate(pool, units_of, columns, seconds)):
+    for candidate in _currents_by_duty(_candidates_by_rate(pool, stated, columns, seconds)):
         groups.setdefault(candidate.quantity, []).append(candidate)
     for quantity, group in groups.items():
         if quantity in spelled_stems:
@@ -137,17 +128,14 @@ def propose_columns(
             other_paths = ", ".join(c.signal.path for c in others[:3])
             question = f"or {other_paths}: which one is the {quantity.replace('_', ' ')}?"
         if joint := _joint_name(best.signal, signals):
-            question = f"joint {joint}{'; ' * bool(question)}{question}"
+            question = "; ".join(filter(None, (f"joint {joint}", question)))
         yield best.signal.path, best.line(question)
 
 
 def _joint_name(signal: Signal, signals: Sequence[Signal]) -> str:
     """Name of the joint to which an element of a joint message belongs, empty if none."""
-    element = re.search(r"\w+(\[\d+\])$", signal.path)
-    if element is None:
-        return ""
-    path = f"{signal.path[: element.start()]}name{element[1]}"
-    names = next((s.load() for s in signals if s.path == path and s.words), np.zeros(0))
+    path, count = re.subn(r"\w+(\[\d+\])$", r"name\1", signal.path)
+    names = next((s.load() for s in signals if count and s.path == path and s.words), np.zeros(0))
     return str(names[0]) if len({*names.tolist()}) == 1 else ""
 
 
@@ -161,19 +149,18 @@ def _candidate_of_signal(
         alone: True if no other signal has that unit.
         columns: column names of each quantity, and their units.
     """
-    if signal.refused:
-        return None
     name = _path_words(signal.path)
+    if signal.refused or OTHER.search(name):
+        return None
     matches = [quantity for quantity, pattern in MEANINGS if pattern.search(name)]
     fitting = [q for q in matches if unit is None or unit in columns[q].values()]
     if not matches and unit is not None and alone and not SENSOR.search(name):
         fitting = [q for q in BY_UNIT if unit in columns[q].values()]
-    command = bool(COMMAND.search(name))
-    fitting = [q for q in fitting if not OTHER.search(name) and (not command or q in IMPOSED)]
+    if COMMAND.search(name):
+        fitting = [q for q in fitting if q in IMPOSED]
     if not fitting or (signal.words and fitting[0] != "run_id"):
         return None
-    quantity, question = fitting[0], ""
-    units = columns[quantity]
+    quantity = fitting[0]
     if quantity == "run_id":
         return ColumnCandidate(signal, quantity, quantity)
     values = np.asarray(signal.load(), float)
@@ -182,28 +169,32 @@ def _candidate_of_signal(
         return None
     largest = float(np.abs(values).max())
     if quantity == "duty":
+        factor, question = 1.0, ""
         if unit == "percent" or re.search(r"pct|percent|%", name) or 1.0 < largest <= 100.0:
-            return ColumnCandidate(signal, quantity, "duty", "", 0.01)
-        if largest <= 1.0:
-            return ColumnCandidate(signal, quantity, "duty")
-        full_scale = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
-        if full_scale is None or values.min() > 0.4 * largest:  # pulse widths never become small
-            return None
-        return ColumnCandidate(
-            signal, quantity, "duty", f"is {full_scale} full duty?", float(f"{1 / full_scale:.8g}")
-        )
+            factor = 0.01
+        elif largest > 1.0:
+            full_scale = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
+            if full_scale is None or values.min() > 0.4 * largest:  # pulse widths never become small
+                return None
+            factor, question = float(f"{1 / full_scale:.8g}"), f"is {full_scale} full duty?"
+        return ColumnCandidate(signal, quantity, "duty", question, factor)
     if unit is None and quantity == "motor_speed" and largest < SLOW:
         return ColumnCandidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")
+    question = ""
     if unit is None:
-        unit, question = next(iter(units.values())), "unit not stated: check it"
+        unit, question = next(iter(columns[quantity].values())), "unit not stated: check it"
         if largest > {"V": LARGEST_V, "A": LARGEST_A}.get(unit, np.inf):
             unit, question = f"m{unit}", f"numbers up to {largest:.0f}: m{unit}?"
     elif not matches:
         question = "a guess from its unit only: check it"
     elif "effort" in name:
         question = "effort may be a torque or a current: check it"
-    column = next(c for c, u in units.items() if u == unit)
-    return ColumnCandidate(signal, quantity, column, question)
+    return ColumnCandidate(signal, quantity, _column_in(columns[quantity], unit), question)
+
+
+def _column_in(units: Mapping[str, str], unit: str) -> str:
+    """Column of a quantity in a unit."""
+    return next(column for column, u in units.items() if u == unit)
 
 
 def _path_words(path: str) -> str:
@@ -222,9 +213,7 @@ def _stated_unit(signal: Signal, known: set[str]) -> str | None:
 
 def _is_reading(values: np.ndarray) -> bool:
     """False for a constant, a flag, a counter or a time stamp."""
-    if not len(values) or np.ptp(values) == 0 or np.abs(values).max() > LARGEST:
-        return False
-    if np.isin(values, (0.0, 1.0)).all():
+    if not len(values) or np.ptp(values) == 0 or np.abs(values).max() > LARGEST or np.isin(values, (0.0, 1.0)).all():
         return False
     steps = np.diff(values)
     return not (len(steps) > 3 and values.min() >= 0 and (steps == steps[0]).all() and float(steps[0]).is_integer())
@@ -237,15 +226,17 @@ def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
     Args:
         count: counts of the clock, shape (rows,).
     """
-    known_units = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
-    seconds_by_unit = {
-        signal.path: _stated_unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)
-    }
+    known_units = {unit for of_place, of_rate, _ in RATES for unit in (of_place, of_rate)}
+    stated = [
+        (signal, _stated_unit(signal, known_units))
+        for signal in signals
+        if not (signal.refused or signal.words) and signal.length == len(count)
+    ]
     pairs = {(of_place, of_rate): seconds for of_place, of_rate, seconds in RATES}
-    for clock_signal, rate in itertools.permutations([s for s in signals if seconds_by_unit.get(s.path)], 2):
-        seconds = pairs.get((str(seconds_by_unit[clock_signal.path]), str(seconds_by_unit[rate.path])))
-        if seconds is not None and clock_signal.length == rate.length == len(count):
-            factor = _integral_factor(count, np.asarray(clock_signal.load(), float), np.asarray(rate.load(), float))
+    for (place, of_place), (rate, of_rate) in itertools.permutations(stated, 2):
+        seconds = pairs.get((of_place or "", of_rate or ""))
+        if seconds is not None:
+            factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))
             if math.isfinite(factor) and factor > 0:
                 return factor / seconds
     return math.nan
@@ -264,27 +255,28 @@ def _candidates_by_rate(
         columns: as in `_candidate_of_signal`.
     """
     agreed: dict[str, ColumnCandidate] = {}
-    for place, rate in itertools.product(pool, pool):
-        if not _PLACES & {*columns[place.quantity].values()} or not _SPEEDS & {*columns[rate.quantity].values()}:
+    places = [c.signal for c in pool if _PLACES & {*columns[c.quantity].values()}]
+    rates = [
+        c.signal
+        for c in pool
+        if _SPEEDS & {*columns[c.quantity].values()} and "motor" not in c.signal.path.casefold()
+    ]
+    for place, rate in itertools.product(places, rates):
+        time = seconds(rate) if place.length == rate.length and place.path not in agreed else None
+        if time is None or len(time) != rate.length:
             continue
-        if place.signal.path in agreed:
-            continue
-        time = seconds(rate.signal) if place.signal.length == rate.signal.length else None
-        if time is None or len(time) != rate.signal.length or "motor" in rate.signal.path.casefold():
-            continue
-        stated_rates = [stated[c.signal.path] for c in (place, rate)]
-        units = _units_of_position_and_rate(time, place.signal, rate.signal, stated_rates)
+        stated_units = stated[place.path], stated[rate.path]
+        units = _units_of_position_and_rate(time, place, rate, stated_units)
         if not units:
             continue
-        *others, words = ["", *(f"{p} and {v.replace('_', '/')}" for p, v in reversed(units[:4]))]
-        either = f"; or {' or '.join(reversed(others[1:]))}?" if others[1:] else ""
-        straight = units[0][0] in ("m", "mm")
-        quantities_of_both = ("position", "speed") if straight else ("output_angle", "output_speed")
-        for k, candidate in enumerate((place, rate)):
-            quantity, other = quantities_of_both[k], (rate, place)[k]
-            column = next(c for c, u in columns[quantity].items() if u == units[0][k])
-            question = "" if None not in stated_rates else f"by {other.signal.path}, in {words}{either}"
-            agreed[candidate.signal.path] = ColumnCandidate(candidate.signal, quantity, column, question)
+        words, *others = (f"{p} and {v.replace('_', '/')}" for p, v in units[:4])
+        either = f"; or {' or '.join(others)}?" if others else ""
+        quantities_of_both = ("position", "speed") if units[0][0] in ("m", "mm") else ("output_angle", "output_speed")
+        for signal, other, quantity, unit in zip(
+            (place, rate), (rate, place), quantities_of_both, units[0], strict=True
+        ):
+            question = f"by {other.path}, in {words}{either}" if None in stated_units else ""
+            agreed[signal.path] = ColumnCandidate(signal, quantity, _column_in(columns[quantity], unit), question)
     yield from (agreed.get(c.signal.path, c) for c in pool)
 
 
@@ -327,21 +319,21 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
     return factor if relative_error < INTEGRAL else math.nan
 
 
-def _currents_by_duty(pool: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:
+def _currents_by_duty(candidates: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:
     """Candidates for two currents that are logged with a duty: the supply current is the motor current times the
     duty.
     """
-    pool = [*pool]
-    duty = next((c for c in pool if c.quantity == "duty"), None)
+    pool = [*candidates]
+    duties = [c for c in pool if c.quantity == "duty"][:1]
     currents = [c for c in pool if c.quantity in ("total_current", "motor_current")]
-    load: Callable[[ColumnCandidate], np.ndarray] = lambda c: np.abs(np.asarray(c.signal.load(), float) * c.factor)  # noqa: E731
     meant = {id(c): c.quantity for c in currents}
-    for supply, motor in itertools.permutations(currents, 2) if duty is not None else ():
-        if duty is None or not supply.signal.length == motor.signal.length == duty.signal.length:
-            continue
-        difference = load(supply) - load(duty) * load(motor)
-        if np.nanmedian(np.abs(difference)) < POWER * np.nanmedian(load(supply)):
-            meant |= {id(supply): "total_current", id(motor): "motor_current"}
+    for (supply, motor), duty in itertools.product(itertools.permutations(currents, 2), duties):
+        if supply.signal.length == motor.signal.length == duty.signal.length:
+            of_supply, of_motor, share = (
+                np.abs(np.asarray(c.signal.load(), float) * c.factor) for c in (supply, motor, duty)
+            )
+            if np.nanmedian(np.abs(of_supply - share * of_motor)) < POWER * np.nanmedian(of_supply):
+                meant |= {id(supply): "total_current", id(motor): "motor_current"}
     for candidate in pool:
         quantity = meant.get(id(candidate), candidate.quantity)
         column = candidate.column.replace(candidate.quantity, quantity)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from importlib import resources
-from itertools import combinations
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -169,42 +169,43 @@ def parse_requirements(text: str, where: str) -> Requirements:
     if schema != SCHEMA:
         raise BadConfiguration(f"{where}, schema: got {schema!r}; expected {SCHEMA}")
     place = f"{where}, envelope"
-    envelope_table = stated_as(content.pop("envelope", {}), dict, place, f"a table of {', '.join(KEYS)}")
-    envelope = _updated_envelope(Envelope(), envelope_table, place)
+    table = stated_as(content.pop("envelope", {}), dict, place, f"a table of {', '.join(KEYS)}")
+    envelope = _updated_envelope(Envelope(), table, place)
     requirements: list[Requirement] = []
     for name, value in content.items():
-        if name not in QUANTITIES:
-            raise BadConfiguration(f"{where}, {_unknown_name_error(name, (*QUANTITIES, 'envelope'))}")
-        tables = value if isinstance(value, list) else [value]
-        if not tables:
+        _check_name(name, (*QUANTITIES, "envelope"), where)
+        entries = value if isinstance(value, list) else [value]
+        if not entries:
             raise BadConfiguration(
                 f"{where}, {name}: got an empty list; expected a number or tables with least or most"
             )
-        for k, table in enumerate(tables):
-            table_name = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
-            requirements += _requirements_of_entry(name, table, envelope, table_name)
+        for k, entry in enumerate(entries, 1):
+            place = f"{where}, {name} {k}" if len(entries) > 1 else f"{where}, {name}"
+            requirements += _requirements_of_entry(name, entry, envelope, place)
     if not requirements:
         raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
     _check_consistent(requirements, envelope, where)
     return Requirements(where, envelope, tuple(requirements), text)
 
 
+def _check_name(name: str, known: Sequence[str], where: str) -> None:
+    """Rejects an unknown name, or one without its unit."""
+    if name in known:
+        return
+    stems = {_stem_of_name(k): k for k in known if _stem_of_name(k) != k}
+    head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
+    why = f"no such key; {allowed_words(name, known)}"
+    if name in stems:
+        why = f"no unit in its name; write {stems[name]}"
+    elif head:
+        why = f"unit {name[len(head) + 1 :]} is not supported; write {stems[head]}"
+    raise BadConfiguration(f"{where}, {name}: {why}")
+
+
 def _stem_of_name(name: str) -> str:
     """Name without unit."""
     units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
     return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
-
-
-def _unknown_name_error(name: str, known: Iterable[str]) -> str:
-    """Message about an unknown name."""
-    known = tuple(known)
-    stems = {_stem_of_name(k): k for k in known if _stem_of_name(k) != k}
-    if name in stems:
-        return f"{name}: no unit in its name; write {stems[name]}"
-    head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
-    if head:
-        return f"{name}: unit {name[len(head) + 1 :]} is not supported; write {stems[head]}"
-    return f"{name}: no such key; {allowed_words(name, known)}"
 
 
 def _parse_range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
@@ -217,13 +218,12 @@ def _parse_range(value: Any, where: str, low: float, high: float, unit: str) -> 
     return first, last
 
 
-def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
+def _updated_envelope(base: Envelope, stated: Json, where: str) -> Envelope:
     """Envelope with the stated values in place of those of `base`."""
     envelope: Json = {}
     for key, value in stated.items():
         key_path = f"{where}.{key}"
-        if key not in KEYS:
-            raise BadConfiguration(f"{where}, {_unknown_name_error(key, KEYS)}")
+        _check_name(key, KEYS, where)
         if key in RANGES:
             envelope[key] = _parse_range(value, key_path, *RANGES[key])
         elif key == "battery":
@@ -232,13 +232,11 @@ def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> 
             envelope[key] = stated_word(value, SURFACES, key_path, f"got {value!r}")
         else:
             envelope[key] = stated_as(value, str, key_path, "the name of a configuration")
+    other = next((key for key in ("battery", "state_of_charge") if envelope.get(key)), None)
     if "supply_voltage_V" in envelope:
-        if envelope.setdefault("battery", False):
-            raise BadConfiguration(f"{where}: battery and supply_voltage_V contradict each other; give one of them")
-        if "state_of_charge" in envelope:
-            raise BadConfiguration(
-                f"{where}: state_of_charge and supply_voltage_V contradict each other; give one of them"
-            )
+        if other is not None:
+            raise BadConfiguration(f"{where}: {other} and supply_voltage_V contradict each other; give one of them")
+        envelope["battery"] = False
     elif "state_of_charge" in envelope and not envelope.setdefault("battery", True):
         raise BadConfiguration(f"{where}: state_of_charge needs the battery; got battery = false")
     merged = dataclasses.replace(base, **envelope)
@@ -249,44 +247,38 @@ def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> 
 
 def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
     """Requirements of one entry: at least, at most, or both."""
-    quantity = QUANTITIES[name]
-    table = dict(value) if isinstance(value, dict) else {"least" if quantity.least else "most": value}
-    limits = {s: _parse_limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
-    source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
-    tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
+    quantity, is_endurance = QUANTITIES[name], name == "endurance_min"
+    table = value if isinstance(value, dict) else {"least" if quantity.least else "most": value}
     own_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
-    allowed = ("least", "most", "source", *KEYS, *own_keys)
     for key in table:
-        if key not in allowed:
-            raise BadConfiguration(f"{where}, {_unknown_name_error(key, allowed)}")
-    for key in table:
+        if key in ("duty", "share") and not is_endurance:
+            raise BadConfiguration(f"{where}: duty and share can be used only with endurance_min")
+        _check_name(key, ("least", "most", "source", *KEYS, *own_keys), where)
         if key in AXES and key not in quantity.axes:
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
+    limits = {sense: _parse_limit(table[sense], where, quantity) for sense in ("least", "most") if sense in table}
     if not limits:
         raise BadConfiguration(f"{where}: expected least, most or both [{quantity.unit}]")
-    stated_as(source, str, f"{where}, source", "text")
-    if name != "endurance_min" and (duty is not None or share is not None):
-        raise BadConfiguration(f"{where}: duty and share can be used only with endurance_min")
-    if name == STAIRS and tread is None:
-        raise BadConfiguration(
-            f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
-        )
-    depth = 0.0 if tread is None else stated_number(tread, f"{where}, {TREAD}", *TREADS, "mm")
-    own_envelope = _updated_envelope(envelope, table, where)
-    if name == "endurance_min" and not own_envelope.battery:
+    source = stated_as(table.get("source", ""), str, f"{where}, source", "text")
+    depth = 0.0
+    if name == STAIRS:
+        if TREAD not in table:
+            raise BadConfiguration(
+                f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
+            )
+        depth = stated_number(table[TREAD], f"{where}, {TREAD}", *TREADS, "mm")
+    envelope = _updated_envelope(envelope, {key: table[key] for key in KEYS if key in table}, where)
+    if is_endurance and not envelope.battery:
         raise BadConfiguration(f"{where}: endurance needs the battery, but the envelope sets supply_voltage_V")
     if name == "speed_end_of_charge_m_s":
-        if not own_envelope.battery:
+        if not envelope.battery:
             raise BadConfiguration(
                 f"{where}: an end of charge needs the battery, but the envelope sets another supply"
             )
-        own_envelope = dataclasses.replace(
-            own_envelope, state_of_charge=(own_envelope.charge_end, own_envelope.charge_end)
-        )
-    driven = _parse_share(duty, share, where)
+        envelope = dataclasses.replace(envelope, state_of_charge=(envelope.charge_end, envelope.charge_end))
+    share = _parse_share(table.get("duty"), table.get("share"), where)
     return [
-        Requirement(name, limit, sense == "least", own_envelope, driven, source, depth)
-        for sense, limit in limits.items()
+        Requirement(name, limit, sense == "least", envelope, share, source, depth) for sense, limit in limits.items()
     ]
 
 
@@ -317,35 +309,21 @@ _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_spe
 
 
 def _check_consistent(each: list[Requirement], envelope: Envelope, where: str) -> None:
-    for a, b in combinations(each, 2):
-        least, most = (a, b) if a.least else (b, a)
-        same_quantity = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name)
-        same_quantity = same_quantity and (a.share, a.tread_mm) == (b.share, b.tread_mm)
-        if least.limit is None or most.limit is None:
-            continue
-        if (
-            same_quantity
-            and least.least
-            and not most.least
-            and least.limit > most.limit
-            and a.envelope.meets(b.envelope)
-        ):
+    limits = [(r, r.limit) for r in each if r.limit is not None]
+    for (a, least), (b, most) in product(limits, limits):
+        of_a, of_b = ((_SAME.get(r.name, r.name), r.share, r.tread_mm) for r in (a, b))
+        if a.least and not b.least and least > most and of_a == of_b and a.envelope.meets(b.envelope):
             unit = a.quantity.unit
             raise BadConfiguration(
-                f"{where}: {least.name} at least {least.limit:g} {unit} and {most.name} at most {most.limit:g} "
-                f"{unit} contradict each other"
+                f"{where}: {a.name} at least {least:g} {unit} and {b.name} at most {most:g} {unit} contradict "
+                "each other"
             )
-    for r in each:
-        if r.limit is None:
-            continue
-        ends = {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(r.name)
-        if ends is not None and r.least and r.limit < ends[1]:
+    for r, limit in limits:
+        key, ends = r.name, {"payload_kg": envelope.payload_kg, "slope_deg": envelope.slope_deg}.get(r.name)
+        if r.name == "winding_C":
+            key, ends = "ambient_C", r.envelope.ambient_C
+        if ends is not None and limit < ends[1] and (r.least or key == "ambient_C"):
             raise BadConfiguration(
-                f"{where}: {r.name} of at least {r.limit:g} contradicts the envelope, whose {r.name} goes up to "
+                f"{where}: {r.name} of at {r.sense} {limit:g} contradicts the envelope, whose {key} goes up to "
                 f"{ends[1]:g}"
-            )
-        if r.name == "winding_C" and r.envelope.ambient_C is not None and r.limit < r.envelope.ambient_C[1]:
-            raise BadConfiguration(
-                f"{where}: winding_C of at most {r.limit:g} contradicts the envelope, whose ambient_C goes up to "
-                f"{r.envelope.ambient_C[1]:g}"
             )

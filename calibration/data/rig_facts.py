@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -47,64 +48,69 @@ class DerivedFact:
 
 def derived_facts(robot: Robot) -> list[DerivedFact]:
     """Values that follow from the numbers of a robot's motor, gearbox and loads."""
-    facts = [*_motor_facts(robot), *_gearbox_facts(robot)]
+    facts = [*_motor_facts(robot), _gearbox_fact(robot)]
     for name, load in robot.configurations.items():
         facts += _shaft_facts(robot, name, load) if isinstance(load, Shaft) else _vehicle_facts(robot, name)
     return facts
 
 
-def _reason_if_outside(value: float, low: float, high: float, why: str) -> str:
-    """`why` and the usual range if a value is outside it, otherwise empty."""
-    return "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
+def _fact(
+    what: str, value: float, unit: str, usual: tuple[float, float], why: str, scale: float = 1.0
+) -> DerivedFact:
+    """Fact about a value, shown `scale` times as large. Outside its usual range it is odd, for the reason `why`."""
+    low, high = usual
+    odd = "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
+    return DerivedFact(what, f"{three_digits(scale * value)} {unit}".rstrip(), odd)
 
 
 def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
-    motor = robot.motor
+    motor, voltage = robot.motor, robot.motor.voltage_limit
     constant, resistance, inertia = (float(x) for x in (motor.torque_constant, motor.resistance, motor.inertia))
-    voltage = motor.voltage_limit
     with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
     if with_constant:
-        per_volt = 1 / constant / RPM
-        doubt = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", doubt)
-        idle = float(motor.friction_coulomb) / constant
-        doubt = _reason_if_outside(
-            idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current"
-        )
-        yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", doubt)
-    if with_constant and voltage is not None:
-        fastest = voltage / constant
-        doubt = (
-            "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit. Check torque_constant")
-        )
-        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", doubt)
+        yield _fact(
+            "no-load speed per volt", 1 / constant / RPM, "rpm/V", (5, 20_000),
+            "is torque_constant in N·m/A? 1 mN·m/A is 0.001",
+        )  # fmt: skip
+        yield _fact(
+            "current needed to overcome the motor's dry friction", float(motor.friction_coulomb) / constant, "A",
+            (0, 10), "is friction_coulomb in N·m? it is torque_constant times the no-load current",
+        )  # fmt: skip
+        if voltage is not None:
+            fastest = voltage / constant
+            yield DerivedFact(
+                f"no-load speed at {three_digits(voltage)} V",
+                f"{three_digits(fastest / RPM)} rpm",
+                "more than twice motor.speed_limit. Check torque_constant" * (fastest >= 2 * motor.speed_limit),
+            )
     if with_resistance and voltage is not None:
-        stall = float(motor.current_stall(voltage))
-        doubt = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
-        yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", doubt)
+        yield _fact(
+            f"stall current at {three_digits(voltage)} V", float(motor.current_stall(voltage)), "A", (0.02, 1000),
+            "check motor.resistance",
+        )  # fmt: skip
     if with_constant and with_resistance:
         size = constant**2 / resistance
-        doubt = _reason_if_outside(
-            size, 1e-7, 1.0, "torque_constant and resistance fit no one motor. Check their units"
-        )
-        yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", doubt)
+        yield _fact(
+            "torque over speed k²/R", size, "mN·m·s", (1e-7, 1.0),
+            "torque_constant and resistance fit no one motor. Check their units", scale=1e3,
+        )  # fmt: skip
         if inertia > 0:
-            constant_time = inertia / size
-            why = "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
-            doubt = _reason_if_outside(constant_time, 5e-4, 0.5, why)
-            yield DerivedFact(
-                "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", doubt
-            )
+            yield _fact(
+                "mechanical time constant of the motor alone J R/k²", inertia / size, "ms", (5e-4, 0.5),
+                "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance", scale=1e3,
+            )  # fmt: skip
 
 
-def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
+def _gearbox_fact(robot: Robot) -> DerivedFact:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
-    doubt = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
-    if ratio >= STAGES and efficiency > EFFICIENCY:
-        doubt = f"an efficiency of {efficiency:g} is high for three or more stages (0.5 to {EFFICIENCY:g})"
-    if ratio == 1 and efficiency < 0.9:
-        doubt = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
-    yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", doubt)
+    text, odd = f"{ratio:g} : 1 with efficiency {efficiency:g}", ""
+    if not 1 <= ratio <= 3000:
+        odd = "expected motor turns per output turn (usual: 1 to 3000)"
+    elif ratio >= STAGES and efficiency > EFFICIENCY:
+        odd = f"an efficiency of {efficiency:g} is high for three or more stages (0.5 to {EFFICIENCY:g})"
+    elif ratio == 1 and efficiency < 0.9:
+        odd = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
+    return DerivedFact("gearbox", text, odd)
 
 
 def _output_torque_at(robot: Robot, current: float) -> float:
@@ -126,77 +132,67 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
-    doubt = _reason_if_outside(current, 0, 200, f"check {places}, and the gearbox")
+    fact = _fact(what, current, "A per motor", (0, 200), f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
-            doubt = (
-                f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move. "
-                f"Check {places}"
-            )
-    yield DerivedFact(what, f"{three_digits(current)} A per motor", doubt)
+            odd = f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move. "
+            fact = dataclasses.replace(fact, odd=f"{odd}Check {places}")
+    yield fact
 
 
 def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
     friction, constant, gravity = (float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity))
+    inertia, of_motor, travel = float(load.inertia), float(robot.motor.inertia), 2 * math.pi * float(load.radius)
     places = f"{name}.loss_coulomb [N·m, at the output]"
     yield from _current_fact(robot, f"{name}: current to turn it slowly", friction + max(constant, 0.0), places)
     if gravity > 0:
         yield from _current_fact(
             robot, f"{name}: current to hold and lift the arm", friction + gravity, f"{name}.torque_gravity"
         )
-        length = float(load.inertia) * GRAVITY / gravity
-        why = f"{name}.inertia and {name}.torque_gravity are unlikely to belong to one arm (m l² and m g l)"
-        yield DerivedFact(
-            f"{name}: length of a pendulum with the same period",
-            f"{three_digits(length * 1e3)} mm",
-            _reason_if_outside(length, 0.01, 3.0, why),
-        )
-    if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
-        share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
-        why = f"check {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
-        yield DerivedFact(
+        yield _fact(
+            f"{name}: length of a pendulum with the same period", inertia * GRAVITY / gravity, "mm", (0.01, 3.0),
+            f"{name}.inertia and {name}.torque_gravity are unlikely to belong to one arm (m l² and m g l)", scale=1e3,
+        )  # fmt: skip
+    if inertia > 0 and of_motor > 0:
+        yield _fact(
             f"{name}: load inertia over motor inertia, both at the output",
-            three_digits(share),
-            _reason_if_outside(share, 1e-4, 1e4, why),
-        )
+            inertia / (of_motor * float(robot.gearbox.ratio) ** 2), "", (1e-4, 1e4),
+            f"check {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7",
+        )  # fmt: skip
     if float(load.radius) != 1.0:
-        travel = 2 * math.pi * float(load.radius)
-        yield DerivedFact(
-            f"{name}: travel per turn",
-            f"{three_digits(travel * 1e3)} mm",
-            _reason_if_outside(travel, 1e-4, 10.0, "check the travel"),
-        )
+        yield _fact(f"{name}: travel per turn", travel, "mm", (1e-4, 10.0), "check the travel", scale=1e3)
 
 
 def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
-    load = robot.configurations[name]
-    sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
-    rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
-    doubt = _reason_if_outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
-    yield DerivedFact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", doubt)
-    guide = float(load.track.guide_friction) * float(load.track.guide_share)
-    torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
+    load, motor, limit = params.values_by_name(robot.configurations[name]), robot.motor, robot.motor.voltage_limit
+    sides, radius, loss = float(robot.sides), load["radius"], load["track.loss_coulomb"]
+    weight = load["mass"] * GRAVITY
+    resistance = load["ground.rolling_resistance"] + load["track.guide_friction"] * load["track.guide_share"]
+    fact = _fact(f"{name}: weight", load["mass"], "kg", (0.05, 2000), f"is {name}.mass in kg?")
+    yield dataclasses.replace(fact, value=f"{fact.value}, {three_digits(weight)} N")
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
+    torque = weight * resistance * radius / sides + loss
     yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
+    static = load["ground.friction.static"]
     grip = math.degrees(math.atan(static))
-    doubt = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
-    yield DerivedFact(
-        f"{name}: steepest slope without sliding",
-        f"{grip:.0f}°",
-        doubt or _reason_if_outside(grip, 5, 60, "check friction.static"),
-    )
-    limit = robot.motor.voltage_limit
+    fact = _fact(f"{name}: steepest slope without sliding", grip, "", (5, 60), "check friction.static")
+    odd = "it cannot move on the flat: friction.static is below the resistance" * (static <= resistance)
+    yield dataclasses.replace(fact, value=f"{grip:.0f}°", odd=odd or fact.odd)
     if limit is None or not robot.knows(["motor.resistance"]):
         return
-    pull = _output_torque_at(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
-    climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
-    doubt = "" if climb > 0 else "its motors cannot move it. Check mass, ratio, torque_constant and resistance"
-    angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
-    yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, doubt)
-    speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
-    doubt = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", doubt)
+    pull = (_output_torque_at(robot, float(motor.current_stall(limit))) - loss) * sides / radius
+    climb = pull / weight - resistance
+    yield DerivedFact(
+        f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V",
+        "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°",
+        "its motors cannot move it. Check mass, ratio, torque_constant and resistance" * (climb <= 0),
+    )
+    yield _fact(
+        f"{name}: no-load speed at {three_digits(limit)} V",
+        limit / float(motor.torque_constant) / float(robot.gearbox.ratio) * radius, "m/s", (0.005, 15),
+        f"check {name}.radius, gearbox.ratio and motor.torque_constant",
+    )  # fmt: skip
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
@@ -206,25 +202,25 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     """
     if not runs.sampled or robot.rig.imposed != "voltage":
         return ""
-    longest = FAR * time_constant(robot)
+    constant = time_constant(robot)
     moving = [c for c in runs.channels if c.zero_at_rest and c.directed and runs.has(c.column)]
-    for stretch in (s for run in intervals_by_run(runs) for s in run if len(s.rows) >= 4 * RISING):
-        time = runs["time_s"][stretch.rows]
-        for channel in moving:
-            readings = runs[channel.column][stretch.rows]
-            end = np.nanmedian(readings[len(readings) // 2 :]) - readings[0]
-            if not abs(end) > 0.5 * np.nanmax(np.abs(runs[channel.column])):
-                continue
-            share = (readings - readings[0]) / end
-            rises = np.flatnonzero((share > 0.1) & (share < 0.9))
-            if len(rises) < RISING or np.any(np.diff(rises) > 1) or time[rises[-1]] - time[rises[0]] < longest:
-                continue
-            lasts, column = time[rises[-1]] - time[rises[0]], runs.headings.get("time_s", "time_s")
+    stretches = [s.rows for run in intervals_by_run(runs) for s in run if len(s.rows) >= 4 * RISING]
+    for stretch, channel in itertools.product(stretches, moving):
+        readings = runs[channel.column][stretch]
+        change = np.nanmedian(readings[len(readings) // 2 :]) - readings[0]
+        if not abs(change) > 0.5 * np.nanmax(np.abs(runs[channel.column])):
+            continue
+        share = (readings - readings[0]) / change
+        rises = np.flatnonzero((share > 0.1) & (share < 0.9))
+        if len(rises) < RISING or np.any(np.diff(rises) > 1):
+            continue
+        first, last = stretch[rises[0]], stretch[rises[-1]]
+        lasts, column = runs["time_s"][last] - runs["time_s"][first], runs.heading("time_s")
+        if lasts >= FAR * constant:
             return (
-                f"{runs.source} rows {stretch.rows[rises[0]] + 1} to {stretch.rows[rises[-1]] + 1}: "
-                f"{channel.label} changes over {three_digits(lasts)} s at a constant voltage, while these motors "
-                f"need about {three_digits(longest / FAR)} s. Is {column} in milliseconds? Then name it time_ms, "
-                f'or state [columns] time_ms = "{column}"'
+                f"{runs.place(first, last)}: {channel.label} changes over {three_digits(lasts)} s "
+                f"at a constant voltage, while these motors need about {three_digits(constant)} s. Is {column} in "
+                f'milliseconds? Then name it time_ms, or state [columns] time_ms = "{column}"'
             )
     return ""
 
@@ -242,13 +238,17 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     loads = [x for name, x in robot.configurations.items() if name in present and isinstance(x, Shaft)]
     if column != CURRENT or not loads:
         return ""
-    torques = [[float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity)] for load in loads]
-    needed = max(_current_for_torque(robot, sum(map(abs, torque))) for torque in torques)
+    needed = max(
+        _current_for_torque(
+            robot, abs(float(x.loss_coulomb)) + abs(float(x.torque_constant)) + abs(float(x.torque_gravity))
+        )
+        for x in loads
+    )
     turning = runs["held"] < 0.5 if runs.has("held") else np.full(len(runs), True)
     largest = float(np.nanmax(np.abs(runs[column][turning]), initial=0.0))
     if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
         return ""
-    heading = runs.headings.get(column, column)
+    heading = runs.heading(column)
     motionless = largest > needed and not any(c.zero_at_rest and runs.has(c.column) for c in runs.channels)
     held = "Was the shaft held? Then add a column held with 1 in these rows. " * motionless
     return (
@@ -279,25 +279,24 @@ def jitter_sentence(runs: Runs) -> str:
         if float(np.mean(deviation[1:] * deviation[:-1])) < TURNS_BACK * spread**2:
             run = f" of run {name}" if name else ""
             return (
-                f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
-                f"{three_digits(spread / 2**0.5)} s around even spacing. Replace these times by even ones, "
-                f"{three_digits(float(np.mean(steps)))} s apart"
+                f"{runs.place(rows[0], rows[-1])}, time_s: the clock{run} jitters by {three_digits(spread / 2**0.5)} "
+                f"s around even spacing. Replace these times by even ones, {three_digits(float(np.mean(steps)))} s "
+                "apart"
             )
     return ""
 
 
 def constant_conditions_sentence(runs: Runs) -> str:
     """Sentence on a log in which no condition changes, empty for others."""
-    conditions = (*changing_columns(runs), *(c for c in runs.layout.sides if runs.has(c)))
-    column = runs.layout.imposed_column
+    conditions, column = (*changing_columns(runs), *runs.layout.sides), runs.layout.imposed_column
     if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
         return ""
-    if any(len(np.unique(runs[c])) > 1 for c in conditions):
+    if any(len(np.unique(runs[c])) > 1 for c in conditions if runs.has(c)):
         return ""
     return (
-        f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: "
-        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row. One level does not separate "
-        "losses by current from those by speed. Log three or more, in both directions if the drive reverses"
+        f"{runs.place(0, len(runs) - 1)}, {runs.heading(column)}: {three_digits(runs[column][0])} "
+        f"{column.rpartition('_')[2]} in every row. One level does not separate losses by current from those by "
+        "speed. Log three or more, in both directions if the drive reverses"
     )
 
 
@@ -313,31 +312,31 @@ def saturation_sentence(runs: Runs) -> str:
     and speeds at higher commands correspond to one constant voltage.
     """
     # With a duty, the supply current is only a share of the motor current.
-    current_columns = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
-    current, speed = next((c for c in current_columns if runs.has(c)), CURRENT), SPEED
-    if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
+    currents = [c for c in (CURRENT, *["total_current_A"] * (not runs.has("duty"))) if runs.has(c)]
+    read = (*currents[:1], SPEED)
+    if runs.layout.imposed != "voltage" or runs.turns or not runs.sampled or not currents or not runs.has(SPEED):
         return ""
-    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
+    if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in read):
         return ""
-    drive, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
-    read = np.isfinite(readings).all(1)
-    is_inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
+    drive, readings = applied_drive(runs), np.stack([runs[column] for column in read], 1)
+    is_read, size = np.isfinite(readings).all(1), np.abs(drive)
+    is_inner = is_read & (drive != 0) & (size <= INNER * float(size.max()))
     if is_inner.sum() < ROWS_INNER:
         return ""
     predicted = readings @ np.linalg.lstsq(readings[is_inner], drive[is_inner], rcond=None)[0]
     if np.std(predicted[is_inner] - drive[is_inner]) > FITS * np.std(drive[is_inner]):
         return ""
-    top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
+    top = is_read & (size >= np.quantile(size[is_read], 0.9))
     limit = float(np.median(np.abs(predicted[top])))
-    limited = read & (np.abs(drive) > limit / REACHES)
+    limited = is_read & (size > limit / REACHES)
     # If the voltage from these rows still rises, the driver does not limit it.
     if limited.sum() < ROWS_INNER or np.std(np.abs(predicted[limited])) > FITS * limit:
         return ""
-    row = int(np.flatnonzero(limited)[0])
+    row = int(np.argmax(limited))
     return (
-        f"{runs.source} row {row + 1}, {drive_heading(runs)}: commands {three_digits(drive[row])} V, but "
-        f"current and speed show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the "
-        f"log. Give the voltage that the driver applies, or limit the column to {three_digits(limit)} V"
+        f"{runs.place(row)}, {drive_heading(runs)}: commands {three_digits(drive[row])} V, but current and speed "
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(limited):.2g} % of the log. Give the voltage "
+        f"that the driver applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -356,20 +355,19 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
         return ""
     ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
     highest = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
-    read, is_shown = runs[column], np.isfinite(runs[column]) & (highest > 0)
-    is_shown &= np.abs(np.nan_to_num(read)) > 0
-    if not is_shown.any():
+    speed = np.abs(np.nan_to_num(runs[column]))
+    rows = np.flatnonzero((speed > 0) & (highest > 0))
+    if not rows.size:
         return ""
-    share = float(np.median(np.abs(read[is_shown]) / highest[is_shown]))
+    share = float(np.median(speed[rows] / highest[rows]))
     braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
-    row = int(np.flatnonzero(is_shown)[0])
-    heading, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
+    row, (heading, supply) = int(rows[0]), map(runs.heading, (column, SUPPLY))
     return (
-        f"{runs.source} row {row + 1}, {heading}: got {three_digits(abs(read[row]))} rpm, but with the file's "
-        f"torque constant the motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} "
-        f"and {supply}, and motor.torque_constant"
+        f"{runs.place(row)}, {heading}: got {three_digits(speed[row])} rpm, but with the file's torque constant the "
+        f"motors reach at most {three_digits(highest[row])} rpm; check the units of {heading} and {supply}, and "
+        "motor.torque_constant"
     )
 
 
@@ -386,15 +384,15 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    torque_at_zero, torque_per_ampere = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
-    stall = np.maximum(torque_at_zero + (torque_per_ampere - torque_at_zero) * current, 0.0)
+    at_zero, at_one = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # linear in the current
+    stall = np.maximum(at_zero + (at_one - at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     exceeds_stall = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
     if not braked.any() or exceeds_stall.sum() <= braked.sum() / 2:
         return ""
-    row, heading = int(np.flatnonzero(exceeds_stall)[0]), runs.headings.get(LOAD, LOAD)
+    row, heading = int(np.argmax(exceeds_stall)), runs.heading(LOAD)
     return (
-        f"{runs.source} row {row + 1}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
+        f"{runs.place(row)}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
         f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{heading}"'
     )
 
@@ -411,38 +409,33 @@ def swapped_sentence(runs: Runs) -> str:
     if not drive.min() < 0 < drive.max():
         return ""  # a signal that never changes sign may lack it, which other checks report
     for channel, readings in zip(runs.channels, runs.measured().T, strict=True):
+        if not channel.zero_at_rest:
+            continue
         power = np.zeros(len(drive))
-        for rows in of_runs if channel.zero_at_rest else ():
+        for rows in of_runs:
             motion = readings[rows] if channel.settled or len(rows) < 2 else np.gradient(readings[rows])
             power[rows] = np.nan_to_num(drive[rows] * motion)
             power[rows] /= max(float(np.abs(power[rows]).mean()), 1e-300)
-        for rows in (*of_runs, np.concatenate(of_runs)) if channel.zero_at_rest else ():
+        for rows in (*of_runs, np.concatenate(of_runs)):
             total = np.cumsum(power[rows]) / max(float(np.abs(power[rows]).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
-            sums, parts = (total[turn], total[-1] - total[turn]), np.split(drive[rows], [turn + 1])
+            before, after = total[turn], total[-1] - total[turn]
+            parts = np.split(drive[rows], [turn + 1])
             # Of an angle, both parts need both directions: a load without friction returns its energy as it brakes.
             both = channel.settled or all(x.min(initial=0.0) < 0 < x.max(initial=0.0) for x in parts)
-            if both and sums[0] * sums[1] < 0 and min(map(abs, sums)) > SWAPPED:
-                column = runs.headings.get(channel.column, channel.column)
+            if both and before * after < 0 and min(abs(before), abs(after)) > SWAPPED:
                 return (
-                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is opposite to "
-                    f"{drive_heading(runs)}. Correct one part"
+                    f"{runs.place(rows[turn] + 1)}, {runs.heading(channel.column)}: from here on its sign is "
+                    f"opposite to {drive_heading(runs)}. Correct one part"
                 )
     return ""
 
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Doubts about a log, one sentence each: times, levels, limits, and units that do not fit the robot."""
-    doubts = (
-        jitter_sentence(runs),
-        saturation_sentence(runs),
-        constant_conditions_sentence(runs),
-        swapped_sentence(runs),
-        doubtful_time(runs, robot),
-        doubtful_current(runs, robot),
-        doubtful_torque(runs, robot),
-        doubtful_speed(runs, robot),
-    )
+    of_runs = (jitter_sentence, saturation_sentence, constant_conditions_sentence, swapped_sentence)
+    of_robot = (doubtful_time, doubtful_current, doubtful_torque, doubtful_speed)
+    doubts = (*(doubt(runs) for doubt in of_runs), *(doubt(runs, robot) for doubt in of_robot))
     return tuple(filter(None, doubts))
 
 
@@ -467,41 +460,30 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
     """Origin of each number of a robot, part by part. Numbers that no file states come last in their part."""
     robot, names_in_file = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
+    reasons = {"motor.inductance": rig_file.WINDING_WHY, rig_file.CENTRE: rig_file.CENTRE_WHY}
+    reasons |= {name: why for name, (_, why) in rig_file.DEFAULTS.items()}
+    of_loads = rig_file.FOLLOWS | {key: why for key, (_, why) in rig_file.VEHICLE.items()}
+    of_loads["radius"] = "not stated: travel is the angle"
+    shown = (*(f"{name}." for name in robot.configurations), "motor.friction", "gearbox.")
+    if any(name.startswith(f"{BATTERY}.") for name in names_in_file):
+        shown += (f"{BATTERY}.",)
+    if rig_file.WHEELBASE in names_in_file:
+        shown += (rig_file.CENTRE,)
+    if not robot.rig.inherits:
+        shown += ("motor.inertia", *["motor.inductance"] * robot.rig.shows_voltage)
     origins = []
     for p in params.walk_parameters(robot):
         head, _, key = p.name.partition(".")
-        is_own_configuration = head in robot.configurations
-        is_shown = (
-            p.name in names_in_file or is_own_configuration or p.name.startswith(("motor.friction", "gearbox."))
-        )
-        is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in names_in_file
-        is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in names_in_file)
-        assumed = not robot.rig.inherits and (
-            p.name == "motor.inertia" or (p.name == "motor.inductance" and robot.rig.shows_voltage)
-        )
-        if not is_shown and not assumed:
-            continue
         if p.name in names_in_file:
             why = "computed from mass and travel of the linear unit" if head in file.linear else "the file"
+        elif not p.name.startswith(shown):
+            continue
         elif robot.rig.inherits:
             why = "its base"
         elif head == BATTERY and not robot.knows([p.name]):
             why = "not stated: an example value. Results on the battery depend on it"
         else:
-            why = _reason_of_default(p.name, key if is_own_configuration else "")
+            of_load = of_loads.get(key) if head in robot.configurations else None
+            why = reasons.get(p.name) or of_load or "not stated: none"
         origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return origins
-
-
-def _reason_of_default(name: str, rest: str) -> str:
-    if name == "motor.inductance":
-        return rig_file.WINDING_WHY
-    if name == rig_file.CENTRE:
-        return rig_file.CENTRE_WHY
-    if name in rig_file.DEFAULTS:
-        return rig_file.DEFAULTS[name][1]
-    if rest in rig_file.FOLLOWS:
-        return rig_file.FOLLOWS[rest]
-    if rest in rig_file.VEHICLE:
-        return rig_file.VEHICLE[rest][1]
-    return "not stated: travel is the angle" if rest == "radius" else "not stated: none"

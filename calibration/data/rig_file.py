@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from calibration.data import Json, Names
+from calibration.data import Json, Mapped, Names
 from calibration.data.columns import Layout
 from calibration.data.input_errors import (
     BadConfiguration,
@@ -113,9 +113,12 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         BadConfiguration: a key is unknown, a value is no number, the mass is missing, lead and drum are both given or
             both missing, or one of these is not positive.
     """
-    for key in table:
+    for key, value in table.items():
         stated_word(key, LINEAR, f"{where}.{key}", "no such key of a linear unit")
-    values = {key: _linear_value(table, key, where) for key in table}
+        if not is_number(value) or not math.isfinite(value) or (key in _LEAST and value <= 0):
+            expected = "a number above 0" if key in _LEAST else "a number"
+            raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {expected} ({LINEAR[key]})")
+    values = {key: float(value) for key, value in table.items()}
     travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
         raise BadConfiguration(
@@ -126,31 +129,17 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     table.clear()
     table.update(_shaft_of_linear_unit(values, sides))
     inputs = {key: sds.pop(f"{name}.{key}") for key in values if f"{name}.{key}" in sds}
-    exact = {key for key, sd in inputs.items() if sd == 0}
+
+    def change(result: str, key: str, step: float) -> float:
+        return _shaft_of_linear_unit({**values, key: values[key] + step}, sides)[result] - float(table[result])
+
     for result in table:
-        shaft_values = {
-            key
-            for key in values
-            if _shaft_of_linear_unit({**values, key: 1.01 * values[key] + 1e-6}, sides)[result] != table[result]
-        }
-        if shaft_values and shaft_values <= exact:
+        acting = {key for key in values if change(result, key, 0.01 * values[key] + 1e-6)}
+        sd = math.hypot(*(change(result, key, sd) for key, sd in inputs.items()))
+        if acting and all(inputs.get(key) == 0 for key in acting):
             sds[f"{name}.{result}"] = 0.0
-            continue
-        steps = [
-            _shaft_of_linear_unit({**values, key: values[key] + sd}, sides)[result] - table[result]
-            for key, sd in inputs.items()
-        ]
-        sd = math.hypot(*steps)
-        if sd > 0:
+        elif sd > 0:
             sds[f"{name}.{result}"] = float(f"{sd:.12g}")
-
-
-def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:
-    value = table[key]
-    if not is_number(value) or not math.isfinite(value) or (key in _LEAST and value <= 0):
-        expected = "a number above 0" if key in _LEAST else "a number"
-        raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {expected} ({LINEAR[key]})")
-    return float(value)
 
 
 def _shaft_of_linear_unit(at: Mapping[str, float], sides: float) -> dict[str, float]:
@@ -165,23 +154,19 @@ def _shaft_of_linear_unit(at: Mapping[str, float], sides: float) -> dict[str, fl
     }
 
 
-def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) -> dict[str, float]:
+def vehicle_defaults(on_tracks: bool, values: Mapping[str, Any], sides: float) -> dict[str, float]:
     """Default values of a vehicle in a robot file without a base.
 
     Args:
-        table: table of the vehicle in the file.
+        values: values that its table states, by dotted name. One that is no number is rejected later.
         sides: number of drives that move it together.
     """
-
-    def stated_value(*keys: str) -> float:
-        entry: Any = table
-        for key in keys:
-            entry = entry.get(key) if isinstance(entry, Mapping) else None
-        return float(entry) if is_number(entry) else 0.0  # a value that is no number is rejected later
-
+    mass, radius, static = (
+        float(values[key]) if is_number(values.get(key)) else 0.0
+        for key in ("mass", "radius", "ground.friction.static")
+    )
     defaults = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
-    wheels = 0.5 * WHEELS * stated_value("mass") * stated_value("radius") ** 2 / sides
-    return defaults | {DYNAMIC: DYNAMIC_SHARE * stated_value(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
+    return defaults | {DYNAMIC: DYNAMIC_SHARE * static, "inertia": 0.5 * WHEELS * mass * radius**2 / sides}
 
 
 def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
@@ -198,29 +183,33 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
         BadConfiguration: a word, channel or column is unknown, a channel is imposed, or an instrument belongs to a
             channel that the rig does not have.
     """
-    imposed_name = content.pop("imposed", IMPOSED[0])
-    imposed = stated_word(
-        SHORT.get(imposed_name, imposed_name) if isinstance(imposed_name, str) else imposed_name,
-        IMPOSED,
-        f"{where}, imposed",
-    )
-    start = stated_word(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
-    between = stated_word(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
-    usual = [name for name in channels.USUAL if travels or name != "speed"]
-    names = _parse_channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
+
+    def word(key: str, words: Sequence[str]) -> str:
+        stated = content.pop(key, words[0])
+        if key == "imposed" and isinstance(stated, str):
+            stated = SHORT.get(stated, stated)
+        return stated_word(stated, words, f"{where}, {key}")
+
+    imposed, start, between = word("imposed", IMPOSED), word("start", STARTS), word("between_rows", BETWEEN)
+    usual = [name for name in channels.USUAL if name != imposed and (travels or name != "speed")]
+    names = _parse_channels(content.pop("channels", usual), f"{where}, channels")
     if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
             f"{where}, channels: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
+    surfaces = stated_as(content.pop("surfaces", {}), dict, f"{where}, surfaces", "a table [surfaces]")
+    for name, other in surfaces.items():
+        for load in (name, other):
+            stated_word(load, loads, f"{where}, surfaces.{name}")
     return Rig(
         imposed=imposed,
         channels=names,
-        instruments=_parse_instruments(content.pop("instruments", {}), names, where),
-        columns=_parse_columns(content.pop("columns", {}), where),
+        instruments=_parse_instruments(content.pop("instruments", {}), names, f"{where}, instruments"),
+        columns=_parse_columns(content.pop("columns", {}), f"{where}, columns"),
         start=start,
         between_rows=between,
-        surfaces=_parse_surfaces(content.pop("surfaces", {}), loads, where),
+        surfaces=tuple(surfaces.items()),
         inherits=inherits,
     )
 
@@ -235,35 +224,27 @@ def _parse_channels(stated: Any, where: str) -> Names:
     return tuple(name for name in channel_names if name in stated)
 
 
-def _parse_surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
-    table_place = f"{where}, surfaces"
-    for name, other in stated_as(stated, dict, table_place, "a table [surfaces]").items():
-        for word in (name, other):
-            stated_word(word, loads, f"{table_place}.{name}")
-    return tuple(stated.items())
-
-
 #: Word for an instrument property that is inferred from its table.
 FREE = "free"
 
 
 def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
-    table_place = f"{where}, instruments"
     instruments = []
-    for name, table in stated_as(stated, dict, table_place, f"tables such as [instruments.{names[0]}]").items():
-        stated_word(name, names, f"{table_place}.{name}", "the rig has no such channel")
-        for key in stated_as(table, dict, f"{table_place}.{name}", f"a table [instruments.{name}]"):
-            stated_word(key, ("signed", "quantum"), f"{table_place}.{name}.{key}", "no such key")
+    for name, table in stated_as(stated, dict, where, f"tables such as [instruments.{names[0]}]").items():
+        place = f"{where}.{name}"
+        stated_word(name, names, place, "the rig has no such channel")
+        for key in stated_as(table, dict, place, f"a table [instruments.{name}]"):
+            stated_word(key, ("signed", "quantum"), f"{place}.{key}", "no such key")
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
         channel = channels.find_channel(name)
         if not isinstance(signed, bool) and signed != FREE:
             raise BadConfiguration(
-                f"{table_place}.{name}.signed: got {signed!r}; expected true, false (shows only the magnitude), or "
-                f"{FREE!r} (decided from the table)"
+                f"{place}.signed: got {signed!r}; expected true, false (shows only the magnitude), or {FREE!r} "
+                "(decided from the table)"
             )
         if quantum != FREE and not (is_number(quantum) and 0 <= quantum < math.inf):
             raise BadConfiguration(
-                f"{table_place}.{name}.quantum: got {quantum!r}; expected the resolution of its readings, 0 or more "
+                f"{place}.quantum: got {quantum!r}; expected the resolution of its readings, 0 or more "
                 f"{channel.unit}, or {FREE!r} (decided from the table)"
             )
         step = None if quantum == FREE else float(quantum) * channel.factor
@@ -271,53 +252,47 @@ def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[I
     return tuple(instruments)
 
 
-def _parse_columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
-    table_place = f"{where}, columns"
-    stated_as(stated, dict, table_place, "a table [columns]")
+def _parse_columns(stated: Any, where: str) -> Mapped:
     layout, entries = Layout(channels=channels.EVERY), []
     spellings = layout.spellings()
-    for own_column, logger_column in stated.items():
+    for own_column, entry in stated_as(stated, dict, where, "a table [columns]").items():
+        place = f"{where}.{own_column}"
         if own_column not in spellings:
             names_text = allowed_words(own_column, spellings, shown=layout.known())
-            raise BadConfiguration(
-                f"{table_place}.{own_column}: no such column of a table; {names_text}; also in other units"
-            )
-        table = {"column": logger_column} if isinstance(logger_column, str) else logger_column
+            raise BadConfiguration(f"{place}: no such column of a table; {names_text}; also in other units")
+        table = {"column": entry} if isinstance(entry, str) else entry
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
             raise BadConfiguration(
-                f'{table_place}.{own_column}: got {logger_column!r}; expected {own_column} = "LOGGER COLUMN", or '
+                f'{place}: got {entry!r}; expected {own_column} = "LOGGER COLUMN", or '
                 f'{own_column} = {{column = "LOGGER COLUMN", factor = 0.001}}'
             )
         factor = table.get("factor", 1.0)
         if not is_number(factor) or not math.isfinite(factor) or not factor:
-            raise BadConfiguration(
-                f"{table_place}.{own_column}.factor: got {factor!r}; expected a number that is not 0"
-            )
+            raise BadConfiguration(f"{place}.factor: got {factor!r}; expected a number that is not 0")
         entries.append((own_column, table["column"], float(factor)))
     return tuple(entries)
 
 
-def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]]) -> Names:
+def required_parameters(rig: Rig, values: Mapping[str, Any]) -> Names:
     """Parameters that a robot file without a base must state: those of its drive and, if it turns, of turning.
 
     Args:
         values: values of the robot's parameters, by dotted name.
     """
-    turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
+    turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values.items())
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
-    voltage = rig.shows_voltage
     has_temperature = "winding_temperature" in rig.channels
-    conditions: tuple[tuple[str, Any], ...] = (
-        ("controller.kp", rig.follows_goal),
-        ("gearbox.ratio", True),
-        ("gearbox.efficiency_load", True),
-        ("motor.torque_constant", current or voltage),
-        ("motor.resistance", voltage or has_temperature),
-        ("motor.resistance_thermal_winding", has_temperature),
-        ("motor.resistance_thermal_housing", has_temperature),
-        (WHEELBASE, turns),
-    )
-    return tuple(name for name, is_needed in conditions if is_needed)
+    is_needed = {
+        "controller.kp": rig.follows_goal,
+        "gearbox.ratio": True,
+        "gearbox.efficiency_load": True,
+        "motor.torque_constant": current or rig.shows_voltage,
+        "motor.resistance": rig.shows_voltage or has_temperature,
+        "motor.resistance_thermal_winding": has_temperature,
+        "motor.resistance_thermal_housing": has_temperature,
+        WHEELBASE: turns,
+    }
+    return tuple(name for name, needed in is_needed.items() if needed)
 
 
 def reject_missing(
@@ -363,14 +338,6 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 
 
-def recentre_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """Robot whose stated priors are centred on new parameter values, with unchanged widths."""
-    if not set(values) & {name for name, _, _ in robot.rig.priors}:
-        return robot
-    priors = tuple((name, float(values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
-
-
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that describe a rig: the first lines, then those of each table."""
     head = [
@@ -380,24 +347,22 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
         f'between_rows = "{rig.between_rows}"  # imposed quantity between rows of time histories: held or linear',
     ]
     tables: dict[str, list[str]] = {}
-    if rig.columns:
-        tables["columns"] = [
-            f"{own_column} = {toml_value(logger_column)}"
-            if factor == 1
-            else f"{own_column} = {{column = {toml_value(logger_column)}, factor = {factor!r}}}"
-            for own_column, logger_column, factor in rig.columns
-        ]
-    if rig.surfaces:
-        tables["surfaces"] = ["# these differ only in their ground"]
-        tables["surfaces"] += [f"{toml_value(name)} = {toml_value(other)}" for name, other in rig.surfaces]
+    for own_column, logger_column, factor in rig.columns:
+        entry = toml_value(logger_column)
+        if factor != 1:
+            entry = f"{{column = {entry}, factor = {factor!r}}}"
+        tables.setdefault("columns", []).append(f"{own_column} = {entry}")
+    for name, other in rig.surfaces:
+        lines = tables.setdefault("surfaces", ["# these differ only in their ground"])
+        lines.append(f"{toml_value(name)} = {toml_value(other)}")
     for instrument in rig.instruments:
         channel = channels.find_channel(instrument.channel)
-        size = f'"{FREE}"' if instrument.quantum is None else repr(instrument.quantum / channel.factor)
-        step = [f"quantum = {size}  # [{channel.unit}] step of its readings"]
-        tables[f"instruments.{channel.name}"] = [
-            f"signed = {toml_value(FREE if instrument.signed is None else instrument.signed)}",
-            *([] if instrument.quantum == 0 else step),
+        lines = tables[f"instruments.{channel.name}"] = [
+            f"signed = {toml_value(FREE if instrument.signed is None else instrument.signed)}"
         ]
+        if instrument.quantum != 0:
+            size = FREE if instrument.quantum is None else instrument.quantum / channel.factor
+            lines.append(f"quantum = {toml_value(size)}  # [{channel.unit}] step of its readings")
     return head, tables
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from calibration.data import Json, Names, rig_file, stated
+from calibration.data import Json, Names, input_files, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolve_likes
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import (
@@ -22,7 +22,6 @@ from calibration.data.input_errors import (
     stated_names,
     stated_word,
 )
-from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
 from mmrjax.compile.compiling import in_double
@@ -35,67 +34,70 @@ from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
 
 SCHEMA = "mmrjax.robot/2"
-#: Whole numbers of a robot, which a fit cannot free: smallest, largest, meaning.
-COUNTS = {
-    "sides": (1, 12, "(motors with the same command)"),
-    "battery.cells": (1, 100, "(cells of the battery in series)"),
+
+
+def allowed_setting(name: str) -> str:
+    """Allowed values of a setting, as text."""
+    allowed, unit, _ = SETTINGS[name]
+    if isinstance(allowed[0], bool | str):
+        return " or ".join(str(x).lower() for x in allowed)
+    return f"{allowed[0]:g} to {allowed[-1]:g} {unit}".rstrip()
+
+
+#: Values of a robot that a fit cannot free: counts, makers' ratings, switches and choices. Each has its allowed
+#: values (a range, limits, or all of them), unit and meaning. Proposed experiments stay within the ratings.
+SETTINGS: dict[str, tuple[Any, str, str]] = {
+    "sides": (range(1, 13), "", "motors with the same command"),
+    "battery.cells": (range(1, 101), "", "cells of the battery in series"),
+    "motor.voltage_limit": ((0.1, 1000.0), "V", "highest supply voltage; not stated: the highest in the table"),
+    "motor.speed_limit": ((1.0, 1e5), "rad/s", "permissible speed of the motor"),
+    "motor.temperature_limit": ((30.0, 400.0), "°C", "permissible temperature of the winding"),
+    "gearbox.speed_limit": ((1.0, 1e5), "rad/s", "permissible speed at the gearbox input"),
+    "gearbox.torque_limit": (
+        (1e-3, 1e5),
+        "N·m",
+        "permissible continuous torque at the driving wheel; GP32C: 3 x 25/12",
+    ),
+    "battery.voltage_charge": ((0.5, 10.0), "V", "highest voltage of a cell during charging; Section 3.3"),
+    "battery.voltage_cutoff": ((0.0, 10.0), "V", "lowest voltage of a cell under load; assumed, not in the paper"),
+    "battery.delay_cutoff": ((0.0, 1e3), "s", "permitted time of a cell below its cut-off; assumed"),
+    "battery.current_limit": ((1e-3, 1e4), "A", "largest discharge current of a cell; not stated: no limit"),
+    "battery.current_charge": ((0.0, 1e4), "A", "largest charging current of a cell; not stated: no limit"),
+    "controller.rate": (
+        (0.0, 1e5),
+        "Hz",
+        "rate of the controller's samples, the first in a run's first row; 0: continuous",
+    ),
+    "controller.samples_late": ((0.0, 1.0), "-", "number of samples, 0 or 1, after which its duty acts"),
+    "controller.supply_voltage": (
+        (0.0, 1000.0),
+        "V",
+        "supply voltage of the driver, for tables without that column; 0: not used",
+    ),
+    "battery.capacity_curve": ((1.0, 1e6), "C", "capacity of the cell to which curvature and slope belong"),
+    "gearbox.mesh_theory": (
+        (True, False),
+        "",
+        "efficiency 2 - 1/η (gear mesh theory) when the load drives the motor, else η",
+    ),
+    "driver.returns_current": (
+        (True, False),
+        "",
+        "supply and driver accept regenerative current (otherwise a diode blocks it)",
+    ),
+    "driver.decay": (
+        DECAYS,
+        "",
+        "between pulses the driver shorts the motors (slow decay) or lets them coast (fast decay)",
+    ),
 }
+
 
 #: Key in an effect's table that scales the library's priors and limits to the rig.
 FACTORS = "scaled"
 
-#: Makers' ratings, which a fit cannot free: smallest, largest, unit and meaning. Proposed experiments stay within
-#: them.
-RATINGS = {
-    "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: the highest in the table"),
-    "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
-    "motor.temperature_limit": (30.0, 400.0, "°C", "permissible temperature of the winding"),
-    "gearbox.speed_limit": (1.0, 1e5, "rad/s", "permissible speed at the gearbox input"),
-    "gearbox.torque_limit": (
-        1e-3,
-        1e5,
-        "N·m",
-        "permissible continuous torque at the driving wheel; GP32C: 3 x 25/12",
-    ),
-    "battery.voltage_charge": (0.5, 10.0, "V", "highest voltage of a cell during charging; Section 3.3"),
-    "battery.voltage_cutoff": (0.0, 10.0, "V", "lowest voltage of a cell under load; assumed, not in the paper"),
-    "battery.delay_cutoff": (
-        0.0,
-        1e3,
-        "s",
-        "permitted time of a cell below its cut-off; assumed",
-    ),
-    "battery.current_limit": (1e-3, 1e4, "A", "largest discharge current of a cell; not stated: no limit"),
-    "battery.current_charge": (0.0, 1e4, "A", "largest charging current of a cell; not stated: no limit"),
-    "controller.rate": (
-        0.0,
-        1e5,
-        "Hz",
-        "rate of the controller's samples, the first in a run's first row; 0: continuous",
-    ),
-    "controller.samples_late": (0.0, 1.0, "-", "number of samples, 0 or 1, after which its duty acts"),
-    "controller.supply_voltage": (
-        0.0,
-        1000.0,
-        "V",
-        "supply voltage of the driver, for tables without that column; 0: not used",
-    ),
-    "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell to which curvature and slope belong"),
-}
 #: Parabola of a cell's no-load voltage. If a capacity is stated too, it applies to a cell of that capacity.
 CURVE = {"battery.curvature", "battery.slope"}
-#: Switches of a robot, which a fit cannot free: meaning.
-SWITCHES = {
-    "gearbox.mesh_theory": "efficiency 2 - 1/η (gear mesh theory) when the load drives the motor, else η",
-    "driver.returns_current": "supply and driver accept regenerative current (otherwise a diode blocks it)",
-}
-#: Choices by word, which a fit cannot free: allowed words, meaning.
-CHOICES = {
-    "driver.decay": (
-        DECAYS,
-        "between pulses the driver shorts the motors (slow decay) or lets them coast (fast decay)",
-    )
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,32 +127,26 @@ class RobotFile:
 
 
 @in_double
-def load_robot(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+def load_robot(name_or_path: str, library: Library = effects.BY_NAME) -> Robot:
     """Robot with a packaged name, or from a robot file.
 
     Args:
         name_or_path: `nominal`, `sm1`, `sm2`, or a TOML file that `calibrate`, `loop` or `rig new` wrote.
         library: effects by name that the file may use.
-        notes: callback for remarks on the file.
 
     Raises:
         BadConfiguration: no such name or file, or an invalid value in the file.
     """
-    return find_robot_file(name_or_path, library, notes).robot
+    return find_robot_file(name_or_path, library).robot
 
 
-def read_robot(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+def read_robot(path: Path, library: Library = effects.BY_NAME) -> Robot:
     """Robot from a file, as in `parse_robot_file` but without the origin of its numbers."""
-    return parse_robot_file(path, library, notes).robot
+    return parse_robot_file(path, library).robot
 
 
-def find_robot_file(
-    name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None
-) -> RobotFile:
+def find_robot_file(name_or_path: str, library: Library = effects.BY_NAME) -> RobotFile:
     """Robot with a packaged name (`nominal`, `sm1`, `sm2`) or from a file, and the origin of its numbers.
-
-    Args:
-        notes: function that receives a sentence for each value that is allowed but unlikely.
 
     Raises:
         BadConfiguration: there is no such name or file, or as in `parse_robot_file`.
@@ -163,10 +159,10 @@ def find_robot_file(
             f"--robot: got {name_or_path}, no such file and no known robot; "
             f"{allowed_words(name_or_path, paper_robots.ROBOTS)}"
         )
-    return parse_robot_file(path, library, notes)
+    return parse_robot_file(path, library)
 
 
-def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
+def parse_robot_file(path: Path, library: Library = effects.BY_NAME) -> RobotFile:
     """Read a robot file. Its effects are looked up in `library` and among the curves.
 
     The file states, all optional:
@@ -179,52 +175,45 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
         parameters: parameters in SI units, in tables by dotted name, e.g. `[motor] resistance = 0.9`, or with the sd
-            of their prior, `"0.9 ± 5 %"`. The sd is wider as long as the number is that of a template. Also RATINGS,
-            SWITCHES (true or false) and CHOICES.
+            of their prior, `"0.9 ± 5 %"`. The sd is wider as long as the number is that of a template. Also SETTINGS.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.base.scaled_effect`).
-
-    Args:
-        notes: as for `find_robot_file`.
 
     Raises:
         BadConfiguration: the text is not TOML. A key is unknown (the message lists the choices). A value is no
             number, not finite, or outside its field's bounds. Also for the reasons of `loads_from_tables` and
             `add_effects`.
     """
-    text = toml_text(path, path.name)
-    content = toml_content(text, path.name)
+    where, text = path.name, input_files.toml_text(path, path.name)
+    content = input_files.toml_content(text, where)
     if not content:
         raise BadConfiguration(
-            f"{path.name}: is empty; expected parameter tables such as [motor], or "
-            'base = "nominal" for the packaged robot'
+            f'{where}: is empty; expected parameter tables such as [motor], or base = "nominal" for the packaged '
+            "robot"
         )
     schema = content.pop("schema", SCHEMA)
     if schema != SCHEMA:
-        raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
-    base = content.pop("base", "nominal")
-    stated_word(base, (*paper_robots.ROBOTS, rig_file.NONE), f"{path.name}, base")
+        raise BadConfiguration(f"{where}, schema: got {schema}; expected {SCHEMA}")
+    base = stated_word(content.pop("base", "nominal"), (*paper_robots.ROBOTS, rig_file.NONE), f"{where}, base")
     robot, sds, linear = _robot_before_parameters(
-        None if base == rig_file.NONE else paper_robots.ROBOTS[base](),
-        content,
-        path.name,
-        stated.example_numbers(text),
+        None if base == rig_file.NONE else paper_robots.ROBOTS[base](), content, where, stated.example_numbers(text)
     )
-    place = f"{path.name}, effects"
-    present = stated_as(content.get("effects", {}), dict, place, "tables such as [effects.churning]")
-    for name in present:
+    present = stated_as(content.get("effects", {}), dict, f"{where}, effects", "tables such as [effects.churning]")
+    acting: Json = {}
+    scaled: dict[str, type[effects.Effect]] = {}
+    for name, table in present.items():
         if name not in {**effects.BESIDE, **library}:
-            raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {allowed_words(name, library)}")
-    tables = {name: table for name, table in present.items() if isinstance(table, dict)}
-    acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
-    factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
-    sized = {**effects.OF_TURNS, **effects.OF_CHANNELS, **library}
-    of_size = {name: _scaled_effect(sized, name, value, path.name) for name, value in factors.items()}
-    robot = add_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
-    parameters = dict(_flatten(content))
-    robot = rig_file.with_priors(change_robot(robot, parameters, where=path.name, notes=notes), sds, path.name)
-    return RobotFile(robot, str(path), frozenset(parameters), linear, text)
+            raise BadConfiguration(f"{where}, effects.{name}: no such effect; {allowed_words(name, library)}")
+        if isinstance(table, dict) and "configurations" in table:
+            acting[name] = table.pop("configurations")
+        if isinstance(table, dict) and FACTORS in table:
+            scaled[name] = _scaled_effect(library, name, table.pop(FACTORS), f"{where}, effects.{name}.{FACTORS}")
+    robot = add_effects(robot, tuple(present), {**library, **scaled}, acting, where)
+    parameters = input_files.flat_table(content)
+    robot = rig_file.with_priors(change_robot(robot, parameters, where), sds, where)
+    remarks = battery_remarks(robot, parameters, where)
+    return RobotFile(robot, str(path), frozenset(parameters), linear, text, remarks)
 
 
 def _robot_before_parameters(
@@ -241,7 +230,7 @@ def _robot_before_parameters(
         resolve_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.split_values_and_sds(tables, where)
-    values = dict(_flatten(tables))
+    values = input_files.flat_table(tables)
     sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
     loads, travels, linear, lacking = loads_from_tables(base, content, sds, where)
     rig = rig_file.parse_rig(content, where, list(loads), travels=travels, inherits=base is not None)
@@ -254,22 +243,21 @@ def _robot_before_parameters(
     if base is not None:
         robot = dataclasses.replace(base, configurations=Configurations(loads), rig=rig, controller=controller)
         return robot, sds, linear
-    robot = paper_robots.blank_robot(Configurations(loads), rig=rig)
-    robot = dataclasses.replace(robot, controller=controller)
-    robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
-    file_values = dict(_flatten(content))
-    parameters = params.parameters_by_name(robot)
-    resistance = file_values.get("motor.resistance", float(robot.motor.resistance))
+    robot = dataclasses.replace(paper_robots.blank_robot(Configurations(loads), rig=rig), controller=controller)
+    parameters, values = params.parameters_by_name(robot), input_files.flat_table(content)
+    defaults = {name: value for name, (value, _) in rig_file.DEFAULTS.items()}
+    resistance = values.get("motor.resistance", float(robot.motor.resistance))
     if isinstance(resistance, int | float):
         time_constant = rig_file.WINDING if rig.shows_voltage else rig_file.WINDING_AT_ONCE
-        robot = params.replace(robot, {"motor.inductance": params.as_float(time_constant * resistance)})
-    for name in file_values:
-        if "." not in name and name not in COUNTS:
+        defaults["motor.inductance"] = time_constant * resistance
+    robot = params.replace(robot, {name: params.as_float(value) for name, value in defaults.items()})
+    for name in values:
+        if "." not in name and name not in SETTINGS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
-    missing = [name for name in rig_file.required_parameters(rig, file_values.items()) if name not in file_values]
+    missing = [name for name in rig_file.required_parameters(rig, values) if name not in values]
     if not travels and "speed" in rig.channels:
-        missing += [f"{name}.radius" for name in loads if f"{name}.radius" not in file_values]
-    rig_file.reject_missing([*missing, *lacking], parameters, where, file_values)
+        missing += [f"{name}.radius" for name in loads if f"{name}.radius" not in values]
+    rig_file.reject_missing([*missing, *lacking], parameters, where, values)
     return robot, sds, linear
 
 
@@ -279,23 +267,23 @@ def _scaled_effect(library: Library, name: str, factors: Any, where: str) -> typ
     Raises:
         BadConfiguration: the scale is not three positive numbers, or the effect has no prior.
     """
-    table_place = f"{where}, effects.{name}.{FACTORS}"
-    if name not in library:
-        raise BadConfiguration(f"{table_place}: a curve or wave has no prior for its size; remove the key")
-    three = isinstance(factors, list) and len(factors) == 3
-    if not three or not all(is_number(x) and 0 < x < math.inf for x in factors):
+    effect = {**effects.OF_TURNS, **effects.OF_CHANNELS, **library}.get(name)
+    if effect is None:
+        raise BadConfiguration(f"{where}: a curve or wave has no prior for its size; remove the key")
+    is_list = isinstance(factors, list) and len(factors) == 3
+    if not is_list or not all(is_number(x) and 0 < x < math.inf for x in factors):
         raise BadConfiguration(
-            f"{table_place}: got {factors!r}; expected three factors above 0 on the library's values: [sd of the "
+            f"{where}: got {factors!r}; expected three factors above 0 on the library's values: [sd of the "
             "amplitude, shape, limits of the amplitude]"
         )
-    return scaled_effect(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
+    return scaled_effect(effect, (float(factors[0]), float(factors[1]), float(factors[2])))
 
 
 def add_effects(
     robot: Robot,
     names: Sequence[str],
     library: Library = effects.BY_NAME,
-    configurations: Mapping[str, Any] | None = None,
+    configurations: Json | None = None,
     where: str = "effects",
 ) -> Robot:
     """Robot with these effects of `library`, or curves, each with amplitude 0.
@@ -307,36 +295,31 @@ def add_effects(
     Raises:
         BadConfiguration: the configurations of an effect are no list of names, or the robot lacks one.
     """
-    library_with_built_in = {**effects.BESIDE, **library}
     present = []
     for name in names:
-        effect = library_with_built_in[name]()
+        effect, place = {**effects.BESIDE, **library}[name](), f"{where}, effects.{name}.configurations"
         acting = (configurations or {}).get(name, effect.configurations)
-        list_place = f"{where}, effects.{name}.configurations"
-        acting = stated_names(acting, list_place, f"a list of {', '.join(robot.configurations)}", least=0)
+        acting = stated_names(acting, place, f"a list of {', '.join(robot.configurations)}", least=0)
         for c in acting:
-            stated_word(c, robot.configurations, list_place)
+            stated_word(c, robot.configurations, place)
         present.append(dataclasses.replace(effect, configurations=acting))
     return dataclasses.replace(robot, effects=tuple(present))
 
 
-def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
-    """Robot with changed parameters, each of them checked. Also changes `sides`, `battery.cells`, RATINGS, SWITCHES
-    and CHOICES.
+def change_robot(robot: Robot, values: Mapping[str, Any], where: str) -> Robot:
+    """Robot with changed parameters and SETTINGS, each of them checked.
 
     Args:
         values: new values by dotted name [SI].
         where: beginning of the error message.
-        notes: as in `find_robot_file`.
 
     Raises:
         BadConfiguration: for the same reasons as `parse_robot_file`.
     """
     new_values = dict(values)
-    settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
-    ratings = {name: _check_setting(where, name, new_values.pop(name)) for name in settings if name in new_values}
+    settings = {name: _check_setting(where, name, new_values.pop(name)) for name in SETTINGS if name in new_values}
     if CURVE & new_values.keys() and "battery.capacity" in new_values:  # scaled to one cell, unless stated otherwise
-        ratings.setdefault("battery.capacity_curve", new_values["battery.capacity"])
+        settings.setdefault("battery.capacity_curve", new_values["battery.capacity"])
     parameters = params.parameters_by_name(robot)
     refused: dict[str, list[str]] = {}
     for name, value in new_values.items():
@@ -348,18 +331,29 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
             sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in new_values.items()})
-    robot = rig_file.recentre_priors(robot, new_values)
-    robot = dataclasses.replace(robot, sides=ratings.pop("sides", robot.sides))
-    for name, value in ratings.items():
+    priors = tuple((name, float(new_values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
+    rig = dataclasses.replace(robot.rig, priors=priors)  # centred on the new values
+    robot = dataclasses.replace(robot, sides=settings.pop("sides", robot.sides), rig=rig)
+    for name, value in settings.items():
         part, _, key = name.partition(".")
         robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
     _check_pairs(robot, where)
-    if notes is not None and "battery.voltage_cutoff" in values and (remark := power.cutoff_remark(robot.battery)):
-        notes.append(f"{where}, battery.voltage_cutoff: {remark}")
-    shapes = CURVE | {"battery.capacity_curve"}
-    if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
-        notes.append(f"{where}, battery.curvature: {remark}")
     return _add_required_states(robot, where)
+
+
+def battery_remarks(robot: Robot, changed: Collection[str], where: str) -> Names:
+    """Sentences on allowed but unlikely values of the battery, if a file or an option states them.
+
+    Args:
+        changed: names of the stated values.
+        where: beginning of the sentences.
+    """
+    remarks = {}
+    if "battery.voltage_cutoff" in changed:
+        remarks["voltage_cutoff"] = power.cutoff_remark(robot.battery)
+    if not (CURVE | {"battery.capacity_curve"}).isdisjoint(changed):
+        remarks["curvature"] = power.curve_remark(robot.battery)
+    return tuple(f"{where}, battery.{name}: {remark}" for name, remark in remarks.items() if remark)
 
 
 def _refusal_reason(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
@@ -385,10 +379,9 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
             key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
-            problem_text = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
             raise BadConfiguration(
-                f"{problem_text}; motor and load can then move relative to each other, so motor.inertia and "
-                f"{name}.inertia must be above 0"
+                f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}; motor and load can then move "
+                f"relative to each other, so motor.inertia and {name}.inertia must be above 0"
             )
     controller = robot.controller
     if controller is not None:
@@ -408,26 +401,17 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
 
 def _check_setting(where: str, name: str, value: Any) -> Any:
     """Checks and returns a count, a rating, a switch or a choice of a robot file."""
-    if name in SWITCHES:
-        allowed, expected = isinstance(value, bool), f"true or false ({SWITCHES[name]})"
-    elif name in CHOICES:
-        words, meaning = CHOICES[name]
-        allowed, expected = value in words, f"{' or '.join(words)} ({meaning})"
-    elif name in COUNTS:
-        low, high, meaning = COUNTS[name]
-        allowed = is_number(value) and value == value // 1 and low <= value <= high
-        value, expected = int(value) if allowed else value, f"a whole number, {low} to {high} {meaning}"
+    allowed, _, meaning = SETTINGS[name]
+    kind, text, number = type(allowed[0]), repr(value), ""
+    if kind in (bool, str):
+        is_allowed = isinstance(value, kind) and value in allowed
     else:
-        least, most, unit, meaning = RATINGS[name]
-        allowed = is_number(value) and least <= value <= most
-        value, expected = (
-            float(value) if is_number(value) else value,
-            f"a number, {least:g} to {most:g} {unit} ({meaning})",
-        )
-    if not allowed:
-        value_text = f"{value:g}" if name in RATINGS and is_number(value) else repr(value)
-        raise BadConfiguration(f"{where}, {name}: got {value_text}; expected {expected}")
-    return value
+        number = "a whole number, " if kind is int else "a number, "
+        is_allowed = is_number(value) and allowed[0] <= value <= allowed[-1] and value == kind(value)
+        text = f"{value:g}" if kind is float and is_number(value) else text
+    if not is_allowed:
+        raise BadConfiguration(f"{where}, {name}: got {text}; expected {number}{allowed_setting(name)} ({meaning})")
+    return kind(value)
 
 
 def _parameter_choices(name: str, known: Collection[str]) -> str:
@@ -478,18 +462,15 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
     if not inherits:
         defaults = {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()}
         base_robot = params.replace(paper_robots.blank_robot(robot.configurations), defaults)
-    pack = not inherits and robot.battery.cells == base_robot.battery.cells
-    tables: dict[str, list[str]] = {
-        "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
-        "motor": [],
-        "gearbox": [],
-    }
+    tables: dict[str, list[str]] = {"battery": [], "motor": [], "gearbox": []}
+    if inherits or robot.battery.cells != base_robot.battery.cells:
+        tables["battery"].append(f"cells = {robot.battery.cells}  # in series")
     head, rig_tables = rig_file.rig_lines(robot.rig)
     if rig_file.is_default_rig(robot.rig) and inherits and robot.has_ground:
         head, rig_tables = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
-        tables[name] = ['load = "shaft"'] if isinstance(load, Shaft) else [f'movers = "{moves}"']
+        tables[name] = ['load = "shaft"' if isinstance(load, Shaft) else f'movers = "{moves}"']
     for effect in robot.effects:
         table = tables[f"effects.{effect.name}"] = []
         if effect.configurations or type(effect)().configurations:
@@ -498,74 +479,56 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
             table.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
     for title, line in _lines_of_parameters(robot, base_robot):
         tables.setdefault(title, []).append(line)
-    for title, line in _rating_lines(robot, base_robot, {name for name, lines in tables.items() if lines}):
+    for title, line in _setting_lines(robot, base_robot, {name for name, lines in tables.items() if lines}):
         tables.setdefault(title, []).append(line)
     lines = [f"# {printable(line)}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if inherits else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors with the same command", *head]
     lines.append(f"configurations = {toml_value(list(robot.configurations))}")
     for title, table in {**tables, **rig_tables}.items():
-        if not (inherits or table or title in robot.configurations):
-            continue
-        lines += ["", f"[{title}]", *table]
+        if inherits or table or title in robot.configurations:
+            lines += ["", f"[{title}]", *table]
     write_text(path, "\n".join(lines) + "\n")
 
 
 def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
     """Table and line of each parameter that a file must state because it differs from the base robot."""
-    inherits = robot.rig.inherits
-    start = params.values_by_name(nothing)
-    needed = rig_file.required_parameters(robot.rig, params.values_by_name(robot).items())
+    inherits, start = robot.rig.inherits, params.values_by_name(nothing)
+    needed = {*rig_file.required_parameters(robot.rig, params.values_by_name(robot))}
+    needed |= {*nothing.rig.unknown} - {*robot.rig.unknown}
+    needed |= frozenset() if inherits else robot.rig.stated
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
-        table, _, key = parameter.name.rpartition(".")
-        spec, value = parameter.spec, float(parameter.value)
+        name, spec, value = parameter.name, parameter.spec, float(parameter.value)
+        table, _, key = name.rpartition(".")
         if table.startswith("rig."):  # the start of a table's runs is no property of the robot
             continue
-        was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
-        is_unchanged = value == was and not parameter.name.startswith(always) and parameter.name not in needed
-        is_unchanged &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
-        is_unchanged &= inherits or parameter.name not in robot.rig.stated
-        if is_unchanged and (not inherits or table == "rig"):
+        was = start.get(name, 0.0 if table.startswith("effects.") else None)
+        is_needed = value != was or name in needed or name.startswith(always)
+        if not is_needed and (not inherits or table == "rig"):
             continue
-        origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
-        origin = f"; {spec.source}" if value == was else origin
-        text = rig_file.value_text(parameter.name, value, robot.rig)
-        line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
-        yield table, f"{line}{origin}" if inherits else line
+        origin = ""
+        if inherits and was is not None:
+            origin = f"; {spec.source}" if value == was else f"; nominal {was:g}: {spec.source}"
+        text = rig_file.value_text(name, value, robot.rig)
+        yield table, f"{key} = {text}  # [{spec.unit}] {spec.meaning}{origin}"
 
 
-def _rating_lines(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
+def _setting_lines(robot: Robot, nothing: Robot, tables: set[str]) -> Iterator[tuple[str, str]]:
     """Table and line of each rating, switch and choice that differs from those of the base robot.
 
     Args:
-        stated: tables that already have an entry.
+        tables: tables that already have an entry.
     """
-    inherits = robot.rig.inherits
-
-    def value(owner: Robot, name: str) -> Any:
+    for name, (allowed, unit, meaning) in SETTINGS.items():
         part, _, key = name.partition(".")
-        return getattr(getattr(owner, part), key, None)
-
-    for name in (*RATINGS, *SWITCHES, *CHOICES):
-        part, _, key = name.partition(".")
-        setting, meaning = value(robot, name), SWITCHES.get(name, "")
-        differs = setting != value(nothing, name)
-        must_state = key == "capacity_curve" and part in stated  # otherwise it would follow from the capacity
-        if setting is None or not (differs or must_state or (inherits and name not in CHOICES)):
+        if isinstance(allowed, range):
             continue
-        stated = stated | {part}
-        if name in RATINGS:
-            _, _, unit, words = RATINGS[name]
-            meaning = f"[{unit}] {words if inherits else words.partition(';')[0]}"
-        elif name in CHOICES:
-            meaning = CHOICES[name][1]
-        yield part, f"{key} = {toml_value(setting)}  # {meaning}"
-
-
-def _flatten(content: Json, prefix: str = "") -> list[tuple[str, Any]]:
-    flat: list[tuple[str, Any]] = []
-    for key, value in content.items():
-        name = f"{prefix}{key}"
-        flat += _flatten(value, f"{name}.") if isinstance(value, dict) else [(name, value)]
-    return flat
+        setting, usual = (getattr(getattr(owner, part), key, None) for owner in (robot, nothing))
+        is_needed = setting != usual or (robot.rig.inherits and not isinstance(allowed[0], str))
+        is_needed |= key == "capacity_curve" and part in tables  # otherwise it would follow from the capacity
+        if setting is None or not is_needed:
+            continue
+        tables = tables | {part}
+        text = f"[{unit}] {meaning if robot.rig.inherits else meaning.partition(';')[0]}" if unit else meaning
+        yield part, f"{key} = {toml_value(setting)}  # {text}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, three_digits
+from calibration.data.input_errors import BadData, rows_text, three_digits
 from calibration.data.named_arrays import Check, check_rows
 from calibration.data.table import driven_on
 from mmrjax.model import channels
@@ -50,14 +50,9 @@ def reading_period(values: np.ndarray) -> float:
     Args:
         values: readings of a channel in one recording, in order of time, NaN if missing.
     """
-    values = values[np.isfinite(values)]
-    changed = np.flatnonzero(np.diff(values) != 0)
-    gaps = np.diff(changed)
-    if len(gaps) < FEWEST:
-        return 0.0
-    size = np.abs(np.diff(values)[changed])
-    smallest = size.min()
-    if (size <= 1.5 * smallest).mean() > STEPS:
+    changes = np.diff(values[np.isfinite(values)])
+    gaps, size = np.diff(np.flatnonzero(changes)), np.abs(changes[changes != 0])
+    if len(gaps) < FEWEST or (size <= 1.5 * size.min()).mean() > STEPS:
         return 0.0
     usual = float(np.median(gaps))
     near = gaps[gaps <= 1.5 * usual]
@@ -65,11 +60,8 @@ def reading_period(values: np.ndarray) -> float:
     if usual < APART or (gaps < usual - 1.5).mean() > SOONER or (usual < 3 and (gaps < APART).mean() > SOONER):
         return 0.0
     distance_to_multiple = np.abs(gaps - rows * np.maximum(np.round(gaps / rows), 1))
-    return (
-        rows
-        if (distance_to_multiple <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps)
-        else 0.0
-    )
+    is_regular = (distance_to_multiple <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR
+    return rows if is_regular and len(near) >= 0.5 * len(gaps) else 0.0
 
 
 def drop_repeated_readings(
@@ -89,21 +81,21 @@ def drop_repeated_readings(
     names = np.zeros(len(values), int) if run is None else np.unique(run, return_inverse=True)[1]
     order = np.lexsort((time, names))
     recordings = np.split(order, np.flatnonzero(np.diff(names[order])) + 1)
-    periods = [reading_period(values[rows]) for rows in recordings]
-    of_period = sum(len(rows) for rows, p in zip(recordings, periods, strict=True) if p)
-    true_periods = [p for p in periods if p]
-    if not true_periods or min(true_periods) < ALIKE * max(true_periods) or of_period < 0.5 * len(values):
+    periods = np.array([reading_period(values[rows]) for rows in recordings])
+    is_slow = periods > 0
+    of_period = sum(len(rows) for rows, slow in zip(recordings, is_slow, strict=True) if slow)
+    if not is_slow.any() or of_period < 0.5 * len(values) or periods[is_slow].min() < ALIKE * periods.max():
         return values, 0.0
-    rows_apart = float(np.median(true_periods))
+    rows_apart = float(np.median(periods[is_slow]))
     first_readings = np.full(len(values), np.nan)
     for rows in recordings:
         finite_rows = rows[np.isfinite(values[rows])]
         begins = np.flatnonzero(np.concatenate([[True], np.diff(values[finite_rows]) != 0]))[: len(finite_rows)]
         lengths = np.diff(np.append(begins, len(finite_rows)))
         times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # two readings may be equal
-        first = np.repeat(begins, times)
-        again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
-        nearest = finite_rows[np.minimum(first + np.round(again * rows_apart).astype(int), len(finite_rows) - 1)]
+        again = np.arange(times.sum()) - np.repeat(np.cumsum(times) - times, times)
+        first = np.repeat(begins, times) + np.round(again * rows_apart).astype(int)
+        nearest = finite_rows[np.minimum(first, len(finite_rows) - 1)]
         first_readings[nearest] = values[nearest]
     return first_readings, rows_apart
 
@@ -120,7 +112,8 @@ STILL = 0.02
 
 def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table may omit, and rejects values that contradict each other."""
-    _add_default_columns(name, columns, rows, layout)
+    if not layout.complete:
+        _add_default_columns(name, columns, rows, layout)
     check_rows(name, columns, _contradictions_in_rows(name, columns, layout))
     if "duty" in columns:
         columns["duty"] = np.nan_to_num(columns["duty"])
@@ -142,14 +135,8 @@ def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iter
         yield "duty", undriven, lambda row: f" in mode {modes[row]}; expected 0 or an empty cell"
     held = columns.get("held", np.zeros(1))
     yield "held", (held != 0) & (held != 1), "; expected 1 if a clamp holds the output, otherwise 0"
-    yield (
-        LOAD,
-        (held == 1) & (columns.get(LOAD, 0.0) != 0),
-        (
-            " although held is 1; expected 0, since the torque at a clamp is a reading: rename its column to "
-            "output_torque"
-        ),
-    )
+    why = "; expected 0, since the torque at a clamp is a reading: rename its column to output_torque"
+    yield LOAD, (held == 1) & (columns.get(LOAD, 0.0) != 0), f" although held is 1{why}"
     contradictions.check_commands_of_sides(name, columns, layout.sides, ("duty", "mode"))
     if "total_mass_kg" in columns:
         payload = columns["payload_kg"]
@@ -161,18 +148,15 @@ def _contradictions_in_rows(name: str, columns: Columns, layout: Layout) -> Iter
 
 def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     """False for each row of a log that repeats the row before it, shape (rows,), and a sentence on such rows."""
-    rows = len(next(iter(columns.values()), []))
-    is_distinct = np.full(rows, True)
+    is_distinct = np.full(len(next(iter(columns.values()), [])), True)
     if not set(TIME) <= set(columns):
         return is_distinct, ()
     again = np.flatnonzero(np.diff(columns["time_s"]) == 0) + 1
     for values in columns.values():
-        if not again.size:
-            return is_distinct, ()
-        values_after, values_before = values[again], values[again - 1]
-        is_equal = values_after == values_before
+        after, before = values[again], values[again - 1]
+        is_equal = after == before
         if values.dtype.kind == "f":
-            is_equal |= np.isnan(values_after) & np.isnan(values_before)
+            is_equal |= np.isnan(after) & np.isnan(before)
         again = again[is_equal]
     is_distinct[again] = False
     if not again.size:
@@ -196,37 +180,33 @@ def split_at_jumps(name: str, columns: Columns, at_rest: bool) -> Names:
     if not set(TIME) <= set(columns):
         return ()
     time = columns["time_s"]
-    run = columns.get("run_id", np.full(len(time), ""))
+    run = names = columns.get("run_id", np.full(len(time), ""))
     steps = np.where(run[1:] == run[:-1], np.diff(time), 0.0)
     usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
     jumps = np.flatnonzero((steps if at_rest else np.abs(steps)) > JUMP * usual) + 1
     if usual == 0 or not 0 < len(jumps) <= MOST_JUMPS:
         return ()
     first, rows = steps[jumps[0] - 1], ", ".join(str(k + 1) for k in jumps)
-    sentence = (
-        f"{name} row {rows}, time_s: {three_digits(abs(first))} s {'after' if first > 0 else 'earlier than'} the row "
-        f"before it, where {three_digits(usual)} s is usual. "
-    )
+    consequence = "A new run begins there"
     if at_rest:
-        return (
-            sentence
-            + (
-                'A fit keeps the imposed quantity constant there. If rows are missing, set start = "measured" '
-                "in the rig's file to begin a new run"
-            ),
+        consequence = (
+            'A fit keeps the imposed quantity constant there. If rows are missing, set start = "measured" in the '
+            "rig's file to begin a new run"
         )
-    for part, row in enumerate(jumps):
-        after = (np.arange(len(time)) >= row) & (run == run[row])
-        time = np.where(after, time - time[row], time)
-        run = np.where(after, f"{columns['run_id'][row] if 'run_id' in columns else ''} part {part + 2}".strip(), run)
-    columns |= {"time_s": time, "run_id": run}
-    return (sentence + "A new run begins there",)
+    else:
+        for part, row in enumerate(jumps, 2):
+            after = (np.arange(len(time)) >= row) & (run == run[row])
+            time = np.where(after, time - time[row], time)
+            run = np.where(after, f"{names[row]} part {part}".strip(), run)
+        columns |= {"time_s": time, "run_id": run}
+    return (
+        f"{name} row {rows}, time_s: {three_digits(abs(first))} s {'after' if first > 0 else 'earlier than'} the row "
+        f"before it, where {three_digits(usual)} s is usual. {consequence}",
+    )
 
 
 def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may omit: its only configuration, and conditions with their usual value."""
-    if layout.complete:
-        return
     if "configuration" not in columns and layout.configurations:
         labels = np.unique(columns.get("surface", np.zeros(0, str)))
         configuration = configuration_tables.common_configuration(layout.configurations, labels)
@@ -252,23 +232,24 @@ def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot
     Rows are then at least `CONSTANTS_APART` time constants apart. These are of the windings if a clamp holds the
     output in every row. Otherwise they are of the motors, and `_are_separate_settings` must be true.
     """
-    columns_left, time = dict(columns), columns.get("time_s")
-    if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
-        return columns_left, ()
+    time = columns.get("time_s", np.zeros(0))
     step = np.diff(time)
-    shortest_step, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
+    apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
     constant = windings if clamped else time_constant(robot)
-    if not math.inf > shortest_step >= CONSTANTS_APART * constant or not (
-        clamped or _are_separate_settings(columns, layout, shortest_step)
+    if (
+        len(time) < 3
+        or {"mode", *layout.sides} & set(columns)
+        or not math.inf > apart >= CONSTANTS_APART * constant
+        or not (clamped or _are_separate_settings(columns, layout, apart))
     ):
-        return columns_left, ()
-    for column in (*TIME, "run_id"):
-        columns_left.pop(column, None)
-    note = f"rows are {three_digits(shortest_step)} s or more apart, mostly at different settings"
-    settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
-    why = "the output is held in every row" if clamped else f"{note}{settle}"
-    return columns_left, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
+        return columns, ()
+    why = "the output is held in every row"
+    if not clamped:
+        settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" * (constant > 0)
+        why = f"rows are {three_digits(apart)} s or more apart, mostly at different settings{settle}"
+    columns = {c: values for c, values in columns.items() if c not in (*TIME, "run_id")}
+    return columns, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
 
 
 def _is_clamped(columns: Columns, layout: Layout) -> bool:
@@ -291,21 +272,20 @@ def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bo
     if not all(c.settled for c in present) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
         return False
     drive = columns[SUPPLY] * columns.get("duty", 1.0)
-    other_settings = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
+    acting = np.stack([np.ones(len(drive)), drive, *(columns[c] for c in settings if c not in (SUPPLY, "duty"))], 1)
+    return all(
+        _unexplained_squares(columns[c.column][1:], acting[1:])
+        <= 2 * _unexplained_squares(columns[c.column][1:], acting[:-1])
+        for c in present
+    )
 
-    def left(readings: np.ndarray, k: int) -> float:
-        return _unexplained_squares(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *other_settings)])
 
-    return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in present)
-
-
-def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
-    """Sum of squared residuals of the readings after a linear fit over the settings."""
-    a = np.stack([np.ones(len(readings)), *settings], 1)
+def _unexplained_squares(readings: np.ndarray, settings: np.ndarray) -> float:
+    """Sum of squared residuals of the readings after a linear fit over the settings, shape (rows, settings)."""
     is_finite = np.isfinite(readings)
     if is_finite.sum() < 3:
         return 0.0
-    a, readings = a[is_finite], readings[is_finite]
+    a, readings = settings[is_finite], readings[is_finite]
     return float(np.sum((readings - a @ np.linalg.lstsq(a, readings, rcond=None)[0]) ** 2))
 
 
@@ -333,9 +313,10 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     Raises:
         BadData: for the same reasons as `_driven_mask`, a turn on a slope, or a reading without its sign.
     """
-    driven, note = _driven_mask(name, columns, layout)
-    if note:
+    driven, notes = _driven_mask(name, columns, layout)
+    if notes:
         columns = {column: values[driven] for column, values in columns.items()}
+    checks = [] if set(layout.sides) & set(columns) else _missing_signs(columns, layout)
     if {*layout.sides, *HEADING} & set(columns):
         slope = columns["slope_deg"]
         sloped = int(np.count_nonzero(slope))
@@ -345,12 +326,11 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
             "these rows. To simulate one: simulate --model drive --left --right --slope"
         )
         check_rows(name, columns, [("slope_deg", slope, why)])
-    if not set(layout.sides) & set(columns):
-        check_rows(name, columns, _missing_signs(columns, layout))
-    return columns, driven, (note,) if note else ()
+    check_rows(name, columns, checks)
+    return columns, driven, notes
 
 
-def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
+def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, Names]:
     """True for rows of settled runs whose motors are driven, and a sentence on the other rows.
 
     Raises:
@@ -365,13 +345,13 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
         size = size * np.abs(columns[SUPPLY] if sides else columns.get("duty", 1.0))
     idle = np.flatnonzero(size == 0)
     if not idle.size:
-        return size != 0, ""
+        return size != 0, ()
     drive_columns = (column, *sides, *(["duty"] if "duty" in columns else []))
     zero = " and ".join(c for c in drive_columns if not columns[c][idle].any())
+    why = f" although {zero} is 0; give the command that drives it, or remove the row"
     for channel in (c for c in layout.channels if c.zero_at_rest and c.column in columns):
         readings = np.abs(np.nan_to_num(columns[channel.column]))
         moving = (size == 0) & (readings > STILL * np.max(readings))
-        why = f" although {zero} is 0; give the command that drives it, or remove the row"
         check_rows(name, columns, [(channel.column, moving & ~moving.all(), why)])
     if idle.size == len(size):
         clamp = (
@@ -384,56 +364,45 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
         )
     return size != 0, (
         f"{name}: {_rows_are(idle)} left out, since nothing drives the motors ({zero or column} is 0). Row numbers "
-        "do not count them"
+        "do not count them",
     )
 
 
 def _missing_signs(columns: Columns, layout: Layout) -> Iterator[Check]:
     """Checks for unsigned readings in rows that drive the robot backward."""
-    column = layout.imposed_column
-    imposed, unit = columns[column], column.split("_")[-1]
+    imposed, unit = columns[layout.imposed_column], layout.imposed_column.split("_")[-1]
     if layout.imposed == "voltage":
         imposed = imposed * columns.get("duty", 1.0)
 
     def place(end: str) -> Callable[[int], str]:
         return lambda row: f" at {imposed[row]:g} {unit}; {end}"
 
+    may_drive = layout.weight or "duty" in columns or driven_on(columns, layout).any()
     for channel in layout.channels:
         if channel.column not in columns or not channel.directed:
             continue
-        readings = columns[channel.column]
+        column, readings = channel.column, columns[channel.column]
         if layout.magnitude(channel.name):
-            yield (
-                channel.column,
-                readings < 0,
-                ("; expected no negative reading, since by the robot's file the instrument shows only the magnitude"),
-            )
+            why = "; expected no negative reading, since by the robot's file the instrument shows only the magnitude"
+            yield column, readings < 0, why
             continue
+        if may_drive and not channel.zero_at_rest:
+            continue  # the load may drive a motor; a reversing bridge also reverses the supply current
         # Downhill, gravity may drive a motor. Only uphill or on the flat do current and voltage have the same sign.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
-        if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
-            continue  # the load may drive a motor; a reversing bridge also reverses the supply current
         doubt = _sign_tolerance(columns, channel)
-        forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
-        forward &= channel.name != "motor_voltage"  # compared with the back-EMF instead
-        alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
-        yield (
-            channel.column,
-            forward & (readings < -doubt),
-            place(
+        if not channel.zero_at_rest and channel.name != "motor_voltage":  # that is compared with the back-EMF instead
+            alike = "" if channel not in channels.OF_TURNS else f"; for a turn, give {' and '.join(layout.sides)}"
+            why = (
                 "nothing else drives the motors, so the reading should have its sign; use one sign convention in all "
                 f"rows{alike}"
-            ),
-        )
-        if not _rises_through_zero(imposed, readings, backward):
-            advice = f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
-            yield (
-                channel.column,
-                backward & (readings > (doubt if layout.crosses_zero else 0.0)),
-                place(
-                    f"expected readings with their signs, negative in reverse{advice if layout.crosses_zero else ''}"
-                ),
             )
+            yield column, (imposed > 0) & (columns["slope_deg"] >= 0) & (readings < -doubt), place(why)
+        if not _rises_through_zero(imposed, readings, backward):
+            why = "expected readings with their signs, negative in reverse"
+            if layout.crosses_zero:
+                why += f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
+            yield column, backward & (readings > (doubt if layout.crosses_zero else 0.0)), place(why)
 
 
 def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.ndarray) -> bool:
@@ -460,41 +429,39 @@ def _sign_tolerance(columns: Columns, channel: Channel) -> np.ndarray | float:
 
 def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
     """Notes on missing channels and readings, on copies of rows, and on runs with several rows."""
-    for channel in layout.channels:
-        if channel.column not in columns:
+    for column in layout.measured_columns:
+        if column not in columns:
             if layout.complete:
-                yield f"{name}: no column {channel.column}, so this channel has no readings"
+                yield f"{name}: no column {column}, so this channel has no readings"
             continue
-        empty = np.flatnonzero(np.isnan(columns[channel.column]))
+        empty = np.flatnonzero(np.isnan(columns[column]))
         if empty.size:
-            count = f"{empty.size} of {len(columns[channel.column])}"
             yield (
-                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}. They are "
-                "ignored"
+                f"{name}: {empty.size} of {len(columns[column])} cells of {column} are empty, the first in row "
+                f"{empty[0] + 1}. They are ignored"
             )
+    if set(TIME) & set(columns):
+        return
     alike: dict[tuple[Any, ...], list[int]] = {}
-    settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
-    values_of_columns = [columns[column].tolist() for column in settled]
-    for row, cells in enumerate(zip(*values_of_columns, strict=True), 1):
+    cells_by_column = [columns[c].tolist() for c in columns if c not in ("run_id", *WHEN)]
+    for row, cells in enumerate(zip(*cells_by_column, strict=True), 1):
         alike.setdefault(cells, []).append(row)
-    if copied := [rows for rows in alike.values() if len(rows) > 1]:
+    copied = [rows for rows in alike.values() if len(rows) > 1]
+    if copied:
         others = f", as do {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
-            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and "
-            f"readings{others}. They count as repeats. Remove copies"
+            f"{name}: rows {copied[0][0]} and {copied[0][1]} have the same conditions and readings{others}. They "
+            "count as repeats. Remove copies"
         )
-    if "run_id" in columns and not set(TIME) & set(columns):
-        runs, times = np.unique(columns["run_id"], return_counts=True)
-        several = times > 1
-        if several.any():
-            run = runs[np.argmax(several)]
-            rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
-            row_words = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
-            others = f", and {several.sum() - 1} more run_ids are repeated" if several.sum() > 1 else ""
-            yield (
-                f"{name}: run_id {run} is in rows {row_words}{others}. Without {', '.join(TIME)} every row is a "
-                "separate run"
-            )
+    runs, times = np.unique(columns.get("run_id", np.zeros(0, str)), return_counts=True)
+    several = times > 1
+    if several.any():
+        run = runs[np.argmax(several)]
+        rows = rows_text(np.flatnonzero(columns["run_id"] == run).tolist(), 5, " and more").removeprefix("rows ")
+        others = f", and {several.sum() - 1} more run_ids are repeated" if several.sum() > 1 else ""
+        yield (
+            f"{name}: run_id {run} is in rows {rows}{others}. Without {', '.join(TIME)} every row is a separate run"
+        )
 
 
 def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:

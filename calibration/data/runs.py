@@ -18,6 +18,7 @@ import numpy as np
 from calibration.data import (
     Columns,
     Json,
+    Mapped,
     Names,
     clock,
     column_names,
@@ -32,7 +33,6 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
 from calibration.data.sources.columnar import EXPECTED
-from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
 from calibration.data.unused_readings import drop_computed_torques, without_held, without_unread
 from mmrjax.model import channels
@@ -76,13 +76,11 @@ def read_runs(
         BadConfiguration: the preset does not exist or has a mistake.
     """
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
-    preset = None
-    if columns is not None:
-        preset = (
-            presets_file.preset_of_table(columns)
-            if isinstance(columns, Mapping)
-            else presets_file.find_preset(columns)
-        )
+    preset = presets_file.NONE
+    if isinstance(columns, Mapping):
+        preset = presets_file.preset_of_table(columns)
+    elif columns is not None:
+        preset = presets_file.find_preset(columns)
     if isinstance(source, str | Path) and str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
             arrays, mapped = delimited.read_csv_columns(path, str(source)), layout.mapped
@@ -93,12 +91,12 @@ def read_runs(
         if is_plain_file and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         arrays, mapped = reading.read_columns(source, layout, preset, between)
-    has_known_columns = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
-    if not has_known_columns and (name := presets_file.recognise_preset(arrays.header)):
-        numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
+    is_known = bool(preset.columns) or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
+    if not is_known and (name := presets_file.recognise_preset(arrays.header)):
+        option = name + "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(
             f"{arrays.name}: has no column with a known name, but its columns match the preset {name}; add --columns "
-            f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
+            f'{option}, in Python columns="{option}"'
         )
     return runs_of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
 
@@ -128,7 +126,6 @@ def runs_of_arrays(
             Values contradict each other or the robot. A value is no number, not finite or out of range. The message
             has source, row, column, value and allowed values.
     """
-    inferred = robot is None
     name, layout = arrays.name, Layout.of(robot)
     if mapped is not None:
         layout = dataclasses.replace(layout, mapped=mapped)
@@ -136,59 +133,61 @@ def runs_of_arrays(
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
     header, layout, capitals = column_names.match_column_names(
-        name, arrays.header, layout, inferred=inferred, of_turns=of_turns
+        name, arrays.header, layout, inferred=robot is None, of_turns=of_turns
     )
     meanings = layout.meanings(name, header)
     column_names.check_header(name, header, meanings, measured, battery, layout)
-    if measured and not inferred:
+    if measured and robot is not None:
         column_names.check_has_time(name, header, meanings, layout)
     column_names.check_units(arrays, meanings)
     if not len(arrays):
         raise BadData(f"{name}: a header without rows; expected at least one run")
     arrays = clock.drop_empty_rows(arrays, meanings)
     columns, changed = _column_values(arrays, meanings, layout, battery)
-    settled: Names = ()
+    notes = [*arrays.notes]
     if measured and robot is not None:
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
-    notes = (*arrays.notes, *settled, *contradictions.duties_from_side_voltages(name, columns, battery))
+        notes += settled
+    notes += contradictions.duties_from_side_voltages(name, columns, battery)
     is_kept, copied = row_checks.distinct_rows(name, columns)
     columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
-        begins = () if robot is None else row_checks.split_at_jumps(name, columns, robot.rig.start == STARTS[0])
-        notes = (*notes, *copied, *begins, *_drop_repeats(name, columns, layout))
-    table_instruments = inferred_facts.infer_instruments(layout.instruments, columns)
+        notes += copied
+        if robot is not None:
+            notes += row_checks.split_at_jumps(name, columns, robot.rig.start == STARTS[0])
+        notes += _drop_repeats(name, columns, layout)
+    instruments = inferred_facts.infer_instruments(layout.instruments, columns)
     unsigned = contradictions.unsigned_current_channels(columns, layout) if measured else ()
-    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in table_instruments})
-    layout = dataclasses.replace(layout, instruments=(*table_instruments, *unsigned))
+    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in instruments})
+    layout = dataclasses.replace(layout, instruments=(*instruments, *unsigned))
     row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
     elif measured and not set(TIME) <= set(columns):  # histories may stop or roll against the motors
         columns, driven, left_out = row_checks.driven_rows(name, columns, layout)
         is_kept[is_kept] = driven
-        notes = (*notes, *left_out)
+        notes += left_out
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, is_kept.sum() + 1)
-    extras = {
-        c: _values_without_role(raw)[is_kept]
-        for c, m, raw in zip(header, meanings, arrays.values, strict=True)
-        if m is None
-    }
-    notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
-    notes = (*notes, *(
+    unread = {c: raw for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None}
+    extras = {column: _values_without_role(raw)[is_kept] for column, raw in unread.items()}
+    notes += [*capitals, *changed]
+    if measured:
+        notes += row_checks.missing_data_notes(name, columns, layout)
+    notes += [
         f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward, so "
-        "magnitudes are compared" for i in unsigned
-    ))  # fmt: skip
-    notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
+        "magnitudes are compared"
+        for i in unsigned
+    ]
+    notes += row_checks.driven_backward_notes(name, columns, layout)
     if measured and robot is not None:
-        unread = {c for c, m in zip(header, meanings, strict=True) if m is None}
-        notes = (*notes, *column_names.unread_channel_notes(name, robot, unread))
+        notes += column_names.unread_channel_notes(name, robot, unread)
     headings = {m.column: m.shown for m in meanings if m is not None}
-    runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
-    if robot is not None:
-        runs = contradictions.check_contradictions(runs, robot)
-        runs = drop_computed_torques(without_held(without_unread(runs, robot)), robot)
-    return runs
+    runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, tuple(notes), headings)
+    if robot is None:
+        return runs
+    runs = contradictions.check_contradictions(runs, robot)
+    return drop_computed_torques(without_held(without_unread(runs, robot)), robot)
 
 
 def _column_values(
@@ -203,25 +202,22 @@ def _column_values(
     for j, (meaning, raw) in enumerate(zip(meanings, arrays.values, strict=True)):
         if meaning is None:
             continue
+        changed: Names = ()
         if meaning.column == "configuration":
-            raw, more = _match_configuration_case(arrays.name, column_texts(raw), layout)
-            notes += more
+            raw, changed = _match_configuration_case(arrays.name, column_texts(raw), layout)
         if meaning.column in TIME:
             runs = column_texts(by_name["run_id"]) if "run_id" in by_name else None
-            raw, more_notes = clock.time_since_start(arrays.name, meaning, raw, runs)
-            notes += more_notes
-        on_battery = battery and meaning.column == SUPPLY and layout.imposed == "voltage"
-        if on_battery or meaning.column in layout.idle:
+            raw, changed = clock.time_since_start(arrays.name, meaning, raw, runs)
+        notes += changed
+        if (battery and meaning.column == SUPPLY and layout.imposed == "voltage") or meaning.column in layout.idle:
             _reject_readings(arrays, meaning, raw, layout)
-        else:
-            columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
-            wrong = np.flatnonzero(refused).tolist()
-            count += len(wrong)
-            for k in wrong[:LISTED]:
-                refusal = column_names.refused_cell_sentence(
-                    arrays.row(k), meaning, column_texts(raw[k : k + 1])[0], layout
-                )
-                bad.append((k, j, refusal))
+            continue
+        columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
+        wrong = np.flatnonzero(refused).tolist()
+        count += len(wrong)
+        for k in wrong[:LISTED]:
+            cell = column_texts(raw[k : k + 1])[0]
+            bad.append((k, j, column_names.refused_cell_sentence(arrays.row(k), meaning, cell, layout)))
     if bad:
         raise BadData(_join_cell_messages(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
     return columns, tuple(notes)
@@ -234,16 +230,14 @@ def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
         said: messages, at least the first `LISTED`.
         count: number of rejected cells.
     """
-    first_message, *other_messages = said
-    if not other_messages:
-        return first_message
-    more, repeats = list[str](), {first_message.partition(";")[2]}
-    for sentence in other_messages[: LISTED - 1]:
+    first, *others = said
+    more, repeats = list[str](), {first.partition(";")[2]}
+    for sentence in others[: LISTED - 1]:
         cell_message, _, cure = sentence.removeprefix(f"{name} ").partition(";")
         more.append(cell_message if cure in repeats else f"{cell_message};{cure}")
         repeats.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
-    return f"{first_message}; also {'; '.join(more)}{rest}"
+    return f"{first}; also {'; '.join(more)}{rest}" if more else first
 
 
 def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
@@ -261,15 +255,14 @@ def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
             )
 
 
-def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:
+def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], Names]:
     """Names of configurations with the capitals of the robot file, and notes on changed names."""
     meant = {c.casefold(): c for c in layout.configurations}
     if len(meant) < len(layout.configurations):  # the names differ only in capitals
-        return cells, []
-    unknown_names = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
-    renamed = {c: meant[c.casefold()] for c in unknown_names if c.casefold() in meant}
-    notes = [f"{name}: configuration {c} is read as {right}" for c, right in renamed.items()]
-    return [renamed.get(c, c) for c in cells] if renamed else cells, notes
+        return cells, ()
+    renamed = {c: meant.get(c.casefold(), c) for c in dict.fromkeys(cells)}
+    notes = tuple(f"{name}: configuration {c} is read as {right}" for c, right in renamed.items() if c != right)
+    return [renamed[c] for c in cells], notes
 
 
 def _values_without_role(raw: Raw) -> np.ndarray:
@@ -283,18 +276,18 @@ def _values_without_role(raw: Raw) -> np.ndarray:
 
 def _reject_readings(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
     """Rejects a supply voltage on a battery, and a condition other than 0 that does not act on the robot's load."""
-    given = ~missing_readings(raw, np.arange(len(raw)))
+    is_given = ~missing_readings(raw, np.arange(len(raw)))
     if meaning.column == SUPPLY:
         why = " together with --battery, whose charge sets the voltage; leave the cell empty or remove the column"
     else:
-        given &= column_numbers(raw) != 0
+        is_given &= column_numbers(raw) != 0
         why = (
-            f"; {NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
-            if layout.has_ground
-            else "; the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or "
-            "describe the load as a vehicle"
+            "; the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or describe "
+            "the load as a vehicle"
         )
-    for row in np.flatnonzero(given)[:1].tolist():
+        if layout.has_ground:
+            why = f"; {NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
+    for row in np.flatnonzero(is_given)[:1].tolist():
         raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {column_texts(raw[row : row + 1])[0]}{why}")
 
 
@@ -308,20 +301,19 @@ def single_run(cells: Json, layout: Layout | None) -> Runs:
     Raises:
         BadConfiguration: an option is out of range or not finite, or is an unknown word.
     """
-    layout = Layout() if layout is None else layout
-    rows = layout.quantities()
+    layout = layout or Layout()
+    quantities = layout.quantities()
     columns: Columns = {}
     for column, value in cells.items():
-        quantity = rows[column]
-        meaning = Column(quantity, column, next(iter(quantity.units)))
+        meaning = Column(quantities[column], column, next(iter(quantities[column].units)))
         text = f"{value:g}" if isinstance(value, float) else str(value)
-        columns[column], refused = column_names.convert_column(meaning, [text], layout)
+        converted, refused = column_names.convert_column(meaning, [text], layout)
         if refused.any():
             raise BadConfiguration(column_names.refused_cell_sentence("option", meaning, text, layout, hints=False))
+        columns[column] = np.array([value]) if isinstance(value, float) else converted  # with all digits
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
         total = f"option, total_mass_kg: got {cells['total_mass_kg']:g}"
         raise BadConfiguration(total + row_checks.too_light(cells["payload_kg"]))
-    columns = {c: np.array([cells[c]]) if isinstance(cells.get(c), float) else v for c, v in columns.items()}
     return Runs("the options", columns, layout=layout)

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -172,22 +172,18 @@ class Settled:
         """Settled runs as columns of a table of runs."""
         stretches = self.kept
         columns: Columns = {}
-        means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
-        read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
-        read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}
-        for name, column in means.items():
-            if name in read or name == "mode" or (name == SPEED and self.runs.turns):
-                continue
-            if column.dtype.kind == "f":
-                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in stretches])
-            else:
-                columns[name] = np.array([str(column[s.rows[0]]) for s in stretches])
-        for signal in self.signals:
-            name = signal.channel.name
-            if not any(math.isfinite(s.mean[name]) for s in stretches):
-                continue
-            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in stretches])
-            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in stretches])
+        means = self.runs.columns | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
+        omitted = {s.channel.column for s in self.signals} | {c.sd_column for c in channels.EVERY}
+        omitted |= {"time_s", "order", "run_id", "mode", *(angle for angle, _, _ in RATES)}
+        omitted |= {SPEED} if self.runs.turns else set()
+        for name in (name for name in means if name not in omitted):
+            cells = [means[name][s.rows] for s in stretches]
+            is_number = means[name].dtype.kind == "f"
+            columns[name] = np.array([_digits(_plain(x)) if is_number else str(x[0]) for x in cells])
+        for channel in (s.channel for s in self.signals):
+            if any(math.isfinite(s.mean[channel.name]) for s in stretches):
+                columns[channel.column] = np.array([_digits(s.mean[channel.name]) for s in stretches])
+                columns[channel.sd_column] = np.array([_digits(s.sd[channel.name], 3) for s in stretches])
         columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in stretches])
         columns["order"] = np.arange(1.0, len(stretches) + 1)
         return columns
@@ -229,7 +225,8 @@ def settle_log(
     result = _divide_log(runs, shortest, drift, {} if robot is None else acceleration_currents(robot))
     if not result.kept:
         raise BadData(_nothing_settled_message(result))
-    _check_signs(result)  # from their own sds, because repeats with different signs widen the final ones
+    if doubt := _sign_doubt(result):  # from their own sds, because repeats with different signs widen the final ones
+        raise BadData(doubt)
     if robot is not None and not runs.turns:  # the sides of a turn have different speeds
         _check_units(result, rolling_readings(robot))
     return dataclasses.replace(
@@ -244,14 +241,9 @@ def settle_log(
 def doubtful_sign(runs: Runs) -> str:
     """Reason to doubt the sign of a channel, from the settled stretches, empty without evidence."""
     try:
-        result = _divide_log(runs, None, DRIFT, {})
+        return _sign_doubt(_divide_log(runs, None, DRIFT, {}))
     except BadData:  # a log without a stretch
         return ""
-    try:
-        _check_signs(result)
-    except BadData as error:
-        return str(error)
-    return ""
 
 
 def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia]) -> Settled:
@@ -263,28 +255,24 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
     rows_by_run = _in_order(runs)
     step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in rows_by_run])))
     shortest = max(LEAST, 20 * step) if shortest is None else shortest
-    half = max(1, round(shortest / 6 / step))
     drives = applied_drive(runs)
     gaps: list[int] = []
     levels: list[np.ndarray] = []
-    divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
     for rows in rows_by_run:
         rows_of_gaps = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
-        gaps += [int(rows[k]) for k in rows_of_gaps]
-        for part in np.split(rows, rows_of_gaps + 1):
-            found_in = [part]
-            for driver in divided_by:
-                found_in = [x for level in found_in for x in _levels_of(runs, driver, level, shortest, drift, step)]
-            levels += found_in
-    signals = _settled_signals_of_log(runs, rows_by_run, levels, half, drift)
+        gaps += rows[rows_of_gaps].tolist()
+        levels += np.split(rows, rows_of_gaps + 1)
+    for driver in (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else [])):
+        levels = [x for level in levels for x in _levels_of(runs, driver, level, shortest, drift, step)]
+    signals = _settled_signals_of_log(runs, rows_by_run, levels, max(1, round(shortest / 6 / step)), drift)
     for signal in signals:
         _check_alive(runs, signal)
-    stuck = {s.channel.name: _stuck_rows(s, rows_by_run) for s in signals}
-    stretches = [
+    stuck = np.array([_stuck_rows(s, rows_by_run) for s in signals])
+    stretches = tuple(
         _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia) for level in levels
-    ]
+    )
     scatter = _scatter_of(runs, stretches, signals, float(np.max(np.abs(drives))))
-    return Settled(runs, tuple(stretches), signals, shortest, drift, tuple(gaps), scatter)
+    return Settled(runs, stretches, signals, shortest, drift, tuple(gaps), scatter)
 
 
 # --- time and channels ----------------------------------------------------------------------------------
@@ -307,7 +295,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             if steps[k] < 0:
                 raise time_goes_back(runs, *rows[k : k + 2])
             raise BadData(
-                f"{runs.source} row {rows[k + 1] + 1}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
+                f"{runs.place(rows[k + 1])}, time_s: {time[rows[k]]:g} s is repeated; give each sample its "
                 "own time, with more digits if available, or remove one of them"
             )
     if max(map(len, rows_by_run)) < FEWEST:
@@ -322,37 +310,31 @@ def _settled_signals_of_log(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
     """Returns the readings of each channel of settled runs. If only an angle is measured, its rate."""
-    no_angle, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
-    signals = []
-    for c in runs.channels:
-        if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
-            is_glitch = find_glitches(
-                runs[c.column], levels, width, _step_of_instrument(runs, c, runs[c.column]), drift
-            )
-            readings = np.where(is_glitch, np.nan, runs[c.column])
-            signals.append(
-                Signal(
-                    c, readings, no_angle, _step_of_instrument(runs, c, readings), _reading_size(readings), is_glitch
-                )
-            )
-    have = {s.channel.name for s in signals}
+    width = min(max(6 * half, BESIDE[0]), BESIDE[1])
+    sources = [
+        (c, c, 0.0) for c in runs.channels if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any()
+    ]
+    read_directly = {c.name for c, _, _ in sources}
     for angle, rate, factor in RATES:
-        if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
-            smoothed_values = np.full(len(runs), np.nan)
-            readings = np.full(len(runs), np.nan)
-            read = next(c for c in runs.channels if c.column == angle)
-            is_glitch = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
+        if rate not in read_directly and runs.has(angle):
+            sources += [(channels.find_channel(rate), c, factor) for c in runs.channels if c.column == angle]
+    signals = []
+    for channel, source, factor in sources:
+        raw = runs[source.column]
+        is_glitch = find_glitches(
+            raw, levels, width, _step_of_instrument(runs, source, raw), None if factor else drift
+        )
+        readings, angles, step = np.where(is_glitch, np.nan, raw), np.zeros(0), 0.0
+        if factor:
+            angles, readings = readings * factor, np.full(len(runs), np.nan)
             for rows in each:
-                smoothed_values[rows] = np.where(is_glitch[rows], np.nan, runs[angle][rows] * factor)
                 # rate over the last `2 * half` samples, so that samples after a level do not affect its end
-                time, x, k = runs["time_s"][rows], smoothed_values[rows], np.arange(len(smoothed_values[rows]))
+                time, x, k = runs["time_s"][rows], angles[rows], np.arange(len(rows))
                 first_row, last_row = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
                 readings[rows] = (x[last_row] - x[first_row]) / (time[last_row] - time[first_row])
-            signals.append(
-                Signal(
-                    channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), is_glitch
-                )
-            )
+        else:
+            step = _step_of_instrument(runs, channel, readings)
+        signals.append(Signal(channel, readings, angles, step, _reading_size(readings), is_glitch))
     if not signals:
         raise BadData(f"{runs.source}: no channel has readings that can be used for settled runs")
     return tuple(signals)
@@ -436,16 +418,14 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
 def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
     """Rows in which a channel repeats one number for longer than noise allows: saturated or frozen."""
     is_stuck = np.zeros(len(signal.shown), bool)
-    if len(signal.angle):
-        return is_stuck
-    for rows in each:
+    for rows in each if not len(signal.angle) else ():
         readings = signal.shown[rows]
         repeats = np.diff(readings) == 0
-        if not len(repeats) or repeats.mean() > CHANCE:
-            limits = (np.nanmin(readings), np.nanmax(readings))  # coarse steps, or at its limit
-            repeats_inside = repeats & ~np.isin(readings[1:], limits)
-            if not len(repeats) or repeats_inside.mean() > CHANCE:
-                continue
+        if not len(repeats):
+            continue
+        is_limit = np.isin(readings[1:], (np.nanmin(readings, initial=np.inf), np.nanmax(readings, initial=-np.inf)))
+        if (repeats & ~is_limit).mean() > CHANCE:  # coarse steps
+            continue
         edges = np.flatnonzero(np.diff(np.concatenate([[0], repeats.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
             if high - low >= STUCK and readings[low] != 0:
@@ -454,12 +434,6 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
 
 
 # --- levels and stretches -------------------------------------------------------------------------------
-
-
-def _change_noise(x: np.ndarray) -> float:
-    """Sd of changes from sample to sample, robust to steps, 0 if most samples equal the sample before."""
-    steps = np.diff(x[np.isfinite(x)])
-    return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / math.sqrt(2) if len(steps) else 0.0
 
 
 def _levels_of(
@@ -474,32 +448,26 @@ def _levels_of(
     cuts = differs_from_row_before(rows, (runs[name] for name in EXACT if runs.has(name)))
     cuts[0] = True
     x = drives[rows]
-    largest, noise = float(np.max(np.abs(drives))), _change_noise(x)
+    changes = np.diff(x[np.isfinite(x)])
+    largest, noise = float(np.max(np.abs(drives))), 0.0
+    if len(changes):  # robust to steps, 0 if most samples equal the sample before
+        noise = 1.4826 * float(np.median(np.abs(changes - np.median(changes)))) / math.sqrt(2)
     size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
-    sd = noise / math.sqrt(size)
     begin, mean, count = 0, float(x[0]), 0
     starts = np.arange(0, len(rows), size)
     sizes = np.diff(starts, append=len(rows))
     # Lists are faster here, and a log may have a million rows.
-    blocks = ((np.add.reduceat(x, starts) / sizes).tolist(), np.logical_or.reduceat(cuts, starts).tolist())
-    for k, more, value, cut in zip(starts.tolist(), sizes.tolist(), *blocks, strict=True):
-        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * sd)
+    blocks = (starts, sizes, np.add.reduceat(x, starts) / sizes, np.logical_or.reduceat(cuts, starts))
+    for k, more, value, cut in zip(*(block.tolist() for block in blocks), strict=True):
+        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * noise / math.sqrt(size))
         if count and (abs(value - mean) > tolerance or cut):
             # the last averaged samples may belong to the next level
             yield rows[begin : k - size if size > 1 and k - begin > 3 * size else k]
             begin, mean, count = k, value, more
-            continue
-        mean = (mean * count + value * more) / (count + more)
-        count += more
+        else:
+            mean = (mean * count + value * more) / (count + more)
+            count += more
     yield rows[begin:]
-
-
-#: End of a level, before the test whether it is settled: its rows, the mean, sd and change of each channel by name
-#: [unit of the column], the largest significant change of a channel as a share, and the number of readings that the
-#: mean of each channel omits.
-_End = tuple[np.ndarray, dict[str, tuple[float, float, float]], float, dict[str, int]]
-#: Reason why a level has no settled end: one of `REASONS`, the channel responsible, and the size as a share.
-_Why = tuple[str, str, float]
 
 
 def _settled_end(
@@ -510,16 +478,16 @@ def _settled_end(
     shortest: float,
     drift: float,
     step: float,
-    stuck: Columns,
+    stuck: np.ndarray,
     inertia: Mapping[str, Inertia],
 ) -> Stretch:
     """The settled end of a level, or the reason why it has none."""
     time = runs["time_s"]
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
-    unsettled_stretch = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
+    level = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
 
     def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
-        return dataclasses.replace(unsettled_stretch, why=why, channel=channel, size=size)
+        return dataclasses.replace(level, why=why, channel=channel, size=size)
 
     if runs.has("mode") and str(runs["mode"][rows[0]]) != "voltage":
         return out("undriven")
@@ -527,143 +495,107 @@ def _settled_end(
         return out("changes" if len(rows) < FEWEST else "short")
     if abs(imposed) <= STILL * float(np.max(np.abs(drives))):
         return out("idle")
-    for signal in signals:
-        if stuck[signal.channel.name][rows].mean() > 0.5:
-            return out("stuck", signal.channel.name)
-    best_end = _best_end(signals, time, rows, shortest, drift)
-    unsettled, left_over = _unsettled(signals, rows, best_end, drift)
-    end_rows, end_means, _, end_glitches = best_end
-    if unsettled is not None:
-        return out(*unsettled)
-    finite_means = {name: x for name, x in end_means.items() if math.isfinite(x[0])}
-    if not finite_means:
+    names = [s.channel.name for s in signals]
+    for name, is_stuck in zip(names, stuck, strict=True):
+        if is_stuck[rows].mean() > 0.5:
+            return out("stuck", name)
+    end_rows, means, left_over = _best_end(signals, time, rows, shortest, drift)
+    glitches = [int(s.glitches[end_rows].sum()) for s in signals]
+    for signal, (mean, sd, change), count in zip(signals, means, glitches, strict=True):
+        if count > MOST_GLITCHES * len(end_rows):
+            return out("glitches", signal.channel.name, count / len(end_rows))
+        if not math.isfinite(mean):
+            continue
+        if abs(change) > max(drift * abs(mean), FINE * signal.largest) + SDS * OF_CHANGE * sd:
+            return out("settling", signal.channel.name, abs(change) / max(abs(mean), FINE * signal.largest))
+        to_come = _to_come(signal, rows, mean)
+        if to_come > drift:
+            return out("settling", signal.channel.name, to_come)
+        left_over = max(left_over, to_come)
+    if np.isnan(means).all():
         return out("unread")
-    moving = [
-        s
-        for s in signals
-        if s.channel.zero_at_rest and s.channel.name in finite_means and s.channel.name not in OF_YAW
+    is_moving = [
+        abs(mean) >= max(STILL * s.largest, SDS * sd)
+        for s, (mean, sd, _) in zip(signals, means, strict=True)
+        if s.channel.zero_at_rest and s.channel.name not in OF_YAW and math.isfinite(mean)
     ]
-    ends = [(s, *finite_means[s.channel.name][:2]) for s in moving]
-    if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
+    if is_moving and not any(is_moving):
         return out("rest")
-    inertia_of_configuration = inertia.get(str(runs["configuration"][rows[0]]))
-    lasts = float(time[end_rows[-1]] - time[end_rows[0]])
-    if (
-        inertia_of_configuration is not None
-        and (accelerates := _acceleration_reason(inertia_of_configuration, finite_means, lasts, imposed, drift))
-        is not None
-    ):
-        return out(*accelerates)
-    values_by_channel = {s.channel.name: finite_means.get(s.channel.name, (math.nan,) * 3) for s in signals}
+    by_name = {name: x for name, x in zip(names, means.tolist(), strict=True) if math.isfinite(x[0])}
+    speed, current, per_rate, least = inertia.get(str(runs["configuration"][rows[0]]), ("", "", 0.0, 0.0))
+    if speed in by_name and (not current or current in by_name):
+        a_second = per_rate / float(time[end_rows[-1]] - time[end_rows[0]])
+        _, sd, change = by_name[speed]
+        full_scale = max(abs(by_name[current][0] if current else imposed), least)
+        share, noise = abs(a_second * change) / full_scale, OF_CHANGE * abs(a_second * sd) / full_scale
+        if share > drift + SDS * noise:
+            return out("accelerates", speed, share)
+    mean, sd, change = means.T
     # The tail of a lag would continue by about as much again after the end, in all channels.
-    further = {s.channel.name: left_over * _scale_of(s, values_by_channel[s.channel.name][0]) for s in signals}
+    sd = np.hypot(sd, left_over * _scales(signals, mean))
     return dataclasses.replace(
-        unsettled_stretch,
+        level,
         rows=end_rows,
         begin=float(time[end_rows[0]]),
-        mean={name: mean for name, (mean, _, _) in values_by_channel.items()},
-        sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in values_by_channel.items()},
-        drift={name: change for name, (_, _, change) in values_by_channel.items()},
-        glitches={name: count for name, count in end_glitches.items() if count},
+        mean=dict(zip(names, mean.tolist(), strict=True)),
+        sd=dict(zip(names, sd.tolist(), strict=True)),
+        drift=dict(zip(names, change.tolist(), strict=True)),
+        glitches={name: count for name, count in zip(names, glitches, strict=True) if count},
     )
 
 
-def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
+def _best_end(
+    signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Final part of a level, with the length that gives the most certain means: longer parts average out more noise,
     shorter parts drift less.
+
+    Returns:
+        Its rows. Mean, sd and change of each channel [unit of the column], shape (channels, 3). The largest change
+        beyond noise, as a share of `_scales`.
     """
     parts = _level_parts(time[rows], shortest)
     first_part = _first_steady(signals, rows, parts, drift)
     last_part = max(len(parts) - 3, first_part)
-    ends: list[tuple[float, _End]] = []
+    ends = []
     for k in sorted({first_part, *np.linspace(first_part, last_part, TRIES).astype(int).tolist()}):
         end_rows = rows[parts[k][0] :]
-        end_means = {s.channel.name: _segment_mean(s, time[end_rows], end_rows) for s in signals}
-        left_over = max(_certain_change(s, *end_means[s.channel.name]) for s in signals)
-        sds = [
-            sd / _scale_of(s, mean)
-            for s in signals
-            for mean, sd, _ in (end_means[s.channel.name],)
-            if math.isfinite(mean)
-        ]
-        glitches = {s.channel.name: int(s.glitches[end_rows].sum()) for s in signals}
-        ends.append((math.hypot(max(sds, default=0.0), left_over), (end_rows, end_means, left_over, glitches)))
+        means = np.array([_segment_mean(s, time[end_rows], end_rows) for s in signals])
+        mean, sd, change = means.T
+        scales = _scales(signals, mean)
+        left_over = float(np.nanmax(np.maximum(np.abs(change) - OF_CHANGE * sd, 0.0) / scales, initial=0.0))
+        ends.append((math.hypot(np.nanmax(sd / scales, initial=0.0), left_over), (end_rows, means, left_over)))
         if left_over <= SLIGHT * drift:
             break
     return min(ends, key=lambda end: end[0])[1]
 
 
-def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: float) -> tuple[_Why | None, float]:
-    """Reason why the end of a level is not settled (None if it is), and the largest change of a channel.
-
-    The change is a share, within the end or expected after it.
-    """
-    end_rows, end_means, left_over, glitches = end
-    for signal in signals:
-        name = signal.channel.name
-        share = glitches[name] / len(end_rows)
-        if share > MOST_GLITCHES:
-            return ("glitches", name, share), left_over
-        mean, sd, change = end_means[name]
-        if not math.isfinite(mean):
-            continue
-        tolerance = max(drift * abs(mean), FINE * signal.largest)
-        if abs(change) > tolerance + SDS * OF_CHANGE * sd:
-            return ("settling", name, abs(change) / max(abs(mean), FINE * signal.largest)), left_over
-        if (to_come := _to_come(signal, rows, mean)) > drift:
-            return ("settling", name, to_come), left_over
-        left_over = max(left_over, to_come)
-    return None, left_over
-
-
-def _acceleration_reason(
-    acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
-) -> _Why | None:
-    """Reason if acceleration takes too large a share of the current, otherwise None. `lasts`: duration [s]."""
-    speed, current, per_rate, least = acting
-    if speed not in seen or (current and current not in seen):
-        return None
-    a_second = per_rate / lasts
-    _, sd, change = seen[speed]
-    full_scale = max(abs(seen[current][0] if current else imposed), least)
-    share, noise = abs(a_second * change) / full_scale, OF_CHANGE * abs(a_second * sd) / full_scale
-    return ("accelerates", speed, share) if share > drift + SDS * noise else None
-
-
-def _scale_of(signal: Signal, mean: float) -> float:
-    """Scale of a channel's change [unit]: its mean, but at least a tenth of its largest reading."""
-    return max(abs(mean), 0.1 * signal.largest)
-
-
-def _certain_change(signal: Signal, mean: float, sd: float, change: float) -> float:
-    """Change along a stretch beyond noise, as a share of `_scale_of`."""
-    if not math.isfinite(mean):
-        return 0.0
-    return max(abs(change) - OF_CHANGE * sd, 0.0) / _scale_of(signal, mean)
+def _scales(signals: tuple[Signal, ...], means: np.ndarray) -> np.ndarray:
+    """Scale of each channel's change [unit]: its mean, but at least a tenth of its largest reading."""
+    return np.maximum(np.abs(means), [0.1 * s.largest for s in signals])
 
 
 def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
-    """Change expected after the end of a level, as a share of `_scale_of`.
+    """Change expected after the end of a level, as a share of `_scales`.
 
     It is the tail of a lag, whose decay follows from the changes between quarters of the level. If noise hides the
     last change, it is extrapolated from the earlier ones.
     """
-    quarters = [signal.shown[q] for q in np.array_split(rows, 4)]
-    quarters = [q[np.isfinite(q)] for q in quarters]
+    quarters = [q[np.isfinite(q)] for q in np.array_split(signal.shown[rows], 4)]
     if min(map(len, quarters)) < PART:
         return 0.0
-    first_change, middle_change, last_change = np.diff([float(np.mean(q)) for q in quarters]).tolist()
+    first_change, earlier, later = np.diff([float(np.mean(q)) for q in quarters]).tolist()
     place = np.arange(len(quarters[3]))  # only the last quarter: earlier ones contain a lag's decay
     noise = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
     standard_error = SDS * math.sqrt(2 * _correlation_time(noise) / len(noise)) * float(np.std(noise))
-    earlier, later = (
-        (middle_change, last_change) if abs(last_change) >= standard_error else (first_change, middle_change)
-    )
+    is_hidden = abs(later) < standard_error
+    if is_hidden:
+        earlier, later = first_change, earlier
     if abs(later) < standard_error or earlier * later <= 0:
         return 0.0
     fades = min(later / earlier, 0.9)
-    last_change = abs(last_change) if abs(last_change) >= standard_error else min(abs(later) * fades, standard_error)
-    return last_change * fades / (1 - fades) / _scale_of(signal, mean)
+    last_change = min(abs(later) * fades, standard_error) if is_hidden else abs(later)
+    return last_change * fades / (1 - fades) / max(abs(mean), 0.1 * signal.largest)
 
 
 def _reading_size(shown: np.ndarray) -> float:
@@ -688,37 +620,24 @@ def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
 
 def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
     """First part from which on every channel's mean stays at its final value."""
-    ends = parts[-3:]
-    first_part = len(parts) - len(ends)
-    means = np.array([[_plain(s.shown[rows[low:high]]) for low, high in parts] for s in signals])
-    tail = np.array([_plain(s.shown[rows[ends[0][0] :]]) for s in signals])
-    noise = np.array([_noise_of_mean(s, rows, ends) for s in signals])
-    large = np.array([s.largest for s in signals])
-    tolerance = np.maximum(0.5 * drift * np.abs(tail), FINE * large)
-    for k in range(first_part - 1, -1, -1):
-        difference = np.abs(means[:, k] - tail)
-        count = parts[k][1] - parts[k][0]
-        scatter = noise * math.sqrt(1 / max(count, 1) + 1 / (len(rows) - ends[0][0]))
-        if np.any(difference > tolerance + SDS * scatter):
-            break
-        first_part = k
-    return first_part
+    earlier, tail_row = parts[:-3], parts[-3:][0][0]
+    counts = np.array([max(high - low, 1) for low, high in earlier])
+    is_steady = np.full(len(earlier), True)
+    for s in signals:
+        means = np.array([_plain(s.shown[rows[low:high]]) for low, high in earlier])
+        tail = s.shown[rows[tail_row:]]
+        tail = tail[np.isfinite(tail)]
+        mean, noise = _plain(tail), 0.0
+        if len(tail) > 2:
+            noise = float(np.std(tail) * math.sqrt(_correlation_time(tail - mean)))
+        scatter = noise * np.sqrt(1 / counts + 1 / (len(rows) - tail_row))
+        is_steady &= ~(np.abs(means - mean) > max(0.5 * drift * abs(mean), FINE * s.largest) + SDS * scatter)
+    return int(np.flatnonzero(~is_steady).max(initial=-1)) + 1
 
 
 def _plain(x: np.ndarray) -> float:
     finite = x[np.isfinite(x)]
     return float(np.mean(finite)) if len(finite) else math.nan
-
-
-def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]) -> float:
-    """Sd of readings at the end of a level, times the root of their autocorrelation time."""
-    readings = signal.shown[rows[ends[0][0] :]]
-    readings = readings[np.isfinite(readings)]
-    return (
-        float(np.std(readings) * math.sqrt(_correlation_time(readings - np.mean(readings))))
-        if len(readings) > 2
-        else 0.0
-    )
 
 
 def _correlation_time(x: np.ndarray) -> float:
@@ -747,53 +666,72 @@ def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[f
     if finite.sum() < max(FEWEST, 0.5 * signal.filled * len(rows)):
         return math.nan, math.nan, math.nan
     t, x = time[finite] - time[finite].mean(), readings[finite]
+    mean, lasts = float(x.mean()), float(np.ptp(t))
+    change = float(t @ (x - mean) / (t @ t)) * lasts
+    fitted = signal.angle[rows][finite] if len(signal.angle) else x
+    slope = float(t @ (fitted - fitted.mean()) / (t @ t))
+    residual = fitted - fitted.mean() - slope * t
+    spread, correlation = float(np.std(residual)), _correlation_time(residual)
     if len(signal.angle):
-        angle = signal.angle[rows][finite]
-        slope = float(t @ (angle - angle.mean()) / (t @ t))
-        residual = angle - angle.mean() - slope * t
-        sd = math.sqrt(float(np.mean(residual**2)) * _correlation_time(residual) / float(t @ t))
-        bend = float(t @ (x - x.mean()) / (t @ t))
-        return slope, max(sd, 1e-9 * abs(slope)), bend * float(np.ptp(t))
-    mean = float(x.mean())
-    slope = float(t @ (x - mean) / (t @ t))
-    residual = x - mean - slope * t
-    spread = float(np.std(residual))
-    sd = spread * math.sqrt(_correlation_time(residual) / len(x))
+        return slope, max(spread * math.sqrt(correlation / float(t @ t)), 1e-9 * abs(slope)), change
+    sd = spread * math.sqrt(correlation / len(x))
     if signal.step > 0:  # without noise all readings round the same way; noise makes the error of their mean smaller
         # Two readings do not show how often noise moves one to the other.
-        noise_in_steps = (
-            max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
-        )
+        noise_in_steps = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(x)) > 2 else 0.0
         rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * noise_in_steps) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
-    return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
+    return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), change
 
 
-def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
+def _scatter_of(
+    runs: Runs, stretches: tuple[Stretch, ...], signals: tuple[Signal, ...], largest: float
+) -> dict[str, float]:
     """Extra sd of each channel between stretches under the same conditions [unit], 0 with too few repeats."""
-    groups: list[list[Stretch]] = []
-    previous_key: tuple[object, ...] = ()
-    for s in sorted((s for s in found if not s.why), key=lambda s: (_point_of(runs, s), s.imposed)):
-        row_key = _point_of(runs, s)
-        if groups and row_key == previous_key and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
-            groups[-1].append(s)
+    groups: list[tuple[tuple[object, ...], list[Stretch]]] = []
+    for point, s in sorted(
+        ((_point_of(runs, s), s) for s in stretches if not s.why), key=lambda pair: (pair[0], pair[1].imposed)
+    ):
+        if groups and groups[-1][0] == point and s.imposed - groups[-1][1][0].imposed <= 0.2 * FINE * largest:
+            groups[-1][1].append(s)
         else:
-            groups.append([s])
-        previous_key = row_key
+            groups.append((point, [s]))
     scatter = {}
-    for signal in signals:
-        name = signal.channel.name
+    for name in (s.channel.name for s in signals):
         excess, freedom = 0.0, 0
-        for group in groups:
-            values = np.array([s.mean[name] for s in group])
-            sds = np.array([s.sd[name] for s in group])
-            good = np.isfinite(values)
-            if good.sum() > 1:
-                excess += float(np.sum((values[good] - values[good].mean()) ** 2))
-                excess -= float((1 - 1 / good.sum()) * np.sum(sds[good] ** 2))
-                freedom += int(good.sum()) - 1
+        for _, group in groups:
+            values = np.array([s.mean[name] for s in group if math.isfinite(s.mean[name])])
+            sds = np.array([s.sd[name] for s in group if math.isfinite(s.mean[name])])
+            if len(values) > 1:
+                excess += float(np.sum((values - values.mean()) ** 2) - (1 - 1 / len(values)) * np.sum(sds**2))
+                freedom += len(values) - 1
         scatter[name] = math.sqrt(max(excess, 0.0) / freedom) if freedom >= 3 else 0.0
     return scatter
+
+
+def _sign_doubt(found: Settled) -> str:
+    """Message on speeds and currents that have the same sign in both directions of travel. Empty: there are none."""
+    layout, runs = found.runs.layout, found.runs
+    for signal in (s for s in found.signals if runs.turns_round(s.channel)):
+        channel = signal.channel
+        name = channel.name
+        clear = [s for s in found.kept if abs(s.mean[name]) > max(SIGNED * s.sd[name], STILL * signal.largest)]
+        backward, forward = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
+        wrong = [s for s in forward if s.mean[name] < 0]
+        is_reversed = bool(wrong) and len(wrong) == len(forward)
+        if backward and all(s.mean[name] > 0 for s in backward) and not is_reversed:
+            return (
+                f"{_place_text(found, backward[0], channel)}; expected readings with their signs, negative in "
+                f"reverse; or set [instruments.{name}] signed = false in the rig's file, if it shows only "
+                "the magnitude"
+            )
+        if (is_reversed or (wrong and channel.zero_at_rest)) and not runs.pulled:
+            cure = (
+                f"state [columns] {channel.column} = {{column = ..., factor = -1}} in the rig's file"
+                if is_reversed
+                else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
+            )
+            return f"{_place_text(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}"
+    return ""
 
 
 def _point_of(runs: Runs, stretch: Stretch) -> tuple[object, ...]:
@@ -823,36 +761,9 @@ def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
     """Place of a stretch, a channel's reading there, and the imposed value, for a message."""
     reading, unit = _digits(s.mean[channel.name], 4), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
-        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {reading:g} "
+        f"{found.runs.place(s.rows[0], s.rows[-1])}, {channel.column}: shows {reading:g} "
         f"{channel.unit} at {_digits(s.imposed, 4):g} {unit}"
     )
-
-
-def _check_signs(found: Settled) -> None:
-    """Rejects speeds and currents that have the same sign in both directions of travel."""
-    layout, runs = found.runs.layout, found.runs
-    for signal in (s for s in found.signals if runs.turns_round(s.channel)):
-        channel = signal.channel
-        smallest_signed = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
-        clear = [s for s in found.kept if abs(s.mean[channel.name]) > smallest_signed[id(s)]]
-        backward, forward = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
-        wrong = [s for s in forward if s.mean[channel.name] < 0]
-        is_reversed = bool(wrong) and len(wrong) == len(forward)
-        if backward and all(s.mean[channel.name] > 0 for s in backward) and not is_reversed:
-            raise BadData(
-                f"{_place_text(found, backward[0], channel)}; expected readings with their signs, negative in "
-                f"reverse; or set [instruments.{channel.name}] signed = false in the rig's file, if it shows "
-                "only the magnitude"
-            )
-        if (is_reversed or (wrong and channel.zero_at_rest)) and not runs.pulled:
-            cure = (
-                f"state [columns] {channel.column} = {{column = ..., factor = -1}} in the rig's file"
-                if is_reversed
-                else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
-            )
-            raise BadData(
-                f"{_place_text(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}"
-            )
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
@@ -860,27 +771,23 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
     runs = found.runs
     angles = {rate: angle for angle, rate, _ in RATES}
     # The angle is suspected first, since its rate is not read directly.
-    order = sorted(found.signals, key=lambda s: not len(s.angle))
+    names = [s.channel.name for s in sorted(found.signals, key=lambda s: not len(s.angle))]
     for s in found.kept:
         units = rolling.get(str(runs["configuration"][s.rows[0]]), {})
-        turns = {
-            x.channel.name: abs(s.mean[x.channel.name] / units[x.channel.name])
-            for x in order
-            if units.get(x.channel.name)
-        }
+        turns = {name: abs(s.mean[name] / units[name]) for name in names if units.get(name)}
         if runs.layout.imposed == "motor_speed":
             turns["motor_speed"] = abs(s.imposed) * math.pi / 30
-        for one, other in ((a, b) for k, a in enumerate(turns) for b in list(turns)[k + 1 :]):
-            if not (turns[one] > 0 and turns[other] > 0):
+        for (one, turns_of_one), (other, turns_of_other) in combinations(turns.items(), 2):
+            if not (turns_of_one > 0 and turns_of_other > 0):
                 continue
-            ratio = turns[one] / turns[other]
+            ratio = turns_of_one / turns_of_other
             unit = next((word for word, x in UNITS.items() if abs(math.log(ratio / x)) < NEAR), None)
             if unit is not None:
                 column = channels.find_channel(one).column
-                if one in angles and not runs.has(column):
-                    column = angles[one]
+                if not runs.has(column):
+                    column = angles.get(one, column)
                 raise BadData(
-                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {ratio:.4g} times the value "
+                    f"{runs.place(s.rows[0], s.rows[-1])}, {column}: {ratio:.4g} times the value "
                     f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
                     f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
                     f"{{column = ..., factor = {1 / ratio:.3g}}} in the rig's file"
@@ -946,41 +853,43 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
 
     By channel. For vehicles, only speeds of shafts, because the ground speed depends on slip.
     """
-    readings = {}
-    for k, (name, load) in enumerate(robot.configurations.items()):
-        zero, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
-        state = State(zero, jnp.ones(()), jnp.asarray(turns), zero)
-        speeds = {c.name: _reading(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
-        readings[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
-    return readings
+    shafts = {
+        c.name for c in settled_channels(robot) if c.zero_at_rest and not (c.name == "speed" and robot.has_ground)
+    }
+    return {
+        name: {n: x for n, x in _readings_of_one(robot, k)[1].items() if n in shafts}
+        for k, name in enumerate(robot.configurations)
+    }
 
 
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     """Current that acceleration takes in each configuration, if known."""
-    constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
-    inertias = {}
+    constant, inertias = float(robot.motor.torque_constant), {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         at_motor = inertia_at_motor(robot, load)
-        zero, one = jnp.zeros(()), jnp.ones(())
-        rolling = float(load.radius) / ratio
-        states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)  # of 1 A, and of 1 rad/s
-        currents, speeds = (
-            {c.name: _reading(robot, k, c, state) for c in settled_channels(robot)} for state in states
-        )
+        currents, speeds = _readings_of_one(robot, k)
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
         is_known = current or robot.rig.imposed == "motor_current"
-        currents[""] = 1.0  # of the imposed one
         if is_known and speed and at_motor > 0 and constant > 0:
-            per_rate = at_motor / constant * currents[current] / speeds[speed]
+            per_rate = at_motor / constant * currents.get(current, 1.0) / speeds[speed]
             inertias[name] = speed, current, per_rate, 1e-3
     return inertias
 
 
-def _reading(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
-    """Reading of a channel that depends only on the state [unit of its column], 0 for others."""
-    signals = balances.begin_signals(robot, Conditions(configuration), state)
-    try:
-        return float(channel.read(robot, signals)) / channel.factor
-    except (AttributeError, TypeError):  # a signal that the balances fill in
-        return 0.0
+def _readings_of_one(robot: Robot, configuration: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Readings of the settled channels [unit of the column] at 1 A at rest, and while the motors turn at 1 rad/s
+    without slip and current. 0 for channels that depend on more than the state.
+    """
+    zero, one = jnp.zeros(()), jnp.ones(())
+    rolling = float(robot.configurations.members[configuration].radius) / float(robot.gearbox.ratio)
+    readings: tuple[dict[str, float], dict[str, float]] = ({}, {})
+    states = State(one, zero, zero, zero), State(zero, one, jnp.asarray(rolling), zero)
+    for by_name, state in zip(readings, states, strict=True):
+        signals = balances.begin_signals(robot, Conditions(configuration), state)
+        for channel in settled_channels(robot):
+            try:
+                by_name[channel.name] = float(channel.read(robot, signals)) / channel.factor
+            except (AttributeError, TypeError):  # a signal that the balances fill in
+                by_name[channel.name] = 0.0
+    return readings

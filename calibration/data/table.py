@@ -104,6 +104,15 @@ class Runs:
         """True if the table has this column."""
         return column in self.columns
 
+    def place(self, first: int, last: int | None = None) -> str:
+        """Source and row, or rows, counted from 1, for the beginning of a message."""
+        rows = f"row {first + 1}" if last is None else f"rows {first + 1} to {last + 1}"
+        return f"{self.source} {rows}"
+
+    def heading(self, column: str) -> str:
+        """Name of a column in the file."""
+        return self.headings.get(column, column)
+
     @property
     def turns(self) -> bool:
         """True if its robot is free to turn: its sides are driven independently, or it does not head uphill."""
@@ -166,12 +175,8 @@ class Runs:
         voltage also reverses the supply current. In a turn each side has its own sign, and the yaw rate has the sign
         of their difference (`sides.check_turns`).
         """
-        if (
-            self.turns
-            or not channel.directed
-            or channel.name == "motor_voltage"
-            or self.layout.magnitude(channel.name)
-        ):
+        is_signed = channel.directed and channel.name != "motor_voltage" and not self.layout.magnitude(channel.name)
+        if self.turns or not is_signed:
             return False
         back = self.has("duty") and channel.name == "total_current"
         return channel.zero_at_rest or not (self.pulled or back)
@@ -221,9 +226,9 @@ class Runs:
     def missing(self) -> list[str]:
         """A note on each channel with missing readings."""
         notes = []
-        for k, channel in enumerate(self.channels):
-            missing_rows = np.flatnonzero(np.isnan(self.measured()[:, k]))
-            if not self.has(channel.column) or missing_rows.size == len(self):
+        for channel, readings in zip(self.channels, self.measured().T, strict=True):
+            missing_rows = np.flatnonzero(np.isnan(readings))
+            if missing_rows.size == len(self):
                 notes.append(
                     f"{channel.column}: no readings. Parameters that only this channel determines are not fitted"
                 )
@@ -241,18 +246,16 @@ class Runs:
         Raises:
             InputError: the robot lacks a configuration. The message lists those that it has.
         """
-        configuration_index = np.empty(len(self), int)
-        names = self.configurations_named(robot)
-        for name in np.unique(names):
-            rows = names == name
+        names, first_rows, inverse = np.unique(
+            self.configurations_named(robot), return_index=True, return_inverse=True
+        )
+        for name, row in zip(names.tolist(), first_rows, strict=True):
             if name not in robot.configurations:
-                first_row = int(np.flatnonzero(rows)[0]) + 1
                 raise BadData(
-                    f"{self.source} row {first_row}, configuration: got {name}; expected one of these; "
-                    f"{allowed_words(str(name), robot.configurations)}"
+                    f"{self.place(row)}, configuration: got {name}; expected one of these; "
+                    f"{allowed_words(name, robot.configurations)}"
                 )
-            configuration_index[rows] = robot.configurations.index(str(name))
-        return configuration_index
+        return np.array([robot.configurations.index(name) for name in names.tolist()], int)[inverse]
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
         """Names of `configurations`. Configurations that the robot lacks keep the table's name."""
@@ -279,17 +282,14 @@ class Runs:
         from mmrjax.model.conditions import Conditions
 
         configuration_index = self.configurations(robot)
-        is_undriven = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
+        modes = self["mode"] if self.has("mode") else np.full(len(self), DRIVEN[0])
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
-            on_tracks = robot.configurations.tracked[configuration_index]
             scaled = rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
-            adhesion[scaled] = [
-                adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
-            ]
-            lateral[scaled] = [
-                lateral_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
-            ]
+            on_tracks = robot.configurations.tracked[configuration_index][scaled]
+            pairs = list(zip(self["surface"][scaled], on_tracks, strict=True))
+            adhesion[scaled] = [adhesion_ratio(*pair) for pair in pairs]
+            lateral[scaled] = [lateral_ratio(*pair) for pair in pairs]
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
@@ -297,7 +297,7 @@ class Runs:
         set_values = {
             c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)
         }
-        set_values["duty"] = np.where(is_undriven, 0.0, set_values.get("duty", 1.0))
+        set_values["duty"] = np.where(modes == DRIVEN[0], set_values.get("duty", 1.0), 0.0)
         sets_motor_speed = imposed and not robot.rig.follows_goal
         set_values["voltage"] = np.zeros(len(self)) if battery or sets_motor_speed else self[SUPPLY]
         if robot.rig.follows_goal:
@@ -313,6 +313,6 @@ class Runs:
             discharge=discharge,
             adhesion=adhesion,
             adhesion_lateral=lateral if self.turns else None,
-            open=[CIRCUITS[mode] for mode in self["mode"]] if self.has("mode") else 0.0,
+            open=[CIRCUITS[mode] for mode in modes] if self.has("mode") else 0.0,
             **set_values,
         )

@@ -60,17 +60,18 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
             raise BadData(
                 f"{path.name}: got columns {', '.join(conflicting)} and {ours}; expected one kind, remove the other"
             )
-    for name, unit in zip(header, table.units, strict=False):
-        if name in names and unit and not name.endswith(f"_{unit}"):
-            raise BadData(f"{path.name}: column {name} states {unit} in {table.units_from}; correct one of them")
-    cells = {name: table.values[header.index(name)] for name in names}
-    columns = {name: named_arrays.column_numbers(raw) for name, raw in cells.items()}
-    for name, numbers in columns.items():
-        for row in np.flatnonzero(~np.isfinite(numbers))[:1].tolist():
-            cell = named_arrays.column_texts(cells[name])[row]
-            raise BadData(f"{path.name} row {row + 2}, {name}: got {cell!r}; expected a number")
     if not len(table):
         raise BadData(f"{path.name}: has no rows; expected at least one")
+    columns = {}
+    for name, unit, raw in zip(header, table.units or [""] * len(header), table.values, strict=True):
+        if name not in names:
+            continue
+        if unit and not name.endswith(f"_{unit}"):
+            raise BadData(f"{path.name}: column {name} states {unit} in {table.units_from}; correct one of them")
+        columns[name] = named_arrays.column_numbers(raw)
+        for row in np.flatnonzero(~np.isfinite(columns[name]))[:1].tolist():
+            cell = named_arrays.column_texts(raw)[row]
+            raise BadData(f"{path.name} row {row + 2}, {name}: got {cell!r}; expected a number")
     return columns, names
 
 
@@ -93,17 +94,14 @@ def read_terrain(path: Path) -> Terrain:
     largest, wall = max(np.ptp(x), np.ptp(z)), np.max(rise, where=rise > across, initial=0.0)
     if SMALLEST <= largest <= LARGEST and wall <= WALL:
         return outline
-    fault, other, other_unit = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm", "millimetres"
+    fault, meant = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm"
     if largest < SMALLEST:
-        fault, other, other_unit = (
-            f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm",
-            "m",
-            "metres",
-        )
+        fault, meant = f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm", "m"
     elif largest <= LARGEST:
         fault = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
     # too small in mm, or too large in m
-    hint = "" if other == unit else f"; is the file in {other_unit}? Then name its columns x_{other} and z_{other}"
+    unit_name = "metres" if meant == "m" else "millimetres"
+    hint = "" if meant == unit else f"; is the file in {unit_name}? Then name its columns x_{meant} and z_{meant}"
     raise BadData(f"{path.name}: {fault}{hint}")
 
 
@@ -118,27 +116,26 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Leve
         BadData: columns are wrong, cells lack numbers, knots do not increase, an angle is beyond the robot's range,
             or a voltage is beyond `HIGHEST`.
     """
-    angles, volts = ("front_deg", "rear_deg"), ("front_V", "rear_V")
-    column_sets = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
-    columns, names = _read_columns(path, "--sequence", column_sets)
-    abscissa = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
-    falls = np.diff(columns[names[0]], prepend=-np.inf) <= 0
-    before = np.roll(columns[names[0]], 1)
-    checks: list[Check] = [(names[0], falls, lambda row: f" after {before[row]:g}; expected increasing values")]
-    over_time = names[0] == "time_s"
-    if names[1:] == volts:
+    column_sets = [(x, f"front_{unit}", f"rear_{unit}") for unit in ("deg", "V") for x in ("x_mm", "time_s")]
+    columns, (abscissa, *both) = _read_columns(path, "--sequence", column_sets)
+    knots = columns[abscissa]
+    over_time, has_volts = abscissa == "time_s", both[0] == "front_V"
+    falls, before = np.diff(knots, prepend=-np.inf) <= 0, np.roll(knots, 1)
+    checks: list[Check] = [(abscissa, falls, lambda row: f" after {before[row]:g}; expected increasing values")]
+    if has_volts:
         allowed = f" V; expected -{HIGHEST:g} to {HIGHEST:g} V"
-        checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in volts]
+        checks += [(name, np.abs(columns[name]) > HIGHEST, allowed) for name in both]
     check_rows(path.name, columns, checks, 2)
-    if names[1:] == volts:
-        front, rear = (jnp.asarray(columns[name]) for name in volts)
-        return LeverSequence(jnp.asarray(abscissa), front, rear, jnp.asarray(begins), over_time)
-    for name in angles:
-        for k, value in enumerate(columns[name]):
+    x = jnp.asarray(knots if over_time else 1e-3 * knots)
+    if has_volts:
+        front, rear = (jnp.asarray(columns[name]) for name in both)
+        return LeverSequence(x, front, rear, jnp.asarray(begins), over_time)
+    for name in both:
+        for k, value in enumerate(columns[name], 2):
             if why := lever_angle_refusal(robot, value):
-                raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
-    front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
-    return LeverSequence(jnp.asarray(abscissa), front, rear, over_time=over_time)
+                raise BadData(f"{path.name} row {k}, {name}: {why}")
+    front, rear = (jnp.asarray(np.radians(columns[name])) for name in both)
+    return LeverSequence(x, front, rear, over_time=over_time)
 
 
 def lever_start_refusal(robot: Robot, angle: float) -> str:

@@ -41,26 +41,24 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
         BadData: the load of a log is computed, the current is imposed, or there is no other channel.
     """
     columns, notes = dict(runs.columns), list(runs.notes)
-    shown_columns = {c.column: c.name for c in runs.channels if runs.has(c.column)}
-    for torque, current in ((t, c) for t in (LOAD, TORQUE) for c in CURRENTS if runs.has(t) and runs.has(c)):
-        if torque not in columns or (torque == TORQUE and len(shown_columns) < 2):
+    shown = {c.column: c.name for c in runs.channels if runs.has(c.column)}
+    for torque, current in itertools.product((LOAD, TORQUE), CURRENTS):
+        if torque not in columns or not runs.has(current) or (torque == TORQUE and len(shown) < 2):
             continue
         line = None if len(np.unique(runs[current])) < FEWEST else line_through(runs[current], runs[torque])
         if line is None or line[0] != 0.0:
             continue
         computed = (
-            f"{runs.source}, {torque}: equals {line[1]:.4g} times {current} in every row, to the last "
-            "digit, so it was "
+            f"{runs.source}, {torque}: equals {line[1]:.4g} times {current} in every row, to the last digit, so it "
+            "was computed, not measured, and does not show torque constant, friction or efficiency"
         )
-        computed += "computed, not measured, and does not show torque constant, friction or efficiency"
         if torque == TORQUE:
             columns.pop(torque)
             notes.append(f"{computed}. It is left out")
-        elif runs.sampled or set(shown_columns) <= {current, TORQUE} or current not in shown_columns:
+        elif runs.sampled or shown.keys() <= {current, TORQUE} or current not in shown:
             raise BadData(f"{computed}; remove it and keep rows without a load, or give the torque set at the brake")
         else:
-            columns[torque] = _load_for_current(runs, robot, shown_columns[current], runs[current])
-            columns.pop(current)
+            columns[torque] = _load_for_current(runs, robot, shown[current], columns.pop(current))
             notes.append(
                 f"{computed}. It is left out. The load follows from {current} and the robot's file, so this "
                 "current is no reading either. Only voltages and speeds are used"
@@ -88,7 +86,7 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
     bad = np.flatnonzero(~(np.abs(current_error) <= ERROR * np.nanmax(np.abs(current))))
     if bad.size:
         raise BadData(
-            f"{runs.source} row {bad[0] + 1}, {LOAD}: it was computed from {channel}, and the file's robot draws "
+            f"{runs.place(bad[0])}, {LOAD}: it was computed from {channel}, and the file's robot draws "
             f"{current[bad[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
         )
     return load
@@ -125,8 +123,8 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
     if runs.sampled or runs.turns or runs.layout.imposed_column != SUPPLY or runs.has("held"):
         return runs
     columns, notes = dict(runs.columns), list(runs.notes)
-    drive = runs[SUPPLY] * (runs["duty"] if runs.has("duty") else 1.0)
-    is_limited = _beyond_limit(runs, np.abs(drive))
+    drive = np.abs(applied_drive(runs))
+    is_limited = _beyond_limit(runs, drive)
     unread = _turning_mask(runs, robot, drive) & ~is_limited
     for channel in (c for c in runs.channels if runs.has(c.column)):
         not_read = unread & (runs[channel.column] == 0) & channel.zero_at_rest
@@ -149,17 +147,16 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
 def _turning_mask(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
     """True for rows whose motor current is far below the stall current and above that of friction."""
     motor = robot.motor
-    resistance, constant = float(motor.resistance), float(motor.torque_constant)
-    share = np.abs(runs["duty"]) if runs.has("duty") else np.ones(len(runs))
     if runs.has("motor_current_A"):
         current = np.abs(runs["motor_current_A"])
     elif runs.has("total_current_A"):
-        current = np.abs(runs["total_current_A"]) / (float(robot.sides) * np.maximum(share, 1e-9))
+        duty = np.abs(runs["duty"]) if runs.has("duty") else 1.0
+        current = np.abs(runs["total_current_A"]) / (float(robot.sides) * np.maximum(duty, 1e-9))
     else:
         return np.zeros(len(runs), bool)
     with np.errstate(invalid="ignore", divide="ignore"):
-        slow = current < TURNS * np.abs(drive) / resistance
-        return slow & (current * constant > DRIVES * float(motor.friction_coulomb))
+        is_slow = current < TURNS * drive / float(motor.resistance)
+        return is_slow & (current * float(motor.torque_constant) > DRIVES * float(motor.friction_coulomb))
 
 
 def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
@@ -170,18 +167,18 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
     """
     is_limited = np.zeros(len(runs), bool)
     command, supply = (np.abs(runs["duty"]), np.abs(runs[SUPPLY])) if runs.has("duty") else (drive, drive)
-    supply_current = [runs["total_current_A"][:, None]] if runs.has("total_current_A") else []
-    other_conditions = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
-    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in other_conditions):
+    others = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
+    if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in others):
         return is_limited
+    readings = [runs.measured()]
+    if runs.has("total_current_A"):
+        readings.insert(0, runs["total_current_A"][:, None])
     order = np.argsort(-command, kind="stable")
-    for magnitudes in (np.abs(x)[order] for x in (*supply_current, runs.measured())):
-        is_equal = np.all(
-            np.isnan(magnitudes) | (np.abs(magnitudes - magnitudes[0]) <= ALIKE * np.abs(magnitudes[0])), axis=1
-        )
-        top = order[: int(np.argmin(is_equal))]
+    for sizes in (np.abs(x)[order] for x in readings):
+        is_equal = np.isnan(sizes) | (np.abs(sizes - sizes[0]) <= ALIKE * np.abs(sizes[0]))
+        top = order[: int(np.argmin(is_equal.all(1)))]
         levels = np.unique(command[top])
-        if len(levels) < 2 or levels[-1] < RISE * levels[0] or not np.isfinite(magnitudes[0]).any():
+        if len(levels) < 2 or levels[-1] < RISE * levels[0] or not np.isfinite(sizes[0]).any():
             continue
         if supply[top].min() < (1 - FALLS) * supply[top].max() and supply[top[0]] == supply[top].min():
             is_limited[top] = True
@@ -199,7 +196,7 @@ MOVES, HELD, SLIGHTLY, NOISY = 0.05, 0.1, 0.02, 0.8
 def drive_heading(runs: Runs) -> str:
     """Name in the file of the column that drives the motors."""
     column = "duty" if runs.has("duty") else runs.layout.imposed_column
-    return runs.headings.get(column, column)
+    return runs.heading(column)
 
 
 def without_held(runs: Runs) -> Runs:
@@ -217,7 +214,7 @@ def without_held(runs: Runs) -> Runs:
         begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
         lasts = np.diff(np.r_[begins, len(rows)])
         is_long = lasts > HELD * len(rows)
-        noisy = np.mean(lasts[~is_long] == 1) > NOISY if not is_long.all() else False
+        noisy = not is_long.all() and np.mean(lasts[~is_long] == 1) > NOISY
         for k in np.flatnonzero(is_long & (np.abs(readings[begins]) > rest)):
             held = rows[begins[k] : begins[k] + lasts[k]]
             if np.ptp(drive[held]) <= (SLIGHTLY if noisy else HELD) * np.ptp(drive):
@@ -228,7 +225,7 @@ def without_held(runs: Runs) -> Runs:
                 columns[column][held[1:]] = np.nan
                 cure = "Such rows are left out"
             notes[column] = (
-                f"{runs.source} rows {held[0] + 1} to {held[-1] + 1}, {runs.headings.get(column, column)}: the same "
+                f"{runs.place(held[0], held[-1])}, {runs.heading(column)}: the same "
                 f"reading while {drive_heading(runs)} changes, like repeats. {cure}"
             )
     return dataclasses.replace(runs, columns=columns, notes=(*runs.notes, *notes.values()))
@@ -268,23 +265,21 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
     """
     if most < 1:
         raise BadConfiguration(f"rows: got {most}; expected 1 or more")
-    need, free = 0.0 if runs.sampled else float(ROW * min(len(runs), most)), input_files.available_memory()
-    if need > free:
+    rows, free = min(len(runs), most), input_files.available_memory()
+    if not runs.sampled and ROW * rows > free:
         raise BadData(
-            f"{runs.source}: {count_noun(min(len(runs), most), 'row')} need {need / 1e9:.3g} GB, and "
-            f"{free / 1e9:.3g} GB of memory are free, enough for {free / ROW:.0f} rows; set --rows"
+            f"{runs.source}: {count_noun(rows, 'row')} need {ROW * rows / 1e9:.3g} GB, and {free / 1e9:.3g} GB of "
+            f"memory are free, enough for {free / ROW:.0f} rows; set --rows"
         )
     if len(runs) <= most:
         return runs
-    rows_per_kept, kept_rows = -(-len(runs) // most), []
-    read = np.isfinite(runs.measured())
+    apart, read = -(-len(runs) // most), np.isfinite(runs.measured())
     if runs.sampled:
         ordered = list(runs.rows_by_run().values())
     else:
         ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
-    for rows in ordered:
-        kept_rows.append(rows[_evenly_spaced_rows(read[rows], rows_per_kept)])
-    return dataclasses.replace(runs.where(np.sort(np.concatenate(kept_rows))), log=runs.whole)
+    kept_rows = np.concatenate([rows[_evenly_spaced_rows(read[rows], apart)] for rows in ordered])
+    return dataclasses.replace(runs.where(np.sort(kept_rows)), log=runs.whole)
 
 
 def _evenly_spaced_rows(read: np.ndarray, apart: int) -> np.ndarray:

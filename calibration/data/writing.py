@@ -19,6 +19,7 @@ from typing import Any, TextIO, TypeAlias
 import numpy as np
 
 from calibration.data import Columns, Json
+from calibration.data.named_arrays import cell_number
 from mmrjax.errors import printable
 from mmrjax.model.quantities import TABLE, unit_at_end, unit_in_column
 
@@ -225,19 +226,12 @@ def cell_text(value: Any) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.9g}" if math.isfinite(value) else ""
     text = printable(str(value)).replace("\n", " ")
-    return f"'{text}" if isinstance(value, str) and _FORMULA.match(text) and not _is_number(text) else text
+    return f"'{text}" if isinstance(value, str) and _FORMULA.match(text) and math.isnan(cell_number(text)) else text
 
 
 def cell_word(text: str) -> str:
     """A cell as it was before `cell_text` marked it."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
-
-
-def _is_number(text: str) -> bool:
-    with contextlib.suppress(ValueError):
-        float(text)
-        return True
-    return False
 
 
 def entries_of(value: Any, *listed: str) -> Json:

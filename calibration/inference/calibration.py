@@ -351,7 +351,11 @@ def _calibration_result(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
     scanned = {k: scans.scan_coordinate(posed, z, k) for k in scans.scanned_coordinates(posed)}
-    about = scans.with_scanned_sds(about, scanned)
+    sd = about.sd.copy()
+    for k, scan in scanned.items():
+        sd[k] = scan.sd()
+    wider = sd / about.sd  # correlations are kept
+    about = dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [
         Remark("prior_of_product", name=name, mean=mean, sd=sd, share=priors.GUIDED)

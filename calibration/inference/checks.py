@@ -94,7 +94,7 @@ def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
             "no_load_gives",
             source=runs.source,
             column=column,
-            theirs=runs.headings.get(column, column),
+            theirs=runs.heading(column),
             share=unexplained / total,
         ),
     )

@@ -85,7 +85,6 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _range_factor(measured[:, k], possible[1:2, :, k])
-        channel_factors = factors[channel]
         remark = Remark(
             "off_by",
             column=channel.column,
@@ -95,7 +94,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
             others=tuple(
                 c.column
                 for c, f in factors.items()
-                if c is not channel and abs(math.log(f / channel_factors)) < math.log(ALIKE)
+                if c is not channel and abs(math.log(f / factor)) < math.log(ALIKE)
             ),
             imposed=runs.layout.imposed_column,
         )
@@ -136,7 +135,7 @@ def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.nda
             continue
         rms, reversed_rms = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
         if reversed_rms * NEARER < rms:
-            heading = runs.headings.get(channel.column, channel.column)
+            heading = runs.heading(channel.column)
             remarks.append(
                 Remark(
                     "turned",

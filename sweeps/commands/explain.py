@@ -36,11 +36,7 @@ WIDTH, INDENT = 80, 16
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
 
 #: Keys of robot files that no fit frees, with their meanings.
-KEYS: dict[str, str] = {
-    **{name: str(about[-1]).strip("()") for name, about in (robot_file.COUNTS | robot_file.RATINGS).items()},
-    **robot_file.SWITCHES,
-    **{name: meaning for name, (_, meaning) in robot_file.CHOICES.items()},
-}
+KEYS = {name: meaning for name, (_, _, meaning) in robot_file.SETTINGS.items()}
 
 
 def explain_name(name: str | None, files: Names) -> int:

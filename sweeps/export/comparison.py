@@ -351,7 +351,7 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     """
     robot = joint.file.robot
     if data is None:
-        if not Layout.of(robot).uses_paper_conditions and capabilities.imposed_limit(robot) is None:
+        if not Layout.of(robot).complete and capabilities.imposed_limit(robot) is None:
             raise BadConfiguration(
                 f"--data: not given, and {joint.file.name} has no motor.voltage_limit; give a table of runs, or "
                 "add the limit"
@@ -421,7 +421,7 @@ def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
-        raise BadData(f"{runs.source}: expected straight travel, not turns")
+        raise BadData(f"{runs.source}: its runs drive the sides differently; expected straight travel")
     if levers := [name for name in runs.axes if name.startswith("lever")]:
         raise BadData(f"{runs.source}, {levers[0]}: an export is one drive; expected runs without lever columns")
     if runs.sampled:

@@ -6,7 +6,6 @@ import dataclasses
 import math
 import re
 import textwrap
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,7 +27,7 @@ from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, filled_template
 
 #: First version with `<dcmotor>`.
-FIRST = (3, 7, 0)
+FIRST, FIRST_TEXT = (3, 7, 0), "3.7"
 #: Effects for which the format has a term, and the term.
 TERMS = {
     "series_resistance": "resistance",
@@ -53,7 +52,11 @@ LEAST_SHARE = 0.05
 #: Fixed-point steps of heat and falling friction.
 STEPS = 12
 #: Names of base terms.
-PLAY, CONTROLLER = "backlash and elasticity", "controller"
+PLAY, CONTROLLER, ROTOR, LIMIT = (
+    "backlash and elasticity", "controller", "rotor inertia", "current limit of the driver",
+)  # fmt: skip
+#: Fate of the ground in simulators.
+GROUND = EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
 #: Impedance of a tendon's limit, so low that the limit acts as a spring and a damper in addition to other torques.
 IMPEDANCE = 1e-3
 #: Names of the format's parameters.
@@ -92,10 +95,19 @@ class MujocoLaw(eqx.Module):
         return values_by_name[SHARE] * current, speed
 
 
-def _law_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> defaultdict[str, float]:
-    """Parameters by dotted name [SI], with some amplitudes replaced. Those of effects that are missing are 0."""
+class _LawNumbers(dict[str, float]):
+    """Parameters by dotted name [SI]. Those of effects that a joint lacks are 0."""
+
+    def __missing__(self, name: str) -> float:
+        if name.startswith("effects."):
+            return 0.0
+        raise KeyError(name)
+
+
+def _law_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> _LawNumbers:
+    """Parameters of a joint, with some amplitudes replaced."""
     changed = {f"effects.{name}.amplitude": amplitude for name, amplitude in amplitudes.items()}
-    return defaultdict(float, params.values_by_name(joint.robot) | changed)
+    return _LawNumbers(params.values_by_name(joint.robot) | changed)
 
 
 def mujoco_law_function(normal: float) -> Any:
@@ -135,7 +147,7 @@ def translate_law(joint: DriveJoint, normal: float, amplitudes: Mapping[str, flo
     if any(e.name == "thermal_drift" for e in joint.inside):
         heat = v["effects.thermal_drift.amplitude"] * v["effects.thermal_drift.resistance_thermal"]
         values[HEAT] = max(heat, 0.0) / share
-    numbers = (list(values.values()), ratio, v["motor.temperature_coefficient"])
+    numbers = (list(values.values()), ratio, float(robot.motor.temperature_coefficient))
     return MujocoLaw(tuple(values), *(jnp.asarray(x, float) for x in numbers))
 
 
@@ -146,7 +158,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     fates = [
         EffectFate("winding and back-EMF", HELD, "resistance, motorconst, inductance"),
         EffectFate("friction of motor and gearbox", HELD, "frictionloss and damping of the joint"),
-        EffectFate("rotor inertia", HELD, "armature of the joint, for a motor that drives"),
+        EffectFate(ROTOR, HELD, "armature of the joint, for a motor that drives"),
     ]
     if float(gear.efficiency_load) != 1:
         fates.append(
@@ -161,16 +173,14 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
         if float(load.track.guide_friction * load.track.guide_share) > 0:
             how = f"frictionloss at the mean normal load of these runs, {normal:.4g} N a side"
             fates.append(EffectFate("friction of track guides", APPROXIMATED, how))
-        fates.append(
-            EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
-        )
+        fates.append(GROUND)
     if joint.loose:
         how = "a joint for the motor's side, and a tendon"
         fates.append(EffectFate(PLAY, HELD, how))
     if joint.controller is not None:
         fates.append(_controller_fate(joint, joint.controller))
     if joint.limit is not None:
-        fates.append(EffectFate("current limit of the driver", HELD, "saturation"))
+        fates.append(EffectFate(LIMIT, HELD, "saturation"))
     return [*fates, *fates_outside_joint(joint)]
 
 
@@ -241,7 +251,7 @@ def mjcf_motor(joint: DriveJoint, values: Mapping[str, float]) -> MjcfMotor:
     thermal: tuple[float, ...] = ()
     if values.get(HEAT):
         capacity = v["effects.thermal_drift.time_constant"] / values[HEAT]
-        thermal = (values[HEAT], capacity, 0.0, v["motor.temperature_coefficient"], 25.0, 25.0)
+        thermal = (values[HEAT], capacity, 0.0, float(robot.motor.temperature_coefficient), 25.0, 25.0)
     lugre: tuple[float, ...] = ()
     bristle = max(v["effects.presliding.amplitude"], 0.0)
     excess = values.get(EXCESS, 0.0)
@@ -317,7 +327,7 @@ def mjcf_fragment(
     gains = _controller_gains(joint, found)
     head = [
         f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; "
-        f"MuJoCo {_version_text()} "
+        f"MuJoCo {FIRST_TEXT} "
         f"or later.",
         f'In the model: <include file="drive.xml"/> before <worldbody>, and class="{name}" on the joint "{at}".',
         f"Command: goal angle of the motor [rad], {found.ratio:.6g} times that of the joint; MuJoCo 3.17 or later."
@@ -350,10 +360,6 @@ def mjcf_fragment(
         about_joint=_comment_lines([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    "),
         sides=sides, attributes=attributes, gains=gains, limit=found.limit, impedance=IMPEDANCE, **play,
     )  # fmt: skip
-
-
-def _version_text() -> str:
-    return ".".join(map(str, FIRST[:2]))
 
 
 def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: float, load: float) -> str:
@@ -436,11 +442,18 @@ def mujoco_module() -> Any:
     if tuple(int(x) for x in found.__version__.split(".")[:3]) < FIRST:
         raise BadConfiguration(
             f"--to mujoco: got MuJoCo {found.__version__}, which has no <dcmotor>; "
-            f"expected {_version_text()} or later: "
+            f"expected {FIRST_TEXT} or later: "
             "pip install -U mujoco"
         )
     found.set_mju_user_warning(lambda text: None)  # otherwise MuJoCo writes a file in the working folder
     return found
+
+
+def _scene(files: Mapping[str, str]) -> tuple[Any, Any, Any]:
+    """MuJoCo's module, the model of a scene with its fragment, and its data."""
+    library = mujoco_module()
+    model = library.MjModel.from_xml_string(files["scene.xml"], {name: text.encode() for name, text in files.items()})
+    return library, model, library.MjData(model)
 
 
 def angles_in_mujoco(
@@ -451,10 +464,8 @@ def angles_in_mujoco(
     Args:
         timestep: time step [s]. None: that of the scene.
     """
-    assets = {name: text.encode() for name, text in files.items()}
-    mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
+    mujoco, model, data = _scene(files)
     model.opt.timestep = timestep or model.opt.timestep
-    data = mujoco.MjData(model)
     data.ctrl[0] = command
     angles = np.zeros(len(times))
     for k, time in enumerate(times):
@@ -473,11 +484,8 @@ def settle_in_mujoco(
         expected: values from the steady law, near which each run begins.
         rows: indices of the runs.
     """
-    # model of a scene and its included fragment, in memory
-    assets = {name: text.encode() for name, text in files.items()}
-    mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
+    mujoco, model, data = _scene(files)
     model.opt.gravity[:] = 0  # an arm's weight is part of the stated load
-    data = mujoco.MjData(model)
     current, speed = np.empty(len(rows)), np.empty(len(rows))
     period = model.opt.timestep
     total = float(np.sum(model.dof_armature) + np.sum(model.body_inertia[:, 1]))

@@ -346,14 +346,10 @@ def sobol(seed: int, number: int, dimensions: int, first: int, count: int) -> Un
     size = 1 << _LOW
     for block in range(first >> _LOW, ((first + count - 1) >> _LOW) + 1):
         begin, end = max(first, block * size), min(first + count, (block + 1) * size)
-        # The Gray code of block * 2^LOW + i is gray(block), then gray(i) with its top bit inverted if the block is
-        # odd.
-        gray, high = block ^ (block >> 1), shift.copy()
-        for bit in range(gray.bit_length()):
-            if gray >> bit & 1:
-                high ^= directions[:, _LOW + bit]
-        if block & 1:
-            high ^= directions[:, _LOW - 1]
+        # gray(block * 2^LOW + i) = gray(block * 2^LOW) ^ gray(i)
+        gray = block * size ^ (block * size >> 1)
+        bits = [bit for bit in range(gray.bit_length()) if gray >> bit & 1]
+        high = shift ^ np.bitwise_xor.reduce(directions[:, bits], axis=1)
         words = table[:, begin - block * size : end - block * size] ^ high[:, None]
         unit[:, begin - first : end - first] = words.astype(float)
     return (unit + 0.5) * 2.0**-BITS

@@ -6,20 +6,15 @@ import dataclasses
 import functools
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 
-from calibration.data import Columns, input_files
+from calibration.data import input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Load, Signal, signals_of_arrays, values_in_memory
+from calibration.data.sources.recorded_signals import Signal, StoredArray, array_in_memory, part_of, signals_of_arrays
 
-#: Arrays by path: shape, type, and a function that loads the array.
-Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Load]]
-#: Name of the type of an array of objects.
-_OBJECTS = np.dtype(object)
 #: Kind of a compressed variable in a MATLAB file.
 COMPRESSED = 15
 
@@ -30,7 +25,7 @@ def signals_of_npz(path: Path, name: str) -> tuple[Signal, ...]:
     Raises:
         BadData: a member whose path leads out of the archive.
     """
-    arrays: Arrays = {}
+    arrays: dict[str, StoredArray] = {}
     archive = zipfile.ZipFile(path)  # stays open until no signal needs it
     input_files.check_declared(name, len(archive.namelist()))
     for member in archive.namelist():
@@ -43,8 +38,7 @@ def signals_of_npz(path: Path, name: str) -> tuple[Signal, ...]:
         if array in arrays:
             raise BadData(f"{name}, {member}: is in the archive twice; expected different names")
         with archive.open(member) as stream:
-            shape, dtype = _read_npy_header(stream)
-        arrays[array] = (shape, dtype, _member(archive, member))
+            arrays[array] = (*_read_npy_header(stream), functools.cache(functools.partial(_member, archive, member)))
     return signals_of_arrays(name, arrays)
 
 
@@ -65,12 +59,9 @@ def _read_npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _member(archive: zipfile.ZipFile, member: str) -> Load:
-    def load() -> np.ndarray:
-        with archive.open(member) as stream:
-            return np.lib.format.read_array(stream, allow_pickle=False)
-
-    return functools.cache(load)
+def _member(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+    with archive.open(member) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def signals_of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
@@ -79,15 +70,14 @@ def signals_of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
 
     _check_matlab(path, name)
     loaded = functools.cache(lambda: io.loadmat(path, squeeze_me=False, struct_as_record=True, chars_as_strings=True))
-    arrays: Arrays = {}
-    plain = {"double", "single", "logical", "char", *(f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64))}
+    arrays: dict[str, StoredArray] = {}
+    plain = {"double", "single", "logical", *(f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64))}
+    types = {"char": np.dtype(str)} | dict.fromkeys(plain, np.dtype(float))
     for variable, shape, kind in io.whosmat(path):
         if kind == "struct":
-            for field, value in _structure_fields(variable, loaded()[variable]):
-                arrays[field] = (value.shape, value.dtype, values_in_memory(value))
+            arrays |= {field: array_in_memory(v) for field, v in _structure_fields(variable, loaded()[variable])}
         else:
-            dtype = np.dtype(float) if kind in plain - {"char"} else np.dtype(str) if kind == "char" else _OBJECTS
-            arrays[variable] = (shape, dtype, _variable(loaded, variable))
+            arrays[variable] = (shape, types.get(kind, np.dtype(object)), part_of(loaded, variable))
     return signals_of_arrays(name, arrays)
 
 
@@ -111,10 +101,6 @@ def _check_matlab(path: Path, name: str) -> None:
     input_files.check_memory(name, size)
 
 
-def _variable(loaded: Callable[[], Columns], name: str) -> Load:
-    return lambda: loaded()[name]
-
-
 def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Arrays of a structure by path. In an array of structures the path has an index."""
     if value.dtype.names is None:
@@ -135,11 +121,37 @@ def signals_of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     """
     import h5py
 
-    arrays: Arrays = {}
+    arrays: dict[str, StoredArray] = {}
     units: dict[str, str] = {}
+    seen: set[int] = set()
+
+    def add_group(group: Any, at: str) -> None:
+        address = h5py.h5o.get_info(group.id).addr
+        if address in seen:  # a group with several paths is read only under the first one
+            return
+        seen.add(address)
+        for key in group:
+            if not _inside(group, key, name):
+                continue
+            item, item_path = group[key], f"{at}/{key}"
+            if isinstance(item, h5py.Group):
+                add_group(item, item_path)
+            elif isinstance(item, h5py.Dataset) and item.shape is not None:
+                if item.external or item.is_virtual:
+                    raise BadData(
+                        f"{name}, {item_path}: its values are in another file; copy its data into this file"
+                    )
+                words = h5py.check_string_dtype(item.dtype) is not None
+                char = matlab and item.attrs.get("MATLAB_class") == b"char"
+                dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype
+                load = functools.cache(functools.partial(_dataset, path, item_path, words, char, matlab))
+                arrays[item_path] = (item.shape[::-1] if matlab else item.shape, dtype, load)
+                unit = next((item.attrs[k] for k in ("unit", "units", "Unit", "Units") if k in item.attrs), "")
+                units[item_path] = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+
     with h5py.File(path, "r") as file:
         matlab = any("MATLAB_class" in file[key].attrs for key in file if _inside(file, key, name))
-        _add_group(file, "", name, arrays, units, path, matlab, h5py, set())
+        add_group(file, "")
     return signals_of_arrays(name, arrays, units)
 
 
@@ -155,54 +167,14 @@ def _inside(group: Any, key: str, name: str) -> bool:
     return not isinstance(link, h5py.SoftLink) and not key.startswith("#")
 
 
-def _add_group(
-    group: Any,
-    at: str,
-    name: str,
-    arrays: Arrays,
-    units: dict[str, str],
-    path: Path,
-    matlab: bool,
-    h5py: Any,
-    seen: set[int],
-) -> None:
-    """Adds the arrays and units of a group. A group with several paths is read only under the first one."""
-    address = h5py.h5o.get_info(group.id).addr
-    if address in seen:
-        return
-    seen.add(address)
-    for key in group:
-        if not _inside(group, key, name):
-            continue
-        item, item_path = group[key], f"{at}/{key}"
-        if isinstance(item, h5py.Group):
-            _add_group(item, item_path, name, arrays, units, path, matlab, h5py, seen)
-            continue
-        if not isinstance(item, h5py.Dataset) or item.shape is None:
-            continue
-        if item.external or item.is_virtual:
-            raise BadData(f"{name}, {item_path}: its values are in another file; copy its data into this file")
-        words = h5py.check_string_dtype(item.dtype) is not None
-        char = matlab and item.attrs.get("MATLAB_class") == b"char"
-        dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype
-        shape = item.shape[::-1] if matlab else item.shape
-        arrays[item_path] = (shape, dtype, _dataset(path, item_path, words, char, matlab))
-        unit = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
-        units[item_path] = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> np.ndarray:
+    import h5py
 
-
-def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Load:
-    def load() -> np.ndarray:
-        import h5py
-
-        with h5py.File(path, "r") as file:
-            values = np.asarray(file[at].asstr()[()], dtype=str) if words else file[at][()]
-            missing = file[at].attrs.get("_FillValue")  # of netCDF
-        values = np.asarray(values)
-        if missing is not None and np.size(missing) == 1 and values.dtype.kind in "iuf":
-            values = np.ma.masked_equal(values, np.ravel(missing)[0])
-        if char:
-            return np.array(["".join(map(chr, row)) for row in np.atleast_2d(values.T)])
-        return values.T if matlab else values
-
-    return functools.cache(load)
+    with h5py.File(path, "r") as file:
+        values = np.asarray(file[at].asstr()[()], dtype=str) if words else np.asarray(file[at][()])
+        missing = file[at].attrs.get("_FillValue")  # of netCDF
+    if missing is not None and np.size(missing) == 1 and values.dtype.kind in "iuf":
+        values = np.ma.masked_equal(values, np.ravel(missing)[0])
+    if char:
+        return np.array(["".join(map(chr, row)) for row in np.atleast_2d(values.T)])
+    return values.T if matlab else values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Clock, Load, Signal
+from calibration.data.sources.recorded_signals import Clock, Signal, part_of, refused_signal
 
 #: Longest array in a message whose elements become signals. Longer arrays are images and point clouds.
 ELEMENTS = 64
@@ -39,38 +39,32 @@ def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
     """
     signals: list[Signal] = []
     with _opened(path) as reader:
-        topics = {c.topic: c for c in reader.connections}
-        for topic in sorted(topics):
-            kind = topics[topic].msgtype
-            count = sum(c.msgcount for c in reader.connections if c.topic == topic)
-            kinds = sorted({c.msgtype for c in reader.connections if c.topic == topic})
-            if len(kinds) > 1:
-                signals.append(
-                    _refused(topic, count, f"has messages of types {' and '.join(kinds)}; expected one type")
+        for topic in sorted({c.topic for c in reader.connections}):
+            connections = [c for c in reader.connections if c.topic == topic]
+            count = sum(c.msgcount for c in connections)
+            kind, *others = sorted({c.msgtype for c in connections})
+            why = ""
+            if others:
+                why = f"has messages of types {' and '.join((kind, *others))}; expected one type"
+            elif not count:
+                why = f"has no message of type {kind}"
+            elif kind not in reader.typestore.fielddefs:
+                why = (
+                    f"has messages of type {kind}, which the bag does not define; record it as MCAP, or convert it "
+                    "with rosbags-convert"
                 )
+            if why:
+                signals.append(refused_signal(topic, count, why))
                 continue
-            if not count:
-                signals.append(_refused(topic, 0, f"has no message of type {kind}"))
-                continue
-            if kind not in reader.typestore.fielddefs:
-                signals.append(
-                    _refused(
-                        topic,
-                        count,
-                        f"has messages of type {kind}, which the bag does not define; record it as MCAP, or "
-                        "convert it with rosbags-convert",
-                    )
-                )
-                continue
-            fields = dict(_values(_first(reader, topic)))
+            connection, _, raw = next(reader.messages(connections=connections))
+            fields = dict(_values(reader.deserialize(raw, connection.msgtype)))
             stamped = fields.pop(_STAMP, None) is not None
             read = functools.cache(functools.partial(_topic_values, path, topic))
-            clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", _column(read, ""), "ns")
-            units = UNITS.get(kind, {})
+            clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", part_of(read, ""), "ns")
             for field, value in fields.items():
-                unit = next((unit for start, unit in units.items() if field.startswith(start)), "")
-                words = isinstance(value, str)
-                signals.append(Signal(f"{topic}.{field}", count, _column(read, field), unit, clock, words))
+                units = (unit for start, unit in UNITS.get(kind, {}).items() if field.startswith(start))
+                load, words = part_of(read, field), isinstance(value, str)
+                signals.append(Signal(f"{topic}.{field}", count, load, next(units, ""), clock, words))
     return tuple(signals)
 
 
@@ -83,66 +77,42 @@ def _opened(path: Path) -> Any:
     return AnyReader([path], default_typestore=store)
 
 
-def _refused(topic: str, count: int, why: str) -> Signal:
-    return Signal(topic, count, lambda: np.empty(0), refused=why)
-
-
-def _first(reader: Any, topic: str) -> Any:
-    connections = [c for c in reader.connections if c.topic == topic]
-    connection, _, raw = next(reader.messages(connections=connections))
-    return reader.deserialize(raw, connection.msgtype)
-
-
-def _column(read: Callable[[], Columns], field: str) -> Load:
-    return lambda: read()[field]
-
-
 def _topic_values(path: Path, topic: str) -> Columns:
     """Values of every field of a topic, and under "" its time [ns]."""
-    rows: list[tuple[Any, ...]] = []
+    rows: list[list[Any]] = []
     recorded: list[int] = []
+    names: list[str] = []
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
-        names: list[str] | None = None
         for connection, instant, raw in reader.messages(connections=connections):
-            message = reader.deserialize(raw, connection.msgtype)
-            values = dict(_values(message))
-            if names is None:
-                names = list(values)
+            values = dict(_values(reader.deserialize(raw, connection.msgtype)))
+            names = names or list(values)
             if len(values) != len(names):
                 odd_name = next((n for n in (*names, *values) if (n in values) != (n in names)), "")
-                longer = len(values) > len(names)
+                amount = "more" if len(values) > len(names) else "fewer"
                 raise BadData(
-                    f"{path.name}, {topic}.{odd_name}: message {len(rows) + 1} has {'more' if longer else 'fewer'} "
-                    "elements than the first; expected arrays of one length in every message"
+                    f"{path.name}, {topic}.{odd_name}: message {len(rows) + 1} has {amount} elements than the first; "
+                    "expected arrays of one length in every message"
                 )
-            rows.append(tuple(values[n] for n in names if n in values))
+            rows.append([values[n] for n in names if n in values])
             recorded.append(instant)
-    columns = {n: np.array(column) for n, column in zip(names or [], zip(*rows, strict=True), strict=True)}
-    stamps = columns.pop(_STAMP, None)
+    columns = {n: np.array(column) for n, column in zip(names, zip(*rows, strict=True), strict=True)}
     received = np.array(recorded, np.int64)
-    if stamps is None or not (stamps > 0).all() or np.median(np.abs(stamps - received)) > _APART:
-        return columns | {"": received}  # simulated stamps, or none
-    return columns | {"": stamps}
+    stamps = columns.pop(_STAMP, np.zeros(len(received)))
+    are_plausible = (stamps > 0).all() and np.median(np.abs(stamps - received)) <= _APART  # or simulated, or missing
+    return columns | {"": stamps if are_plausible else received}
 
 
-def _values(message: Any, at: str = "") -> Iterator[tuple[str, Any]]:
-    for field in message.__dataclass_fields__:
-        if field.startswith("__"):
-            continue
-        value = getattr(message, field)
-        field_path = f"{at}.{field}" if at else field
-        if hasattr(value, "sec") and hasattr(value, "nanosec"):
-            yield field_path, value.sec * 1_000_000_000 + value.nanosec
-        elif hasattr(value, "__dataclass_fields__"):
-            yield from _values(value, field_path)
-        elif isinstance(value, list | tuple | np.ndarray):
-            if len(value) > ELEMENTS:
-                continue
-            for k, element in enumerate(value):
-                if hasattr(element, "__dataclass_fields__"):
-                    yield from _values(element, f"{field_path}[{k}]")
-                else:
-                    yield f"{field_path}[{k}]", element
-        else:
-            yield field_path, value
+def _values(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers and words in a message, by their path. Times in ns."""
+    if path and hasattr(value, "sec") and hasattr(value, "nanosec"):
+        yield path, value.sec * 1_000_000_000 + value.nanosec
+    elif hasattr(value, "__dataclass_fields__"):
+        for field in value.__dataclass_fields__:
+            if not field.startswith("__"):
+                yield from _values(getattr(value, field), f"{path}.{field}" if path else field)
+    elif not isinstance(value, list | tuple | np.ndarray):
+        yield path, value
+    elif len(value) <= ELEMENTS:
+        for k, element in enumerate(value):
+            yield from _values(element, f"{path}[{k}]")

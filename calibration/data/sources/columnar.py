@@ -17,10 +17,11 @@ from calibration.data.sources.recorded_signals import (
     Clock,
     Load,
     Signal,
+    array_in_memory,
+    refused_signal,
     refused_type,
     signals_of_arrays,
     unit_of_clock,
-    values_in_memory,
 )
 
 EXPECTED = (
@@ -39,9 +40,8 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     Raises:
         BadData: the object is of another kind.
     """
-    library = type(source).__module__.partition(".")[0]
-    kind = type(source).__name__
-    if library == "pandas" and kind == "DataFrame":
+    library, kind = type(source).__module__.partition(".")[0], type(source).__name__
+    if (library, kind) == ("pandas", "DataFrame"):
         return "the DataFrame", tuple(_of_frame(source))
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
         try:
@@ -54,19 +54,16 @@ def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
 
         return "the Arrow table", signals_of_arrow_table(pa.table(source))
     if library == "xarray" and kind in ("Dataset", "DataArray"):
-        return f"the {kind}", _of_xarray(
-            source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
-        )
+        dataset = source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
+        return f"the {kind}", _of_xarray(dataset)
     if isinstance(source, np.ndarray) and source.dtype.names:
-        return "the array", signals_of_arrays(
-            "the array", {n: (source.shape, source.dtype[n], values_in_memory(source[n])) for n in source.dtype.names}
-        )
+        fields = {name: array_in_memory(source[name]) for name in source.dtype.names}
+        return "the array", signals_of_arrays("the array", fields)
     if isinstance(source, Mapping):
         return "the dict", json_records.signals_of_json_content(source, "the dict")
     if isinstance(source, list | tuple) and source and all(isinstance(item, Mapping) for item in source):
         return "the records", json_records.signals_of_json_content(list(source), "the records")
-    library = type(source).__module__.partition(".")[0]
-    kind = f"{library} {type(source).__name__}".removeprefix("builtins ")
+    kind = f"{library} {kind}".removeprefix("builtins ")
     raise BadData(f"the source: got {kind}; expected {EXPECTED}")
 
 
@@ -81,28 +78,26 @@ def _of_frame(frame: Any) -> Iterator[Signal]:
         try:
             yield from signals_of_arrow_table(pa.table([pa.array(series, from_pandas=True)], [name]))
         except pa.ArrowException:  # complex numbers, or objects of several kinds
-            yield Signal(name, len(frame), lambda: np.empty(0), refused=refused_type(series.dtype))
+            yield refused_signal(name, len(frame), refused_type(series.dtype))
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
     """Signals of a Dataset. If its variables have several dimensions of time, each variable has its own clock."""
     dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
-    several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
-    signals_found: list[Signal] = []
-    for name, array in {**dataset.coords, **dataset.data_vars}.items():
+    has_clocks = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1
+    signals: list[Signal] = []
+    for title, array in {**dataset.coords, **dataset.data_vars}.items():
         if not array.dims:
             continue
-        clock = None
-        time = array.dims[0]
-        if several and time in dataset.coords:
-            unit = str(dataset.coords[time].attrs.get("units", "")) or unit_of_clock(str(time)) or ""
-            clock = Clock(str(time), _values(dataset.coords[time]), unit)
-        shape, dtype = array.shape, array.dtype
-        signals = signals_of_arrays(
-            "the Dataset", {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
-        )
-        signals_found += [dataclasses.replace(s, clock=clock) for s in signals]
-    return tuple(signals_found)
+        clock, time, name = None, str(array.dims[0]), str(title)
+        stored = (array.shape, array.dtype, _values(array))
+        unit = str(array.attrs.get("units", ""))
+        if has_clocks and time in dataset.coords:
+            stamps = dataset.coords[time]
+            clock = Clock(time, _values(stamps), str(stamps.attrs.get("units", "")) or unit_of_clock(time) or "")
+        of_array = signals_of_arrays("the Dataset", {name: stored}, {name: unit})
+        signals += [dataclasses.replace(s, clock=clock) for s in of_array]
+    return tuple(signals)
 
 
 def _values(array: Any) -> Load:

@@ -15,12 +15,12 @@ from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import (
     RUN,
     Signal,
+    array_in_memory,
     encodable_text,
     parent_path,
     path_parts,
     signals_of_arrays,
     unit_of_clock,
-    values_in_memory,
 )
 
 #: Largest JSON file [bytes], because its objects take about ten times as much memory. Deepest nesting.
@@ -81,7 +81,11 @@ def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
             f"{name}: holds no list of records and no arrays; expected "
             '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
         )
-    return signals_of_arrays(name, {path: (v.shape, v.dtype, values_in_memory(v)) for path, v in arrays.items()})
+    return signals_of_arrays(name, {path: array_in_memory(values) for path, values in arrays.items()})
+
+
+def _below(path: str, key: Any) -> str:
+    return f"{path}.{key}" if path else str(key)
 
 
 def _check_depth(name: str, at: str, depth: int) -> None:
@@ -93,15 +97,14 @@ def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> Non
     _check_depth(name, at, depth)
     if isinstance(value, Mapping):
         value = _unfold_pandas_dict(value)
-        if isinstance(value, list):
-            arrays[at or "values"] = _array(value)
-            return
+    if isinstance(value, Mapping):
         for key, inner in value.items():
-            _collect(inner, f"{at}.{key}" if at else str(key), arrays, name, depth + 1)
+            _collect(inner, _below(at, key), arrays, name, depth + 1)
         _add_time(value, at, arrays)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
         if value and all(isinstance(item, Mapping) for item in value):
-            _columns_of_records(value, at, arrays, name)
+            columns = _columns_of_episodes(value) or _columns_of_records(value, name)
+            arrays.update({_below(at, key): values for key, values in columns.items()})
         elif value:
             arrays[at or "values"] = _array(value)
     elif hasattr(value, "__array__"):
@@ -116,14 +119,12 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
         if isinstance(value.get(key), int | float) and value[key] > 0
     ]
     for inner in value if steps else ():
-        prefix = f"{at}.{inner}." if at else f"{inner}."
-        columns = [path[len(prefix) :] for path in arrays if path.startswith(prefix)]
+        prefix = f"{_below(at, inner)}."
+        columns = [path.removeprefix(prefix) for path in arrays if path.startswith(prefix)]
         if RUN in columns and not any(unit_of_clock(column) is not None for column in columns):
-            runs = arrays[prefix + RUN]
-            first_row_of_run = np.maximum.accumulate(
-                np.where(np.r_[True, runs[1:] != runs[:-1]], np.arange(len(runs)), 0)
-            )
-            arrays[f"{prefix}time_s"] = (np.arange(len(runs)) - first_row_of_run) * steps[0]
+            runs, row = arrays[prefix + RUN], np.arange(len(arrays[prefix + RUN]))
+            first_row = np.maximum.accumulate(np.where(np.r_[True, runs[1:] != runs[:-1]], row, 0))
+            arrays[f"{prefix}time_s"] = (row - first_row) * steps[0]
 
 
 def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
@@ -139,11 +140,8 @@ def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[An
     return dict(zip(map(str, names), map(list, zip(*rows, strict=True)), strict=True))
 
 
-def _columns_of_records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, name: str) -> None:
+def _columns_of_records(records: Sequence[Mapping[str, Any]], name: str) -> Columns:
     """Columns of records. A missing entry is a missing reading."""
-    if (episodes := _columns_of_episodes(records)) is not None:
-        arrays.update({f"{at}.{key}" if at else key: values for key, values in episodes.items()})
-        return
     columns: dict[str, list[Any]] = {}
     for k, record in enumerate(records):
         for key, value in _leaves(record, "", name, 1):
@@ -152,29 +150,27 @@ def _columns_of_records(records: Sequence[Mapping[str, Any]], at: str, arrays: C
                 input_files.check_memory(name, input_files.VALUE * (len(columns) + 1) * len(records))
                 columns[key] = [None] * len(records)
             columns[key][k] = value
-    for key, values in columns.items():
-        arrays[f"{at}.{key}" if at else key] = _array(values)
+    return {key: _array(values) for key, values in columns.items()}
 
 
-def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
-    """Columns of records whose values are equally long lists of numbers. Each record is a run. None for other
+def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns:
+    """Columns of records whose values are equally long lists of numbers. Each record is a run. Empty for other
     records.
 
     A text that differs in every record is the name of the run, otherwise its number is.
     """
     lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
-    lengths = [{len(v) for v in episode.values()} for episode in lists]
-    are_flat = all(not isinstance(x, list | Mapping) for episode in lists for v in episode.values() for x in v[:1])
-    if not are_flat or any(
-        len(n) != 1 or max(n) < 2 or episode.keys() != lists[0].keys()
-        for n, episode in zip(lengths, lists, strict=True)
-    ):
-        return None
-    rows = [n.pop() for n in lengths]
+    rows: list[int] = []
+    for episode in lists:
+        lengths = {len(v) for v in episode.values()}
+        is_nested = any(isinstance(v[0], list | Mapping) for v in episode.values())
+        if is_nested or len(lengths) != 1 or lengths == {1} or episode.keys() != lists[0].keys():
+            return {}
+        rows += lengths
     columns = {key: _array([x for episode in lists for x in episode[key]]) for key in lists[0]}
     single = [key for key in records[0] if all(isinstance(r.get(key), str | int | float) for r in records)]
-    texts = {key: [str(record[key]) for record in records] for key in single if isinstance(records[0][key], str)}
-    names = next((v for v in texts.values() if len({*v}) == len(v)), [str(k) for k in range(1, len(records) + 1)])
+    texts = ([str(record[key]) for record in records] for key in single if isinstance(records[0][key], str))
+    names = next((v for v in texts if len({*v}) == len(v)), [str(k) for k in range(1, len(records) + 1)])
     columns |= {key: _array([record[key] for record in records]).repeat(rows) for key in single}
     return columns | {RUN: np.repeat(names, rows)}
 
@@ -182,11 +178,10 @@ def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None
 def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:
     _check_depth(name, at, depth)
     for key, value in record.items():
-        key_path = f"{at}.{key}" if at else str(key)
         if isinstance(value, Mapping):
-            yield from _leaves(value, key_path, name, depth + 1)
+            yield from _leaves(value, _below(at, key), name, depth + 1)
         else:
-            yield key_path, value
+            yield _below(at, key), value
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 
 import numpy as np
 
@@ -74,11 +75,7 @@ def guessed_unit(raw: np.ndarray) -> str:
 
 
 def signals_on_one_grid(
-    name: str,
-    chosen: Mapping[str, Signal],
-    is_held: Callable[[str], bool],
-    is_measured: Callable[[str], bool],
-    grid: str,
+    name: str, chosen: Mapping[str, Signal], held: AbstractSet[str], measured: AbstractSet[str], grid: str
 ) -> tuple[np.ndarray, Columns, Names]:
     """Returns the time since the first row [s], the values of each signal at these times, and notes on the
     resampling.
@@ -91,8 +88,8 @@ def signals_on_one_grid(
     Args:
         name: name of the source.
         chosen: signals by the name of their column, each with a clock.
-        is_held: True for a column whose values are held.
-        is_measured: True for a column of readings.
+        held: columns whose values are held.
+        measured: columns of readings.
         grid: name of the clock to use as grid. Empty: the densest.
 
     Raises:
@@ -104,71 +101,60 @@ def signals_on_one_grid(
     except BadData as error:
         raise BadData(f"{name}, {str(error).removeprefix(f'{name}, ')}") from error
     begin = min(first for _, first, *_ in read.values())
-    times = {key: time + (first - begin) for key, (time, first, *_) in read.items()}
-    order = {key: _sample_order(time) for key, time in times.items()}
-    late = {key: int(np.count_nonzero(np.diff(times[key]) < 0)) for key, rows in order.items() if rows is not None}
-    times = {key: time if order[key] is None else time[order[key]] for key, time in times.items()}
-    shared_clock = {key: next(k for k in times if np.array_equal(times[k], time)) for key, time in times.items()}
-    for key, time in times.items():
-        _check(name, clocks[key].name, time)
-    measured = {id(s.clock) for column, s in chosen.items() if is_measured(column)}
+    times: dict[int, np.ndarray] = {}
+    order: dict[int, np.ndarray] = {}
+    notes = []
+    for key, (time, first, unit, period) in read.items():
+        clock = clocks[key].name
+        time = time + (first - begin)
+        if late := _late_samples(time):
+            order[key] = np.argsort(time, kind="stable")
+            time = time[order[key]]
+            notes.append(
+                f"{name}: {count_noun(late, 'sample')} of {clock} arrived late. Samples are sorted by time stamp"
+            )
+        times[key] = time
+        if period:
+            notes.append(f"{name}: {clock} wraps at {period:.10g}. The wraps are removed")
+        if not clocks[key].unit and unit not in ("", "s"):
+            notes.append(f"{name}: {clock} has no unit. Its numbers are read as {unit} ({_rate(time)})")
+        _check(name, clock, time)
     grid_clocks = [key for key, clock in clocks.items() if grid and clock.name == grid]
-    pool = grid_clocks or sorted(measured or times, key=lambda key: _step(times[key]))
-    main = pool[0]
-    rows = times[main]
-    step_columns = {column for column in chosen if is_held(column)}
-    starts = [times[id(chosen[column].clock)][0] for column in step_columns]
-    alike = SAME * min(_step(rows), 1.0)
-    is_covered = rows >= max(starts, default=-np.inf) - alike
+    of_readings = {id(s.clock) for column, s in chosen.items() if column in measured}
+    main = grid_clocks[0] if grid_clocks else min(of_readings or times, key=lambda key: _step(times[key]))
+    alike = SAME * min(_step(times[main]), 1.0)
+    starts = [times[id(s.clock)][0] for column, s in chosen.items() if column in held]
+    is_covered = times[main] >= max(starts, default=-np.inf) - alike
+    rows = times[main][is_covered]
     for key, time in times.items():
-        if time[-1] < rows[is_covered][0] if is_covered.any() else True:
+        if not len(rows) or time[-1] < rows[0]:
             raise BadData(
                 f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and every command "
                 "have begun; expected signals that overlap in time"
             )
     values: Columns = {}
-    brought: dict[str, list[str]] = {}
+    resampled: dict[str, list[str]] = {}
     for column, signal in chosen.items():
-        signal_values, key, sorted_by = signal.load(), shared_clock[id(signal.clock)], order[id(signal.clock)]
-        signal_values = signal_values if sorted_by is None else signal_values[sorted_by]
-        if key == shared_clock[main]:
+        key, signal_values = id(signal.clock), signal.load()
+        signal_values = signal_values[order[key]] if key in order else signal_values
+        if np.array_equal(times[key], times[main]):
             values[column] = signal_values[is_covered]
-            continue
-        on = rows[is_covered]
-        if column in step_columns or signal_values.dtype.kind not in "biuf":
-            values[column] = signal_values[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
-            brought.setdefault("held", []).append(column)
+        elif column in held or signal_values.dtype.kind not in "biuf":
+            values[column] = signal_values[np.maximum(np.searchsorted(times[key], rows + alike, side="right") - 1, 0)]
+            resampled.setdefault("held from sample to sample", []).append(column)
         else:
-            values[column] = readings_used_once(on, times[key], signal_values)
-            brought.setdefault("interpolated", []).append(column)
-    notes = []
-    if brought:
-        resampling_words = {
-            "held": "held from sample to sample",
-            "interpolated": "interpolated linearly between samples, each used once",
-        }
-        kind_sentences = "; ".join(
-            f"{', '.join(columns)} {resampling_words[kind]}" for kind, columns in brought.items()
-        )
-        notes.append(
-            f"{name}: signals have different clocks. Rows are taken at the samples of {clocks[main].name} "
-            f"({_rate(rows)}): {kind_sentences}"
-        )
+            values[column] = readings_used_once(rows, times[key], signal_values)
+            resampled.setdefault("interpolated linearly between samples, each used once", []).append(column)
     if not is_covered.all():
-        notes.append(f"{name}: {np.count_nonzero(~is_covered)} rows before the first command are left out")
-    for key, clock in clocks.items():
-        *_, unit, period = read[key]
-        if key in late:
-            notes.append(
-                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} arrived late. Samples are sorted by time "
-                "stamp"
-            )
-        if period:
-            notes.append(f"{name}: {clock.name} wraps at {period:.10g}. The wraps are removed")
-        if not clock.unit and unit not in ("", "s"):
-            notes.append(f"{name}: {clock.name} has no unit. Its numbers are read as {unit} ({_rate(times[key])})")
-    on = rows[is_covered]
-    return on - on[0], values, tuple(notes)
+        notes.insert(0, f"{name}: {np.count_nonzero(~is_covered)} rows before the first command are left out")
+    if resampled:
+        resampled_words = "; ".join(f"{', '.join(columns)} {how}" for how, columns in resampled.items())
+        notes.insert(
+            0,
+            f"{name}: signals have different clocks. Rows are taken at the samples of {clocks[main].name} "
+            f"({_rate(times[main])}): {resampled_words}",
+        )
+    return rows - rows[0], values, tuple(notes)
 
 
 def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -184,26 +170,26 @@ def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -
     resampled = np.full(len(rows), np.nan)
     if not len(time) or not len(rows):
         return resampled
-    next_row = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
-    nearest = np.where(
-        time - rows[next_row - 1] <= rows[np.minimum(next_row, len(rows) - 1)] - time, next_row - 1, next_row
-    )
-    nearest = np.minimum(nearest, len(rows) - 1)
-    step = _step(rows)
-    near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(step, 1e-9)])
+    after = np.minimum(np.searchsorted(rows, time), len(rows) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(time - rows[before] <= rows[after] - time, before, after)
+    near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(_step(rows), 1e-9)])
     near = near[(rows[near] >= time[0]) & (rows[near] <= time[-1])]
     resampled[near] = np.interp(rows[near], time, numbers)
     return resampled
 
 
-def _sample_order(time: np.ndarray) -> np.ndarray | None:
-    """Order of samples by their stamps if some were recorded slightly late. None if they are in order, or if the
-    clock was set back.
-    """
+def _late_samples(time: np.ndarray) -> int:
+    """Number of samples that were recorded slightly late. 0 if the clock was set back."""
     step = np.diff(time)
-    if not (step < 0).any() or step.min() < -LATE * float(np.median(np.abs(step))):
-        return None
-    return np.argsort(time, kind="stable")
+    is_late = step < 0
+    return 0 if (step < -LATE * np.median(np.abs(step))).any() else int(np.count_nonzero(is_late))
+
+
+def usual_step(time: np.ndarray) -> float:
+    """Median of the steps of a clock that rise, NaN if it never rises."""
+    steps = np.diff(time)
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
 
 
 def _step(time: np.ndarray) -> float:

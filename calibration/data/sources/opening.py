@@ -20,7 +20,7 @@ import numpy as np
 from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
 from calibration.data.sources import columnar
-from calibration.data.sources.recorded_signals import Load, Signal, Source, plain_values, refused_type
+from calibration.data.sources.recorded_signals import Clock, Load, Signal, Source, plain_values, refused_type
 
 #: Separator between the path of a file and the path of signals in it.
 WITHIN = "::"
@@ -130,14 +130,12 @@ def format_of(path: Path, name: str) -> Format | None:
                 f"{path / parts[0]}"
             )
     begin = input_files.first_bytes(path, name)
-    for magic, format_name in BEGINNINGS.items():
-        if begin.startswith(magic):
-            return format_name
-    if begin.startswith(b"PK\x03\x04") and (kind := _kind_of_zip(path)) is not None:
-        return kind
-    if any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
-        return JSON
-    return SUFFIXES.get(path.suffix.lower())
+    form = next((form for magic, form in BEGINNINGS.items() if begin.startswith(magic)), None)
+    if form is None and begin.startswith(b"PK\x03\x04"):
+        form = _kind_of_zip(path)
+    if form is None and any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
+        form = JSON
+    return form or SUFFIXES.get(path.suffix.lower())
 
 
 def _kind_of_zip(path: Path) -> Format | None:
@@ -162,17 +160,24 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     Raises:
         BadData: for the same reasons as `Format.signals`, or there is no signal below `within`.
     """
+    files = [path]
     if path.is_dir():
         for item in path.iterdir():
             if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
                 raise BadData(f"{name}, {item.name}: is a link that points outside the bag; expected the file itself")
             if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
                 raise BadData(f"{name}, {item.name}: is not a regular file; expected the files of a bag")
+        files = [file for file in sorted(path.iterdir()) if file.is_file()]
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
-    byte_count = sum(file.stat().st_size for file in _files_of_folder(path))
-    source = checked_source(name, form.kind, signals, byte_count, source_digest(path))
+    digest = hashlib.sha256()  # of the files in order of their names
+    for file in files:
+        with file.open("rb") as stream:
+            while block := stream.read(2**20):
+                digest.update(block)
+    byte_count = sum(file.stat().st_size for file in files)
+    source = checked_source(name, form.kind, signals, byte_count, digest.hexdigest())
     return source.below(within) if within else source
 
 
@@ -213,12 +218,12 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
     """
 
     def guarded(load: Load, path: str, signal: Signal, refused: str = "") -> Load:
-        signal_place = f"{name}, {path}"
+        place = f"{name}, {path}"
 
         def read() -> np.ndarray:
             if refused:
-                raise BadData(f"{signal_place}: {refused}")
-            input_files.check_memory(signal_place, signal.size or input_files.VALUE * signal.length)
+                raise BadData(f"{place}: {refused}")
+            input_files.check_memory(place, signal.size or input_files.VALUE * signal.length)
             try:
                 values = load()
                 why = refused_type(values.dtype)
@@ -226,39 +231,20 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
             except InputError:
                 raise
             except Exception as error:  # each library has its own errors
-                raise unreadable_file(signal_place, kind, error) from error
-            if why or len(values) != signal.length:
-                why = why or f"has {len(values)} of the {signal.length} values that it declares; it may be damaged"
-                raise BadData(f"{signal_place}: {why}")
+                raise unreadable_file(place, kind, error) from error
+            if not why and len(values) != signal.length:
+                why = f"has {len(values)} of the {signal.length} values that it declares; it may be damaged"
+            if why:
+                raise BadData(f"{place}: {why}")
             return values
 
         return read
 
-    clocks = {id(s.clock): (s.clock, s) for s in signals if s.clock is not None}
-    sound = {
-        key: dataclasses.replace(clock, load=guarded(clock.load, clock.name, signal))
-        for key, (clock, signal) in clocks.items()
-    }
+    clocks: dict[int, Clock] = {}
+    for s in signals:
+        if s.clock is not None and id(s.clock) not in clocks:
+            clocks[id(s.clock)] = dataclasses.replace(s.clock, load=guarded(s.clock.load, s.clock.name, s))
     return tuple(
-        dataclasses.replace(
-            s,
-            load=guarded(s.load, s.path, s, s.refused),
-            clock=None if s.clock is None else sound[id(s.clock)],
-        )
+        dataclasses.replace(s, load=guarded(s.load, s.path, s, s.refused), clock=clocks.get(id(s.clock)))
         for s in signals
     )
-
-
-def source_digest(path: Path) -> str:
-    """SHA-256 of a file, or of the files in a folder in order of their names."""
-    digest = hashlib.sha256()
-    for file in _files_of_folder(path):
-        with file.open("rb") as stream:
-            while block := stream.read(2**20):
-                digest.update(block)
-    return digest.hexdigest()
-
-
-def _files_of_folder(path: Path) -> list[Path]:
-    """Files in a folder in order of their names, or the file itself."""
-    return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import Columns, Names, delimited, input_files, presets_file
+from calibration.data import Columns, Mapped, Names, delimited, input_files, presets_file
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
-from calibration.data.presets_file import Preset, PresetColumn
+from calibration.data.presets_file import Preset
 from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import (
     RUN,
@@ -28,8 +28,6 @@ from calibration.data.sources.recorded_signals import (
 from mmrjax.errors import list_some
 from mmrjax.model import channels, quantities
 
-#: Columns in the form of `Layout.mapped`: name in this program, name in the source, factor from its unit.
-Mapped = tuple[tuple[str, str, float], ...]
 #: Columns of a source, and those that have other names there.
 ReadColumns = tuple[NamedArrays, Mapped]
 #: Most values of columns that the model does not use, which are read to find correlations with residuals.
@@ -38,7 +36,9 @@ EXTRA_VALUES = 20_000_000
 WEAKENED = 0.3
 
 
-def read_columns(source: Any, layout: Layout, columns: Preset | None = None, between: str = "held") -> ReadColumns:
+def read_columns(
+    source: Any, layout: Layout, columns: Preset = presets_file.NONE, between: str = "held"
+) -> ReadColumns:
     """Returns the columns of a file or of a table in memory, and those with other names in the source.
 
     Args:
@@ -62,10 +62,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
     form = opening.format_of(path, name)
     if form is not None:
         return _of_signals(opening.open_signals(path, within, name, form), layout, columns, between)
-    arrays = delimited.read_csv_columns(path, name)
-    if columns is not None and columns.header:
-        arrays = _with_header(arrays, columns)
-    return _of_table(arrays, layout, columns)
+    return _of_table(_with_header(delimited.read_csv_columns(path, name), columns.header), layout, columns)
 
 
 def _of_group(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
@@ -75,29 +72,28 @@ def _of_group(readings: Sequence[ReadColumns], name: str) -> ReadColumns:
         BadData: the files have different columns or units.
     """
     tables = [table for table, _ in readings]
-    first_table = tables[0]
-    for other in tables[1:]:
-        if other.header != first_table.header or other.units != first_table.units:
-            differing = sorted({*first_table.header} ^ {*other.header})
+    first, *others = tables
+    for other in others:
+        if (other.header, other.units) != (first.header, first.units):
+            differing = sorted({*first.header} ^ {*other.header})
             raise BadData(
-                f"{name}: {other.name} and {first_table.name} differ in "
+                f"{name}: {other.name} and {first.name} differ in "
                 f"{list_some(differing) if differing else 'the order or units of their columns'}; expected the same "
                 "columns in every file"
             )
-    values = [[table.values[k] for table in tables] for k in range(len(first_table.header))]
     joined = [
         np.concatenate(parts)
         if all(isinstance(v, np.ndarray) for v in parts)
         else list(itertools.chain(*map(column_texts, parts)))
-        for parts in values
+        for parts in zip(*(table.values for table in tables), strict=True)
     ]
-    header, units = first_table.header, first_table.units
+    header, units = first.header, first.units
     if RUN not in header:
         joined.append([Path(table.name).stem for table in tables for _ in range(len(table))])
         header, units = (*header, RUN), (*units, "") if units else ()
     digest = hashlib.sha256("".join(table.digest for table in tables).encode()).hexdigest()
     notes = tuple(dict.fromkeys(note for table in tables for note in table.notes))
-    return NamedArrays(name, header, tuple(joined), units, first_table.units_from, notes, digest), readings[0][1]
+    return NamedArrays(name, header, tuple(joined), units, first.units_from, notes, digest), readings[0][1]
 
 
 def read_whole_table(path: Path, within: str = "") -> NamedArrays:
@@ -116,37 +112,37 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays:
         if signal.refused or signal.clock is not None:
             raise BadData(f"{name}, {signal.path}: {signal.refused or 'has its own clock; expected one table'}")
     input_files.check_memory(name, input_files.VALUE * sum(s.length for s in signals.values()))
-    values = _in_rows(source, signals)
-    units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
-    return NamedArrays(
-        name, tuple(values), tuple(map(_raw_values, values.values())), units, "the source", digest=source.digest
-    )
+    return _arrays(source, _in_rows(source, signals), signals)
 
 
-def _with_header(arrays: NamedArrays, columns: Preset) -> NamedArrays:
+def _arrays(source: Source, values: Columns, signals: Mapping[str, Signal], notes: Names = ()) -> NamedArrays:
+    """Values with the units of their signals."""
+    units = tuple(quantities.unit_in_column(signals[c].unit if c in signals else "") for c in values)
+    raw = tuple(map(_raw_values, values.values()))
+    return NamedArrays(source.name, tuple(values), raw, units, "the source", notes, source.digest)
+
+
+def _with_header(arrays: NamedArrays, header: Names) -> NamedArrays:
     """Table without a header, with column names from a preset."""
-    if len(arrays.header) != len(columns.header) or not np.isfinite(column_numbers(list(arrays.header))).all():
+    if len(arrays.header) != len(header) or not np.isfinite(column_numbers(list(arrays.header))).all():
         return arrays
     values = tuple([first, *rest] for first, rest in zip(arrays.header, arrays.values, strict=True))
-    note = f"{arrays.name}: has no header. Its columns are read as {', '.join(columns.header)}"
-    return dataclasses.replace(arrays, header=columns.header, values=values, notes=(*arrays.notes, note))
+    note = f"{arrays.name}: has no header. Its columns are read as {', '.join(header)}"
+    return dataclasses.replace(arrays, header=header, values=values, notes=(*arrays.notes, note))
 
 
-def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> ReadColumns:
-    if columns is None:
-        return arrays, layout.mapped
+def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset) -> ReadColumns:
     by_name = dict(zip(arrays.header, arrays.values, strict=True))
 
     def has_readings(name: str) -> bool:
         return any(cell not in ("", "0") for cell in by_name[name])
 
     mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
-    if arrays.header and not any(pattern in by_name for _, pattern, _ in mapped):
-        raise _none_of(arrays.name, columns, arrays.header)
+    if arrays.header:
+        _check_any_found(arrays.name, columns, any(pattern in by_name for _, pattern, _ in mapped), arrays.header)
     columns.check_needed(mapped, layout.imposed_column, arrays.name)
     notes = (*arrays.notes, *notes, *weakened_field_notes(columns, by_name))
-    read = map(columns.column_of, arrays.header)
-    values = tuple(map(_decode_raw_numbers, read, arrays.values))
+    values = tuple(map(_decode_raw_numbers, map(columns.column_of, arrays.header), arrays.values))
     mapped = presets_file.merge_columns(mapped, layout.mapped)
     return dataclasses.replace(arrays, values=values, notes=notes), mapped
 
@@ -159,29 +155,28 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
     """
     notes = []
     for column in preset.columns:
-        column_name = next((name for name in column.theirs if name in values), None)
-        if column_name is not None and column.across in values:
-            q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (column_name, column.across))
+        name = next((name for name in column.theirs if name in values), None)
+        if name is not None and column.across in values:
+            q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (name, column.across))
             if d > WEAKENED * q:
                 notes.append(
-                    f"{preset.name}: {column.across} is {d / q:.0%} of {column_name}. The motor runs with field "
-                    "weakening there, which a DC motor model does not cover. Leave those rows out"
+                    f"{preset.name}: {column.across} is {d / q:.0%} of {name}. The motor runs with field weakening "
+                    "there, which a DC motor model does not cover. Leave those rows out"
                 )
     return tuple(notes)
 
 
-def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
-    pattern_words = ", ".join(column.theirs[0] for column in columns.columns[:6]) + (
-        ", ..." if len(columns.columns) > 6 else ""
-    )
-    has = ", ".join(header[:8]) + (", ..." if len(header) > 8 else "")
-    return BadData(
-        f"{name}: has none of the columns of {columns.name} ({pattern_words}), but {has}; correct the names, "
-        "or choose another preset"
-    )
+def _check_any_found(name: str, columns: Preset, is_found: bool, header: Sequence[str]) -> None:
+    """Rejects a source without any column of a preset."""
+    if columns.columns and not is_found:
+        patterns, has = (list_some(x, 120) for x in ([c.theirs[0] for c in columns.columns], header))
+        raise BadData(
+            f"{name}: has none of the columns of {columns.name} ({patterns}), but {has}; correct the names, or "
+            "choose another preset"
+        )
 
 
-def _of_signals(source: Source, layout: Layout, columns: Preset | None, between: str) -> ReadColumns:
+def _of_signals(source: Source, layout: Layout, columns: Preset, between: str) -> ReadColumns:
     """Columns of the signals with a meaning, and of some others."""
     signals = source.signals
 
@@ -189,48 +184,28 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
         matches = matching_signals(signals, name)
         return matches[0].path if "*" in name and len(matches) == 1 else name if matches else None
 
-    mapped, notes = ((), ()) if columns is None else columns.mapped(found)
-    if columns is not None and not any(found(pattern) for _, pattern, _ in mapped):
-        raise _none_of(source.name, columns, [s.path for s in signals])
-    if columns is not None:
-        columns.check_needed(mapped, layout.imposed_column, source.name)
+    mapped, notes = columns.mapped(found)
+    is_found = any(found(pattern) for _, pattern, _ in mapped)
+    _check_any_found(source.name, columns, is_found, [s.path for s in signals])
+    columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
-    signals_by_column, clock, missing = _chosen_signals(source, mapped, layout)
-    for column, signal in signals_by_column.items():
+    chosen, clock, missing = _chosen_signals(source, mapped, layout)
+    for column, signal in chosen.items():
         if signal.refused:
-            raise BadData(
-                f"{source.name}, {signal.path}: {signal.refused}"
-                + ("" if column == signal.path else f" (read as {column})")
-            )
-    timed = [s for s in signals_by_column.values() if s.clock is not None]
-    extras = _extra_columns(source, signals_by_column, timed)
-    size = input_files.VALUE * sum(s.length for s in (*signals_by_column.values(), *extras.values()))
+            read_as = "" if column == signal.path else f" (read as {column})"
+            raise BadData(f"{source.name}, {signal.path}: {signal.refused}{read_as}")
+    has_clocks = any(s.clock is not None for s in chosen.values())
+    extras = {} if has_clocks else _extra_columns(source, chosen)
+    size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
     input_files.check_memory(source.name, size)
-    if columns is not None:
-        signals_by_column = {
-            name: _decoded_signal(columns.column_of(name), signal) for name, signal in signals_by_column.items()
-        }
-    if timed:
-        values, more = _on_a_grid(source, signals_by_column, layout, between, clock, mapped)
+    chosen = {name: _decoded_signal(columns.column_of(name), signal) for name, signal in chosen.items()}
+    if has_clocks:
+        values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
     else:
-        values, more = _in_rows(source, signals_by_column), ()
+        values, more = _in_rows(source, chosen), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
-    if columns is not None:
-        notes = (*notes, *weakened_field_notes(columns, values))
-    units = tuple(
-        quantities.unit_in_column(next((s.unit for c, s in signals_by_column.items() if c == name), ""))
-        for name in values
-    )
-    arrays = NamedArrays(
-        source.name,
-        tuple(values),
-        tuple(map(_raw_values, values.values())),
-        units,
-        "the source",
-        (*source.notes, *more, *notes, *missing),
-        source.digest,
-    )
-    return arrays, mapped
+    notes = (*source.notes, *more, *notes, *weakened_field_notes(columns, values), *missing)
+    return _arrays(source, values, chosen, notes), mapped
 
 
 def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
@@ -260,7 +235,7 @@ def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dic
     return signals_by_column, clock, tuple(missing)
 
 
-def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
+def _decode_raw_numbers(column: presets_file.PresetColumn, raw: Raw) -> Raw:
     """Raw numbers converted to signed numbers around zero. Cells without a number are unchanged."""
     if not (column.sign_bit or column.zero):
         return raw
@@ -271,20 +246,18 @@ def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
     return [cell if np.isnan(x) else repr(x) for cell, x in zip(raw, counted.tolist(), strict=True)]
 
 
-def _decoded_signal(column: PresetColumn, signal: Signal) -> Signal:
+def _decoded_signal(column: presets_file.PresetColumn, signal: Signal) -> Signal:
     """Signal whose values are decoded before they are interpolated."""
     return dataclasses.replace(signal, load=lambda: np.asarray(_decode_raw_numbers(column, signal.load())))
 
 
-def _extra_columns(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
+def _extra_columns(source: Source, chosen: Mapping[str, Signal]) -> dict[str, Signal]:
     """Further columns of a table with the length of the chosen ones, unless they have too many values."""
     used_signals = {id(signal) for signal in chosen.values()}
-    longest = max((s.length for s in source.signals), default=0)
-    lengths = {s.length for s in chosen.values() if s.length > 1} or {longest}
+    lengths = {s.length for s in chosen.values() if s.length > 1}
+    lengths = lengths or {max((s.length for s in source.signals), default=0)}
     others = [s for s in source.signals if id(s) not in used_signals and not s.refused and s.length in lengths]
-    if own or sum(s.length for s in others) > EXTRA_VALUES:
-        return {}
-    return {s.path: s for s in others}
+    return {s.path: s for s in others} if sum(s.length for s in others) <= EXTRA_VALUES else {}
 
 
 def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Columns:
@@ -311,17 +284,8 @@ def _on_a_grid(
     """Values of signals with separate clocks, on one grid."""
     meanings = dataclasses.replace(layout, mapped=mapped).meanings(source.name, list(chosen))
     column_of = {c: "" if m is None else m.column for c, m in zip(chosen, meanings, strict=True)}
-    read = {*layout.measured_columns, *layout.deviation_columns}
-    over_time = {c: s for c, s in chosen.items() if s.clock is not None and column_of[c] not in TIME}
-    other_signals = {c: s for c, s in chosen.items() if s.clock is None and column_of[c] not in TIME}
-    lines = {layout.imposed_column} if between == "linear" or layout.imposed_column == SPEED else set()
-
-    def is_measured(column: str) -> bool:
-        return column_of[column] in read
-
-    def is_held(column: str) -> bool:
-        return not is_measured(column) and column_of[column] not in lines
-
+    signals = {c: s for c, s in chosen.items() if column_of[c] not in TIME}
+    over_time = {c: s for c, s in signals.items() if s.clock is not None}
     if not over_time:
         paths = [s.path for s in source.signals]
         raise BadData(
@@ -329,8 +293,13 @@ def _on_a_grid(
             f'the robot\'s file, for example [columns] supply_voltage_V = "{paths[0]}" (mmrjax inspect proposes the '
             "lines)"
         )
-    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
-    return {"time_s": time, **values, **_in_rows(source, other_signals, len(time))}, notes
+    measured = {c for c in chosen if column_of[c] in (*layout.measured_columns, *layout.deviation_columns)}
+    held = chosen.keys() - measured
+    if between == "linear" or layout.imposed_column == SPEED:
+        held -= {c for c in chosen if column_of[c] == layout.imposed_column}
+    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, held, measured, clock)
+    rest = {c: s for c, s in signals.items() if s.clock is None}
+    return {"time_s": time, **values, **_in_rows(source, rest, len(time))}, notes
 
 
 def _raw_values(values: np.ndarray) -> Raw:

@@ -7,7 +7,7 @@ import fnmatch
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from mmrjax.errors import similar_words
 
 #: Function that reads the values of a signal from its source.
 Load: TypeAlias = Callable[[], np.ndarray]
+#: Shape and type of an array, and a function that loads it.
+StoredArray: TypeAlias = tuple[tuple[int, ...], np.dtype, Load]
 #: Last parts of paths that mark time stamps, without unit.
 CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
 #: Units that the name of a clock may end with, and their value in seconds.
@@ -28,6 +30,7 @@ LISTED = 12
 #: Separators of the parts of a path.
 _PARTS = re.compile(r"[/.]|::")
 _UNIT_OF_CLOCK = re.compile(r"(?:[_ ]?[\[(]?)(s|ms|us|µs|ns|sec|seconds|millis|micros)[\])]?$", re.IGNORECASE)
+_COUNTS = {"millis": "ms", "micros": "us", "nanos": "ns"}
 _WORDS_OF_UNITS = {"sec": "s", "seconds": "s", "millis": "ms", "micros": "us"}
 
 
@@ -114,6 +117,21 @@ def values_in_memory(values: np.ndarray) -> Load:
     return lambda: values
 
 
+def array_in_memory(values: np.ndarray) -> StoredArray:
+    """Description of an array in memory."""
+    return values.shape, values.dtype, values_in_memory(values)
+
+
+def refused_signal(path: str, length: int, why: str) -> Signal:
+    """Signal that cannot be read, for the reason `why`."""
+    return Signal(path, length, lambda: np.empty(0), refused=why)
+
+
+def part_of(load: Callable[[], Any], key: Any) -> Load:
+    """Returns a function that loads something and returns its part with this key."""
+    return lambda: load()[key]
+
+
 def path_parts(path: str) -> list[str]:
     """Returns the parts of a path, separated by slashes, points or double colons."""
     return [part for part in _PARTS.split(path) if part] or [path]
@@ -163,19 +181,16 @@ def unit_of_clock(name: str) -> str | None:
     plain_name = name.strip().casefold()
     if plain_name in CLOCKS:
         return ""
-    if plain_name in ("millis", "micros", "nanos"):
-        return {"millis": "ms", "micros": "us", "nanos": "ns"}[plain_name]
+    if plain_name in _COUNTS:
+        return _COUNTS[plain_name]
     match = _UNIT_OF_CLOCK.search(plain_name)
     if match and plain_name[: match.start()].rstrip("_ ") in CLOCKS:
-        unit = match.group(1)
-        return _WORDS_OF_UNITS.get(unit, unit.replace("µ", "u"))
+        return _WORDS_OF_UNITS.get(match[1], match[1].replace("µ", "u"))
     return None
 
 
 def signals_of_arrays(
-    source: str,
-    arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Load]],
-    units: Mapping[str, str] | None = None,
+    source: str, arrays: Mapping[str, StoredArray], units: Mapping[str, str] | None = None
 ) -> tuple[Signal, ...]:
     """Signals of named arrays. Each column of an array of two dimensions is a separate signal, `name[0]`.
 
@@ -185,31 +200,27 @@ def signals_of_arrays(
 
     Args:
         source: name of the recording, for messages.
-        arrays: by path: shape, kind of numbers, and a function that returns the array.
+        arrays: arrays by path.
         units: units that the recording states, by path.
 
     Raises:
         BadData: too many columns (`input_files.check_declared`).
     """
-    units = units or {}
     input_files.check_declared(source, sum(_column_count(*array[:2]) for array in arrays.values()))
-    shapes = {path: (shape, dtype) for path, (shape, dtype, _) in arrays.items()}
-    lengths = {sample_count(shape) for shape, _ in shapes.values() if sample_count(shape) > 1}
+    lengths = {path: sample_count(shape) for path, (shape, *_) in arrays.items()}
     clocks: dict[int, dict[str, Clock]] = {}
-    if len(lengths) > 1:
-        for path, (shape, dtype) in shapes.items():
+    if len({n for n in lengths.values() if n > 1}) > 1:
+        for path, (shape, dtype, load) in arrays.items():
             unit = unit_of_clock(path_parts(path)[-1])
             if unit is not None and dtype.kind in "iufM" and sum(n > 1 for n in shape) == 1:
-                of_length = clocks.setdefault(sample_count(shape), {})
-                of_length.setdefault(parent_path(path), Clock(path, _flat(arrays[path][2]), unit))
+                of_length = clocks.setdefault(lengths[path], {})
+                of_length.setdefault(parent_path(path), Clock(path, _flat(load), unit))
     signals: list[Signal] = []
-    for path, (shape, dtype, load) in arrays.items():
-        unit = units.get(path, "")
-        clock_of_size = clocks.get(sample_count(shape), {})
-        clock = clock_of_size.get(parent_path(path)) or (
-            next(iter(clock_of_size.values())) if len(clock_of_size) == 1 else None
-        )
-        signals += _of_array(path, shape, dtype, load, unit, clock)
+    for path, array in arrays.items():
+        of_length = clocks.get(lengths[path], {})
+        only = next(iter(of_length.values())) if len(of_length) == 1 else None
+        clock = of_length.get(parent_path(path), only)
+        signals += _of_array(path, *array, (units or {}).get(path, ""), clock)
     return tuple(signals)
 
 
@@ -238,28 +249,18 @@ def _flat(load: Load) -> Load:
 def _of_array(
     path: str, shape: tuple[int, ...], dtype: np.dtype, load: Load, unit: str, clock: Clock | None
 ) -> list[Signal]:
-    words, n = dtype.kind in "US", sample_count(shape)
     if dtype.names:
-        return [
-            s
-            for name in dtype.names
-            for s in _of_array(f"{path}.{name}", shape, dtype[name], _field(load, name), "", clock)
-        ]
-    refused = refused_type(dtype)
+        fields = [_of_array(f"{path}.{n}", shape, dtype[n], part_of(load, n), "", clock) for n in dtype.names]
+        return [signal for signals in fields for signal in signals]
+    words, refused = dtype.kind in "US", refused_type(dtype)
     if not refused and len(shape) > 2:
         refused = f"has {len(shape)} dimensions; expected one, or two for several signals"
     size = float(math.prod(shape)) * max(dtype.itemsize, input_files.VALUE)
-    if refused or len(shape) < 2 or 1 in shape:
-        return [Signal(path, n, _flat(load), unit, clock, words, refused, size)]
-    return [Signal(f"{path}[{j}]", n, _column(load, j), unit, clock, words, "", size) for j in range(shape[1])]
-
-
-def _column(load: Load, j: int) -> Load:
-    return lambda: load()[:, j]
-
-
-def _field(load: Load, name: str) -> Load:
-    return lambda: load()[name]
+    parts = {path: _flat(load)}
+    if not refused and len(shape) == 2 and 1 not in shape:
+        parts = {f"{path}[{j}]": part_of(load, np.s_[:, j]) for j in range(shape[1])}
+    n = sample_count(shape)
+    return [Signal(p, n, part, unit, clock, words, refused, size) for p, part in parts.items()]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
+import functools
 import io
 import logging
 import re
@@ -15,7 +16,7 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Clock, Load, Signal, values_in_memory
+from calibration.data.sources.recorded_signals import Clock, Signal, refused_signal, values_in_memory
 
 
 def signals_of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
@@ -24,24 +25,20 @@ def signals_of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
     with _opened(path) as file:
         count = collections.Counter(c.name for g in file.groups for c in g.channels)
         for k, group in enumerate(file.groups):
-            master = file.masters_db.get(k)
-            rows = group.channel_group.cycles_nr
+            master, clock = file.masters_db.get(k), None
+            if master is not None:
+                clock = Clock(group.channels[master].name, functools.partial(_time, path, k), "s")
             title = str(getattr(group.channel_group, "acq_name", "") or f"group{k}")
-            clock = None if master is None else Clock(group.channels[master].name, _time(path, k), "s")
             for j, channel in enumerate(group.channels):
-                if j == master:
-                    continue
-                channel_path = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
-                unit = file.get_channel_unit(group=k, index=j) or ""
-                signals.append(Signal(channel_path, rows, _column(path, k, j), unit, clock))
-    clocks = {id(s.clock) for s in signals}
-    if len(clocks) == 1 and signals and signals[0].clock is not None:  # a table
-        time = signals[0].clock
-        signals = [
-            Signal("time_s", signals[0].length, time.load, "s"),
-            *(Signal(s.path, s.length, s.load, s.unit) for s in signals),
-        ]
-    return tuple(signals)
+                if j != master:
+                    channel_path = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
+                    load, unit = functools.partial(_column, path, k, j), file.get_channel_unit(group=k, index=j)
+                    signals.append(Signal(channel_path, group.channel_group.cycles_nr, load, unit or "", clock))
+    clock = signals[0].clock if signals else None
+    if clock is None or any(s.clock is not clock for s in signals):
+        return tuple(signals)
+    table = (dataclasses.replace(s, clock=None) for s in signals)
+    return (Signal("time_s", signals[0].length, clock.load, "s"), *table)
 
 
 @contextlib.contextmanager
@@ -71,23 +68,17 @@ def _close_half_made(error: BaseException) -> None:
         frame = frame.tb_next
 
 
-def _time(path: Path, group: int) -> Load:
-    def load() -> np.ndarray:
-        with _opened(path) as file:
-            return np.array(file.get_master(group))
-
-    return load
+def _time(path: Path, group: int) -> np.ndarray:
+    with _opened(path) as file:
+        return np.array(file.get_master(group))
 
 
-def _column(path: Path, group: int, index: int) -> Load:
-    def load() -> np.ndarray:
-        with _opened(path) as file:
-            samples = file.get(group=group, index=index, ignore_invalidation_bits=True)  # otherwise they are omitted
-        invalid = samples.invalidation_bits
-        values = np.asarray(samples.samples)
-        return values if invalid is None else np.ma.masked_array(values, np.asarray(invalid, bool))
-
-    return load
+def _column(path: Path, group: int, index: int) -> np.ndarray:
+    with _opened(path) as file:
+        samples = file.get(group=group, index=index, ignore_invalidation_bits=True)  # otherwise they are omitted
+    invalid = samples.invalidation_bits
+    values = np.asarray(samples.samples)
+    return values if invalid is None else np.ma.masked_array(values, np.asarray(invalid, bool))
 
 
 #: Bytes before the first message.
@@ -115,13 +106,13 @@ def signals_of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
     if log.file_corruption or not log.data_list:
         raise BadData(f"{name}: is a damaged or empty ULog file; download it again from the autopilot")
     signals = []
-    for data in log.data_list:
-        topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
-        clock = Clock(f"{topic}.timestamp", _field_values(data, "timestamp"), "us")
-        for field in data.data:
-            if field != "timestamp":
-                values = data.data[field]
-                signals.append(Signal(f"{topic}.{field}", len(values), _field_values(data, field), "", clock))
+    for topic_data in log.data_list:
+        topic, fields = topic_data.name, dict(topic_data.data)
+        if topic_data.multi_id:
+            topic = f"{topic}[{topic_data.multi_id}]"
+        clock = Clock(f"{topic}.timestamp", values_in_memory(fields.pop("timestamp")), "us")
+        for field, values in fields.items():
+            signals.append(Signal(f"{topic}.{field}", len(values), values_in_memory(values), "", clock))
     return tuple(signals)
 
 
@@ -132,27 +123,16 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
         BadData: the file ends within a message. The library does not report that.
     """
     formats: dict[str, list[tuple[str, int]]] = {}
-    size, byte = path.stat().st_size, ULOG_HEADER
-    with path.open("rb") as stream:
-        stream.seek(byte)
-        block, begin = b"", byte
-        while byte < size:
-            if byte - begin + 3 + 2**16 > len(block) and begin + len(block) < size:
-                stream.seek(byte)
-                block, begin = stream.read(2**22), byte
-            if len(block) - (byte - begin) < 3:
-                break
-            next_message = byte + 3 + int.from_bytes(block[byte - begin : byte - begin + 2], "little")
-            if next_message > size:
-                break
-            if block[byte - begin + 2 : byte - begin + 3] == b"F":
-                topic, _, fields = (
-                    block[byte - begin + 3 : next_message - begin].decode("utf-8", "replace").partition(":")
-                )
-                formats[topic] = [(kind, int(count or 1)) for kind, count in _FIELD.findall(fields)]
-            byte = next_message
-    if byte != size:
-        raise _cut_off(name, "message", byte, size)
+    content, byte = input_files.file_bytes(path, name, largest=path.stat().st_size), ULOG_HEADER
+    while byte < len(content):
+        begin = byte + 3
+        end = begin + int.from_bytes(content[byte : byte + 2], "little")
+        if max(begin, end) > len(content):
+            raise _cut_off(name, "message", byte, len(content))
+        if content[begin - 1 : begin] == b"F":
+            topic, _, fields = content[begin:end].decode("utf-8", "replace").partition(":")
+            formats[topic] = [(kind, int(count or 1)) for kind, count in _FIELD.findall(fields)]
+        byte = end
     return formats
 
 
@@ -166,16 +146,11 @@ def _cut_off(name: str, unit: str, byte: int, size: int) -> BadData:
 
 def _field_count(topic: str, formats: dict[str, list[tuple[str, int]]], sizes: dict[str, int]) -> int:
     """Number of fields in a topic, counting each element of an array and of a nested topic."""
+    if topic not in formats:
+        return 1
     if topic not in sizes:
-        nested_format = formats.get(topic)
-        sizes[topic] = (
-            1 if nested_format is None else sum(n * _field_count(kind, formats, sizes) for kind, n in nested_format)
-        )
+        sizes[topic] = sum(n * _field_count(kind, formats, sizes) for kind, n in formats[topic])
     return sizes[topic]
-
-
-def _field_values(data: Any, field: str) -> Load:
-    return lambda: np.asarray(data.data[field])
 
 
 #: Bytes before the extra header. Type of the control records (of entry 0) that start an entry.
@@ -187,34 +162,6 @@ NUMBERS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "?"}
 WORDS = ("string", "json")
 #: State of a SysId routine between its tests.
 BETWEEN_TESTS = "none"
-
-
-@dataclasses.dataclass
-class _Entry:
-    name: str
-    kind: str
-    stamps: list[int] = dataclasses.field(default_factory=list)
-    payloads: list[bytes] = dataclasses.field(default_factory=list)
-
-    def signal(self, clocks: dict[bytes, Clock]) -> Signal:
-        """The entry's values, with a clock in µs that entries with the same stamps share."""
-        if self.kind in NUMBERS:
-            values = np.frombuffer(b"".join(self.payloads), NUMBERS[self.kind])
-        elif self.kind in WORDS:
-            values = np.array([p.decode("utf-8", "replace") for p in self.payloads])
-        else:
-            return Signal(
-                self.name,
-                len(self.stamps),
-                lambda: np.zeros(0),
-                refused=f"has the type {self.kind}, which is not supported",
-            )
-        stamps = np.array(self.stamps)
-        if self.name.startswith("sysid-test-state-"):  # the end of a test has the stamp of its last sample
-            in_test = values != BETWEEN_TESTS
-            values, stamps = values[in_test], stamps[in_test]
-        clock = clocks.setdefault(stamps.tobytes(), Clock(f"{self.name} (time)", values_in_memory(stamps), "us"))
-        return Signal(self.name, len(values), values_in_memory(values), "", clock, self.kind in WORDS)
 
 
 def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
@@ -230,7 +177,7 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
     if content[7:8] != b"\x01":
         raise BadData(f"{name}: is a WPILOG file with a version other than 1; export it as CSV with DataLogTool")
     record_start = HEADER + int.from_bytes(content[8:HEADER], "little")
-    entries: dict[int, _Entry] = {}
+    entries: dict[int, tuple[str, str, list[int], list[bytes]]] = {}
     while record_start < len(content):
         sizes = content[record_start]
         lengths = (sizes & 3) + 1, (sizes >> 2 & 3) + 1, (sizes >> 4 & 7) + 1
@@ -243,13 +190,34 @@ def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
             raise _cut_off(name, "record", record_start, len(content))
         payload, record_start = content[begin : begin + size], begin + size
         if entry == 0 and payload[:1] == bytes([START]):
-            number, (title, kind) = int.from_bytes(payload[1:5], "little"), _name_and_type(payload[5:])
-            entries[number] = _Entry(title, kind)
-        elif entry in entries and (width := np.dtype(NUMBERS.get(entries[entry].kind, "V0")).itemsize) in (0, size):
-            entries[entry].stamps.append(stamp)
-            entries[entry].payloads.append(payload if width or entries[entry].kind in WORDS else b"")
+            number = int.from_bytes(payload[1:5], "little")
+            entries[number] = (*_name_and_type(payload[5:]), [], [])
+        elif entry in entries:
+            _, kind, stamps, payloads = entries[entry]
+            width = np.dtype(NUMBERS.get(kind, "V0")).itemsize
+            if width in (0, size):
+                stamps.append(stamp)
+                payloads.append(payload if width or kind in WORDS else b"")
     clocks: dict[bytes, Clock] = {}
-    return tuple(entry.signal(clocks) for entry in entries.values() if entry.stamps)
+    return tuple(_wpilog_signal(*entry, clocks) for entry in entries.values() if entry[2])
+
+
+def _wpilog_signal(
+    name: str, kind: str, recorded: list[int], payloads: list[bytes], clocks: dict[bytes, Clock]
+) -> Signal:
+    """Values of an entry, with a clock in µs that entries with the same stamps share."""
+    if kind in NUMBERS:
+        values = np.frombuffer(b"".join(payloads), NUMBERS[kind])
+    elif kind in WORDS:
+        values = np.array([p.decode("utf-8", "replace") for p in payloads])
+    else:
+        return refused_signal(name, len(recorded), f"has the type {kind}, which is not supported")
+    stamps = np.array(recorded)
+    if name.startswith("sysid-test-state-"):  # the end of a test has the stamp of its last sample
+        in_test = values != BETWEEN_TESTS
+        values, stamps = values[in_test], stamps[in_test]
+    clock = clocks.setdefault(stamps.tobytes(), Clock(f"{name} (time)", values_in_memory(stamps), "us"))
+    return Signal(name, len(values), values_in_memory(values), "", clock, kind in WORDS)
 
 
 def _name_and_type(payload: bytes) -> tuple[str, str]:

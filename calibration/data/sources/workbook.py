@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import re
 import zipfile
 from pathlib import Path
@@ -47,23 +47,23 @@ def signals_of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     input_files.check_declared(name, sum(frame.shape[1] for frame in tables.values()))
     signals = []
     for sheet, frame in tables.items():
-        header = ["" if pd.isna(cell) else str(cell).strip() for cell in frame.iloc[0]]
-        units = delimited.row_of_units(header, ["" if pd.isna(c) else str(c).strip() for c in frame.iloc[1]])
+        header, below = (["" if pd.isna(cell) else str(cell).strip() for cell in frame.iloc[k]] for k in (0, 1))
+        units = delimited.row_of_units(header, below)
         body = frame.iloc[2 if units else 1 :]
-        for k, title in enumerate(header):
+        for k, (title, unit) in enumerate(zip(header, units or [""] * len(header), strict=True)):
             if title:
-                signals.append(_signal(body.iloc[:, k].infer_objects(), title, sheet, units[k] if units else ""))
-    is_only_sheet = len(tables) == 1
-    return tuple(
-        dataclasses.replace(s, path=s.path.removeprefix(f"{next(iter(tables))}/")) if is_only_sheet else s
-        for s in signals
-    )
+                signal_path = title if len(tables) == 1 else f"{sheet}/{title}"
+                signals.append(_signal(body.iloc[:, k].infer_objects(), signal_path, f"{sheet}, {title}", unit))
+    return tuple(signals)
 
 
 def _cell_count(content: bytes) -> int:
     """Number of cells in the rectangle that a sheet's XML declares. Calamine allocates all of it."""
-    places = [(_column_no(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
-    width, height = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
+    places = re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)  # of .xlsx
+    height = max((int(row) for _, row in places), default=0)
+    width = max(
+        (functools.reduce(lambda n, c: 26 * n + c - ord("A") + 1, column, 0) for column, _ in places), default=0
+    )
     if b"number-columns-repeated" in content or b"number-rows-repeated" in content:  # of .ods
         for row in re.findall(rb"<table:table-row.*?</table:table-row>", content, re.DOTALL):
             cells = [c for c in re.findall(rb"<table:table-cell[^>]*>", row) if b"value" in c]
@@ -74,15 +74,7 @@ def _cell_count(content: bytes) -> int:
     return width * height
 
 
-def _column_no(column: bytes) -> int:
-    """Number of a sheet's column, from 1, by its letters."""
-    number = 0
-    for letter in column:
-        number = 26 * number + letter - ord("A") + 1
-    return number
-
-
-def _signal(cells: Any, title: str, sheet: str, unit: str) -> Signal:
+def _signal(cells: Any, path: str, place: str, unit: str) -> Signal:
     """A column of numbers, NaN for empty cells, of dates, or of words."""
     import pandas as pd
 
@@ -96,7 +88,7 @@ def _signal(cells: Any, title: str, sheet: str, unit: str) -> Signal:
         if words:
             return cells.fillna("").astype(str).to_numpy(str)
         if len(wrong):
-            raise BadData(f"{sheet}, {title}: got {str(wrong.iloc[0])[:40]!r} among numbers; expected a number")
+            raise BadData(f"{place}: got {str(wrong.iloc[0])[:40]!r} among numbers; expected a number")
         return numbers.to_numpy(float)
 
-    return Signal(f"{sheet}/{title}", len(cells), load, unit, words=words)
+    return Signal(path, len(cells), load, unit, words=words)

@@ -199,8 +199,10 @@ def problem_of_windows(
     def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
         factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
         white = np.stack([np.linalg.inv(x) for x in factors])
-        arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
-        integrals = Integrals(arrays[0], arrays[1], arrays[2], arrays[3], places, count)
+        integrals = Integrals(
+            jnp.asarray(windows.rows), jnp.asarray(windows.weight), jnp.asarray(slope), jnp.asarray(white), places,
+            count,
+        )  # fmt: skip
 
         whitened = np.asarray(_whitened(integrals, *plain)).reshape(-1, plain[0].shape[2])
         prior = np.concatenate([np.zeros(len(run)), fit.origin - fit.centre])
