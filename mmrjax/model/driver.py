@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -61,7 +61,7 @@ class Driver(eqx.Module):
     def unlimited(self) -> Driver:
         """Same driver without limit and diode."""
         without: dict[str, Any] = {"current_limit": None, "returns_current": True}
-        return dataclasses.replace(self, **without)
+        return replace(self, **without)
 
     def voltage(self, source: Scalar, duty: Scalar, pause: Scalar, back: Scalar) -> Scalar:
         """Mean voltage at the motors [V]. `pause`: share of a period without pulses [-]. `back`: back-EMF E [V]."""

@@ -23,6 +23,8 @@ Scalar = Float[Array, "..."] | float
 Scalars = dict[str, Scalar]
 #: Two numbers: of left and right, of two axes, or of two levers.
 Pair = Float[Array, " 2"]
+#: Instants of a run.
+Times = Float[Array, " times"]
 #: An index, or an array of indices.
 Index = Int[Array, "..."] | np.ndarray | int
 
