@@ -74,7 +74,7 @@ def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
 def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
     robot, runs = coarse
     problem = posed(robot, runs)
-    assert scans.scanned_coordinates(problem) == (1,)
+    assert problem.observe.scanned(problem) == (1,)
     count = problem.observe.number_of_scan_points(problem, 1)
     assert 2 * scans.RANGE * 0.02 / count <= 0.5 * 1e-3 / 3.0
 
