@@ -228,10 +228,8 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None) -> tuple[
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Reason for rejecting an option for a quantity that is not imposed."""
-    reason = IMPOSED_WORDS[robot.rig.imposed]
-    if robot.rig.imposed != "voltage":
-        return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
-    return f"{option}: the voltage is imposed on this robot; give {instead} [V]"
+    about = IMPOSED_WORDS[robot.rig.imposed]
+    return f"{option}: the {about.words} is imposed on this robot; give {instead} [{about.unit}]"
 
 
 def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> None:
@@ -243,9 +241,9 @@ def check_acting(robot: Robot, ground: Iterable[str], shaft: Iterable[str]) -> N
     Raises:
         BadConfiguration: there is one.
     """
-    for option in shaft if robot.has_ground else ground:
-        why = "has no effect on a shaft; remove it"
-        raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
+    options, why = (shaft, NO_BRAKE) if robot.has_ground else (ground, "has no effect on a shaft")
+    for option in options:
+        raise BadConfiguration(f"{option}: {why}; remove it")
 
 
 def check_battery(robot: Robot) -> None:

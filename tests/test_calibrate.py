@@ -108,7 +108,7 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
     assert_allclose(answer.speed, found.readings["speed"].after, rtol=1e-9)
     table = rows_of(tmp_path / "fitted/rows.csv")
     assert len(table) == 20 and table[0]["status"] == "converged"
-    assert float(table[3]["after_speed_mm_s"]) == pytest.approx(1e3 * found.readings["speed"].after[3], rel=1e-8)
+    assert_allclose(float(table[3]["after_speed_mm_s"]), 1e3 * found.readings["speed"].after[3], rtol=1e-8)
 
 
 def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, capsys):

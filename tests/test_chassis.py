@@ -53,7 +53,7 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
 
 def test_total_mass_stated_overrides_robot_and_payload(robot):
     state = State(0.0, 0.0, 0.0, 0.0)
-    assert float(begin_signals(robot, Conditions(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
+    assert_allclose(begin_signals(robot, Conditions(payload=3.0), state).mass, 16.1, rtol=1e-15)
     assert float(begin_signals(robot, Conditions(payload=3.0, total_mass=20.0), state).mass) == 20.0
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.requirements_file import load_requirements, parse_requirements
@@ -169,7 +170,7 @@ def test_turns_that_are_asked_for_are_those_that_settle(robot, name, left):
     runs = Conditions([0], voltage=24.0, payload=3.0, duty_left=left, duty_right=1.0).resolved(robot)
     reading = steady_batch(robot, runs).reading
     rate, *rolls = (float(reading[name][0]) for name in ("yaw_rate", "speed", "lateral_speed"))
-    assert float(value) == pytest.approx(rate if left else abs(math.hypot(*rolls) / rate), rel=1e-6)
+    assert_allclose(value, rate if left else abs(math.hypot(*rolls) / rate), rtol=1e-6)
     assert int(outcome) == CONVERGED
 
 
@@ -191,7 +192,7 @@ def test_endurance_is_the_integral_over_the_charge(robot):
     flowing = 0.5 * np.asarray(runs.total_current) + 1.5
     cell = np.asarray(robot.battery.voltage_cell(runs.total_current, jnp.asarray(charge)))
     use = cell >= robot.battery.voltage_cutoff
-    assert float(value) == pytest.approx(np.trapezoid(1 / flowing[use], charge[use]), rel=1e-4)
+    assert_allclose(value, np.trapezoid(1 / flowing[use], charge[use]), rtol=1e-4)
     assert int(outcome) == CONVERGED
 
 

@@ -69,7 +69,7 @@ def test_steepest_slope_that_sliding_ends_is_where_adhesion_is_used_up(robot, co
     found = steepest_slope.compute(robot, asked(configuration, 24.0, slope_deg=17.0, payload=3.0))
     ground = robot.configurations.members[configuration].ground
     closed = math.degrees(math.atan(float(ground.friction.static - ground.rolling_resistance)))
-    assert float(found["steepest_slope"]) == pytest.approx(closed, abs=1e-9)
+    assert_allclose(found["steepest_slope"], closed, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_peak_is_the_top_of_a_parabola():
         assert_allclose(start_figures.curve_peak(x, y), 3.0, atol=1e-12)
     # A current that its limit holds: no overshoot between the samples at the corner.
     held = jnp.minimum(30 * x, 1.5 - 1e-3 * x)
-    assert float(start_figures.curve_peak(x, held, 1.5)) == pytest.approx(1.5, abs=1e-3)
+    assert_allclose(start_figures.curve_peak(x, held, 1.5), 1.5, rtol=0, atol=1e-3)
     assert float(start_figures.curve_peak(x, held)) > 1.6
     for rises in (x, -x, jnp.where(x < 0.8, x, jnp.nan)):  # no top between: the largest sample
         assert float(start_figures.curve_peak(x, rises)) == float(jnp.nanmax(rises))
@@ -181,7 +181,7 @@ def test_peak_is_the_top_of_a_parabola():
 def test_crossing_is_exact_for_a_cubic():
     t = jnp.linspace(0.0, 1.0, 6)
     k, share = start_figures.first_crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
-    assert float(t[k] + share * (t[k + 1] - t[k])) == pytest.approx(0.3 ** (1 / 3), abs=1e-9)
+    assert_allclose(t[k] + share * (t[k + 1] - t[k]), 0.3 ** (1 / 3), rtol=0, atol=1e-9)
 
 
 # --- posture ------------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ LIMITED = Driver(current_limit=5.0)
     ],
 )
 def test_the_current_limit_takes_duty_from_what_drives_the_current(duty, current, limited):
-    assert float(LIMITED.duty_limited(duty, current)) == pytest.approx(limited, abs=1e-9)
+    assert_allclose(LIMITED.duty_limited(duty, current), limited, rtol=0, atol=1e-9)
     assert bool(LIMITED.limits(current)) is (abs(current) > 5.0)
 
 
@@ -140,7 +140,7 @@ def test_power_of_the_supply_is_what_goes_into_heat_and_motion(decay, duty, curr
     goes = sum(float(x) for x in sink_powers(robot, run, signals).values())
     stored = signals.voltage_left * signals.current  # in the inductance
     stored += (robot.motor.inertia + 1e-3) * signals.acceleration_wheel * signals.speed_wheel
-    assert float(source_power(robot, run, signals)) == pytest.approx(goes + float(stored), abs=1e-9)
+    assert_allclose(source_power(robot, run, signals), goes + float(stored), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("opened, current", [(1.0, 0.0), (-1.0, -0.1 * 40.0 / 5.0), (0.0, 0.0)])
@@ -148,4 +148,4 @@ def test_fast_decay_coasts_without_pulses_and_brakes_where_it_is_told_to(opened,
     run = Conditions(voltage=8.0, duty=0.0, open=opened)
     robot = bench(FAST)
     signals = driven_signals(robot, run, State(current, 40.0, 40.0, 0.0), None)
-    assert float(signals.voltage_left) == pytest.approx(0.0, abs=1e-12)
+    assert_allclose(signals.voltage_left, 0.0, rtol=0, atol=1e-12)

@@ -248,7 +248,7 @@ def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
         return speed
 
     rise = jax.grad(power)(24.0)
-    assert float(rise) == pytest.approx(float((power(24.001) - power(23.999)) / 0.002), rel=1e-5)
+    assert_allclose(rise, (power(24.001) - power(23.999)) / 0.002, rtol=1e-5)
 
 
 def test_energy_of_the_actuator_is_what_is_given_and_lost(with_effects):
@@ -320,7 +320,7 @@ def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     )
     subprocess.run([compiler, "-Wall", "-Werror", "-Wno-unused-function", "-o", "f", "f.c"], cwd=tmp_path, check=True)
     printed = subprocess.run([str(tmp_path / "f")], capture_output=True, check=True).stdout
-    assert float(printed) == pytest.approx(given["voltage_V"], rel=1e-5)
+    assert_allclose(float(printed), given["voltage_V"], rtol=1e-5)
 
 
 @pytest.mark.slow

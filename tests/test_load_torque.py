@@ -118,7 +118,7 @@ def test_every_fidelity_settles_alike_under_a_brake():
     assert_array_equal(at.motor_speed[3], without.motor_speed[3])
     times = time_grid(np.linspace(0, 4.0, 9))
     shown = jax.jit(history_signals)(bench(), Conditions(voltage=24.0, load_torque=0.5), jnp.asarray(times))
-    assert float(shown.speed_motor[-1]) == pytest.approx(float(at.motor_speed[0]), rel=1e-6)
+    assert_allclose(shown.speed_motor[-1], at.motor_speed[0], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -298,4 +298,4 @@ def test_a_dynos_table_gives_back_its_motor_and_nothing_is_missing(tmp_path):
     found = mm.discover(runs, rig, noise="motor_current=0.003 A,motor_speed=0.03 rpm")
     assert found.verdict == "none"
     for name, value in {"resistance": 0.5, "torque_constant": 0.05, "friction_coulomb": 0.01}.items():
-        assert float(getattr(found.robot.motor, name)) == pytest.approx(value, rel=0.01)
+        assert_allclose(getattr(found.robot.motor, name), value, rtol=0.01)

@@ -1,5 +1,7 @@
 """DC motor, eqs. (14)-(18)."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -69,14 +71,14 @@ def test_temperatures_in_closed_form_match_scipy(current):
 def test_permissible_time_is_when_the_limit_is_reached():
     motor = Motor()
     permissible = jax.jit(
-        lambda current, winding=25.0, housing=25.0: motor.time_permissible(current, winding, housing)
+        lambda current, ambient=25.0: replace(motor, temperature_ambient=ambient).time_permissible(current)
     )
     for current in (4.5, 8.0, 30.0):
         time = float(permissible(current))
         assert motor.temperatures_after(current, time, 25.0, 25.0)[0] == pytest.approx(125.0, rel=1e-9)
     assert permissible(3.9) == np.inf  # below the continuous current
     assert permissible(8.0, 130.0) == 0.0
-    assert permissible(8.0, 100.0, 80.0) < permissible(8.0) == motor.time_permissible(8.0)
+    assert permissible(8.0, 80.0) < permissible(8.0) == motor.time_permissible(8.0)
 
 
 @pytest.mark.slow

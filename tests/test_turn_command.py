@@ -215,7 +215,7 @@ def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
         mm.Conditions("6T2A", duty=duty, duty_left=1, duty_right=0.5)
     alone = mm.Conditions(0, duty=duty, duty_left=0.5)  # of the right side
     again = dataclasses.replace(alone, duty_right=jnp.asarray(0.5))
-    assert np.all(again.of_sides().duty == 0.5) and np.all(alone.of_sides().duty[1] == duty)
+    assert np.all(again.of_sides().duty == 0.5) and np.all(alone.of_sides().duty[1] == np.asarray(duty))
 
 
 TURNING = profile([0.0, 1.0], duty_left=[0.5, 0.5], duty_right=[1.0, 1.0])

@@ -17,7 +17,7 @@ from mmrjax.turning import circling as turning
 from mmrjax.turning import two_sides as room
 from mmrjax.turning.two_sides import Stance
 
-grip = jax.jit(lambda *inputs: room.ground_forces(room.GroundForceInputs(*inputs)))
+grip = jax.jit(lambda *inputs: room.GroundForceInputs(*inputs).forces())
 CONFIGURATIONS = ("6T2A", "4W2T")
 #: Duties of left and right: one side slower, one held, on the spot, one driven backward by the turn, slow.
 DUTIES = ((1.0, 0.5), (0.8, 0.0), (-1.0, 1.0), (0.3, -0.1), (0.25, 0.2))

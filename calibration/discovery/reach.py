@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
-from calibration.inference.operating import operating_readings
+from calibration.inference.ranges import operating_readings
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot

@@ -28,7 +28,7 @@ from calibration.data.effect_file import Library
 from calibration.data.runs import Runs
 from calibration.discovery.reach import LOADED, RUNNING
 from calibration.inference import observers
-from calibration.inference.operating import travel_of_rows
+from calibration.inference.ranges import travel_of_rows
 from mmrjax.effects import Effect
 from mmrjax.effects.base import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.model import channels, paper_robots, params

@@ -30,8 +30,8 @@ from calibration.discovery.search import Proposed, SearchResult
 from calibration.discovery.settings import HELD_OUT
 from calibration.discovery.verdict import VerdictNoise
 from calibration.inference.fit_notes import progress_remark
+from calibration.inference.lack_of_fit import common_factors, noise_remarks
 from calibration.inference.noise import Noise
-from calibration.inference.noise_factor import common_factors, noise_remarks
 
 #: Number of times that rows are screened for isolated outliers, with the effects found.
 SCREENINGS = 4

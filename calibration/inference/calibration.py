@@ -32,8 +32,8 @@ from calibration.inference import (
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, progress_remark, remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
+from calibration.inference.lack_of_fit import noise_remarks
 from calibration.inference.multistart import MultistartResult
-from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import EDGE, GENERATIONS, LEAST, StoreStage, compute_without_storing
 from calibration.inference.preparation import PreparedInput, prepare_input, rows_to_fit
 from calibration.inference.problem import MARGIN, Problem
@@ -351,7 +351,11 @@ def _calibration_result(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
     scanned = {k: scans.scan_coordinate(posed, z, k) for k in scans.scanned_coordinates(posed)}
-    about = scans.with_scanned_sds(about, scanned)
+    sd = about.sd.copy()
+    for k, scan in scanned.items():
+        sd[k] = scan.sd()
+    wider = sd / about.sd  # correlations are kept
+    about = dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [
         Remark("prior_of_product", name=name, mean=mean, sd=sd, share=priors.GUIDED)

@@ -187,8 +187,8 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
 
     def term(effect: Effect, remembered: Array) -> Array:
         alone = dataclasses.replace(robot, effects=(effect,))
-        there = _with_memory(signals, effect, remembered)
-        return jnp.asarray(balances.effects_sum(alone, there, effect.balance, effect.channel), float)
+        remembering = _with_memory(signals, effect, remembered)
+        return jnp.asarray(balances.effects_sum(alone, remembering, effect.balance, effect.channel), float)
 
     terms = [map_over_shapes(e, term, m) for e, m in zip(effects, memory, strict=True)]
     return jnp.concatenate([jnp.zeros(0), *terms])

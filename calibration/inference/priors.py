@@ -481,7 +481,7 @@ def parameter_coordinates(
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
     known_sds |= {**{n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names}, **stated}
     rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
-    location, spread, low, high, scale = zip(*rows, strict=True)
+    *numbers, scale = zip(*rows, strict=True)
     pairs = [(f"{c}.{follower}", f"{c}.{leader}") for c in robot.configurations for follower, leader in TIED]
     pairs += [(n, leader) for n in fields if (leader := _leading_parameter(robot, n)) is not None]
     tied = tuple(
@@ -489,11 +489,12 @@ def parameter_coordinates(
         for follower, leader in pairs
         if leader in names and follower not in names
     )
+    location, spread, low, high = map(jnp.asarray, numbers)
     return Coordinates(
-        jnp.asarray(location),
-        jnp.asarray(spread),
-        jnp.asarray(low),
-        jnp.asarray(high),
+        location,
+        spread,
+        low,
+        high,
         tuple(names),
         tuple(fields[name].spec.unit for name in names),
         scale,

@@ -118,37 +118,28 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
     columns = _columns_to_test(residuals)
     if not columns:
         return ()
-    channel_tests = [
-        (k, tests)
-        for k in range(fit.counts.shape[1])
-        if (tests := _tests_of_channel(residuals, k, columns)) is not None
-    ]
-    count = sum(len(tested.tests) for _, tested in channel_tests)
-    clusters = [
-        (count * float(p[0]), k, test)
-        for k, tests in channel_tests
-        for test, p in tests.p_values(tests.left[:, None])
-    ]
-    significant = [one for one in clusters if one[0] < LEVEL]
-    if not significant:
+    every = {k: _tests_of_channel(residuals, k, columns) for k in range(fit.counts.shape[1])}
+    channel_tests = {k: tests for k, tests in every.items() if tests is not None}
+    count = sum(len(tested.tests) for tested in channel_tests.values())
+    significant = {
+        k: [(count * float(p[0]), test) for test, p in tested.p_values(tested.left[:, None]) if count * p[0] < LEVEL]
+        for k, tested in channel_tests.items()
+    }
+    if not any(significant.values()):
         return ()
     # Smallest p-value of all tests for each permutation of the residuals.
     random = np.random.default_rng(seed)
-    longest = max(len(tested.left) for _, tested in channel_tests)
+    longest = max(len(tested.left) for tested in channel_tests.values())
     times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
     strongest = np.ones(times)
-    for _, tested in channel_tests:
+    for tested in channel_tests.values():
         permuted = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
         for _, p_values in tested.p_values(tested.project_out(permuted)):
             strongest = np.minimum(strongest, p_values)
     floor = 1 / (1 + len(strongest))
     answer: list[ResidualCluster] = []
-    for k, tested in channel_tests:
-        chances = [
-            (p, test, floor * (1 + int(np.sum(strongest <= p / count))))
-            for p, tests, test in significant
-            if tests == k
-        ]
+    for k, tested in channel_tests.items():
+        chances = [(p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, test in significant[k]]
         own_chances = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
         comparisons: list[tuple[float, _Comparison, list[str]]] = []
         for p, test in _coarse_first(own_chances, columns):
@@ -170,12 +161,10 @@ def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> l
     ordered: list[tuple[float, _Comparison]] = []
     waiting = list(found)
     while waiting:
-        first = waiting[0]
-        name = first[1].column
+        name = waiting[0][1].column
         coarser = [one for one in waiting if name in levels and _determines(words[name], words[one[1].column])]
-        first = coarser[0] if coarser else first
-        ordered.append(first)
-        waiting = [one for one in waiting if one is not first]
+        ordered.append((coarser or waiting)[0])
+        waiting = [one for one in waiting if one is not ordered[-1]]
     return ordered
 
 
@@ -465,9 +454,8 @@ def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndar
     """Regressors of a column: a mean for each of its levels, or a slope over ranks, for each level of `within`."""
     cell = np.zeros(len(cells), str) if within is None else within
     if _is_numeric(cells):
-        return np.stack(
-            [np.where(cell == c, _centred_ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
-        )
+        ranks = [_centred_ranks(np.where(cell == c, cells, np.nan)) for c in np.unique(cell)]
+        return np.stack(ranks, 1)
     words = _column_as_words(cells)
     cell_masks = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
     return np.stack([b for b in cell_masks if b.any()], 1).astype(float)
@@ -479,12 +467,9 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
     A mean for each set of labels and direction, then smooth curves over conditions and readings, as many as the
     number of rows allows.
     """
-    labels = [runs[name] for name in _condition_labels(runs)] + ([] if travel is None else [travel.astype(str)])
-    cells = (
-        np.array(["|".join(map(str, words)) for words in zip(*labels, strict=True)])
-        if labels
-        else np.zeros(len(runs), str)
-    )
+    labels = [np.zeros(len(runs), str), *(runs[name] for name in _condition_labels(runs))]
+    labels += [] if travel is None else [travel.astype(str)]
+    cells = np.array(["|".join(map(str, words)) for words in zip(*labels, strict=True)])
     indicators = np.stack([cells == c for c in np.unique(cells)], 1).astype(float)
     if indicators.shape[1] > SHARE * len(runs):
         indicators = np.ones((len(runs), 1))
@@ -518,21 +503,11 @@ def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, 
         keys = sorted(
             set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _level_order(x[1]))
         )
-        levels = tuple(
-            LevelMean(w, c, float(signed[in_group].mean()), int(in_group.sum()))
-            for c, w in keys if (in_group := (within == c) & (words == w)).any()
-        )  # fmt: skip
+        groups = [(w, c, signed[(within == c) & (words == w)]) for c, w in keys]
+        levels = tuple(LevelMean(w, c, float(group.mean()), len(group)) for w, c, group in groups)
+    coarser = () if _is_numeric(cells) else _coarser_columns(whole, k, test.column, words, within, signed)
     return ResidualCluster(
-        test.column,
-        channel.name,
-        channel.unit,
-        test.within,
-        test.reversing,
-        levels,
-        correlation,
-        p,
-        alike,
-        () if _is_numeric(cells) else _coarser_columns(whole, k, test.column, words, within, signed),
+        test.column, channel.name, channel.unit, test.within, test.reversing, levels, correlation, p, alike, coarser
     )
 
 
@@ -551,15 +526,14 @@ def _coarser_columns(
                 total += in_cell.sum() * (residual[in_cell].mean() - residual[in_level].mean()) ** 2
         return total
 
-    coarser, whole_chi2, counts = [], between(words), whole.counts[:, k]
+    shares, whole_chi2, counts = {}, between(words), whole.counts[:, k]
     for name, cells in whole.runs.extras.items():
         if name == column or _is_numeric(cells[counts]):
             continue
         coarse = _column_as_words(cells[counts])
         if len(np.unique(coarse)) > 1 and _determines(words, coarse) and whole_chi2 > 0:
-            share = between(coarse) / whole_chi2
-            coarser += [(name, float(share))] if share >= MOSTLY else []
-    return tuple(sorted(coarser, key=lambda one: -one[1]))
+            shares[name] = float(between(coarse) / whole_chi2)
+    return tuple(sorted(((n, x) for n, x in shares.items() if x >= MOSTLY), key=lambda one: -one[1]))
 
 
 def _level_order(word: str) -> tuple[float, str]:

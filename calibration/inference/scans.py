@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.inference.fit_notes import Remark, progress_remark
-from calibration.inference.identifiability import Z95, Identifiability
+from calibration.inference.identifiability import Z95
 from calibration.inference.optimizers import Optimum, evaluate_residuals
 from calibration.inference.problem import Observation, Problem
 from mmrjax.model.params import parameters_by_name
@@ -192,15 +192,6 @@ def search_lower_minima(
         sd[k] = scan.sd()
     settled = bool(found[0].converged) or cost_here - lowest < WORTH
     return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
-
-
-def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
-    """Linear analysis in which the sds of scanned coordinates come from their scans. Correlations are kept."""
-    sd = about.sd.copy()
-    for k, scan in scans.items():
-        sd[k] = scan.sd()
-    wider = sd / about.sd
-    return dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
 
 
 def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:

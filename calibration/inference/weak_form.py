@@ -204,13 +204,6 @@ def _rolling_signals(
     return balances.rolling_signals(robot, conditions, dataclasses.replace(state, current=current), row.way), current
 
 
-def _total_inertia(robot: Robot, chassis: Any, signals: Signals) -> Scalar:
-    """Total inertia at the driving wheel, of everything that moves with it when driven forward [kg·m²]."""
-    carried = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
-    gear, turning = robot.gearbox, chassis.inertia + signals.inertia_added + carried
-    return inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, turning)
-
-
 def equation_terms(
     plan: StatePlan, robot: Robot, row: LogPoints, shown: Array, probes: frozenset[str] = frozenset()
 ) -> tuple[Array, Array, Signals]:
@@ -243,7 +236,9 @@ def equation_terms(
     if plan.mechanical:
         # A torque, not an acceleration: the derivative by an inertia is then the motion, which states without noise
         # give. That of an acceleration is a torque, whose model error would enter its own instrument.
-        inertia = _total_inertia(robot, chassis, signals)
+        carried = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
+        gear, turns = robot.gearbox, chassis.inertia + signals.inertia_added + carried
+        inertia = inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, turns)
         read = (shown[plan.motion] - states.errors[plan.motion]) / states.unit if plan.angle else turning
         f.append(inertia * signals.acceleration_wheel)
         y.append(inertia * read / robot.gearbox.ratio)

@@ -17,6 +17,7 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -107,7 +108,7 @@ def on_host(tree: T) -> T:
     if dataclasses.is_dataclass(tree) and not isinstance(tree, type) and jax.tree_util.all_leaves([tree]):
         fields = {f.name: getattr(tree, f.name) for f in dataclasses.fields(tree)}
         changes: Any = {name: on_host(x) for name, x in fields.items() if isinstance(x, eqx.Module)}
-        return dataclasses.replace(tree, **changes) if changes else tree
+        return replace(tree, **changes) if changes else tree
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -94,18 +94,18 @@ def with_cells(robot: Robot, cells: Scalar) -> Robot:
     """Robot with this number of cells in series, which may be traced. Battery voltages scale with the number."""
     battery = robot.battery
     pack_ratio = cells / battery.cells
-    battery = dataclasses.replace(
+    battery = replace(
         battery, curvature=battery.curvature * pack_ratio, slope=battery.slope * pack_ratio,
         voltage_full=battery.voltage_full * pack_ratio, resistance=battery.resistance * pack_ratio,
     )  # fmt: skip
-    return dataclasses.replace(robot, battery=battery)
+    return replace(robot, battery=battery)
 
 
 def _robot_and_conditions_at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
     warm = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
-    motor = dataclasses.replace(robot.motor, resistance=warm)
-    robot = with_cells(dataclasses.replace(robot, motor=motor), rated.cells)
+    motor = replace(robot.motor, resistance=warm)
+    robot = with_cells(replace(robot, motor=motor), rated.cells)
     # slightly less charge is taken at a state of charge of 0, because a battery counts as empty there
     discharge = robot.battery.capacity * (1 - jnp.maximum(point.charge, 1e-9))
     return robot, Conditions(
@@ -140,7 +140,7 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     signals, status, _ = operating_state(robot_there, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
-    warm = dataclasses.replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
+    warm = replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
     quantities = {
@@ -186,7 +186,7 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
     most = CONDITIONS["payload"].range[1]
 
     def smallest_margin(robot: Robot, payload: Scalar) -> Scalar:
-        loaded_point = dataclasses.replace(point, payload=payload)
+        loaded_point = replace(point, payload=payload)
         robot_there, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
         signals, _, _ = operating_state(robot_there, conditions)
         heat_margin = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
@@ -200,9 +200,7 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
         return functools.reduce(jnp.minimum, margins)
 
     found, is_positive = _find_sign_change(smallest_margin, robot, jnp.zeros(()), jnp.asarray(most))
-    unladen_robot, conditions = _robot_and_conditions_at(
-        robot, dataclasses.replace(point, payload=jnp.zeros(())), rated
-    )
+    unladen_robot, conditions = _robot_and_conditions_at(robot, replace(point, payload=jnp.zeros(())), rated)
     signals, status, _ = operating_state(unladen_robot, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_voltage_margin(rated, signals, point) < 0), CUT_OFF, status)
     return jnp.where(is_positive, found, 0.0), outcome
@@ -250,7 +248,7 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
     def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
         """Mean battery current [A], margin above the cut-off [V], status."""
         robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
-        conditions = dataclasses.replace(conditions, discharge=jnp.asarray(discharge))
+        conditions = replace(conditions, discharge=jnp.asarray(discharge))
         signals, status, _ = operating_state(robot_there, conditions)
         stands = point.share <= 0
         motors = jnp.where(stands, 0.0, signals.total_current)
@@ -281,7 +279,7 @@ DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Valued:
     """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
-    conditions = dataclasses.replace(
+    conditions = replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
@@ -305,7 +303,7 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     tan α = B / (2 h). For a rigid robot whose load does not shift.
     """
     robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
-    conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
+    conditions = replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
     chassis = robot_there.chassis(conditions.configuration)
     stance = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
     friction = chassis.ground.friction.static * point.adhesion

@@ -16,7 +16,7 @@ from mmrjax.fidelities.base import History
 from mmrjax.fidelities.drive import TIME_SETTLED, drive
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import PITCH_GROUSER, PITCH_TOOTH
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Times
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 from mmrjax.numerics.elementary import value_and_slope
@@ -174,7 +174,7 @@ INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
 TOLERANCE = 1e-7
 
 
-def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: Scalar = np.inf) -> Float[Array, ""]:
+def curve_peak(times: Times, x: Times, kink: Scalar = np.inf) -> Float[Array, ""]:
     """Largest value of a sampled curve: vertex of the parabola through its largest sample and the two neighbours.
 
     Args:
@@ -195,9 +195,7 @@ def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: S
     return jnp.where(is_peak, top, highest)
 
 
-def first_crossing(
-    times: Float[Array, " times"], x: Float[Array, " times"], rate: Float[Array, " times"], level: Array
-) -> tuple[Array, Array]:
+def first_crossing(times: Times, x: Times, rate: Times, level: Array) -> tuple[Array, Array]:
     """First time at which a sampled curve crosses a level: index of the sample before, and fraction of the way to the
     next.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ HALVINGS = 24
 
 def slope_margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Float[Array, ""]:
     """The smaller of the margins of adhesion and of speed on a slope [-], see `travel_margin`."""
-    conditions = dataclasses.replace(conditions, slope_deg=jnp.asarray(slope_deg))
+    conditions = replace(conditions, slope_deg=jnp.asarray(slope_deg))
     return travel_margin(robot, operating_state(robot, conditions)[0])
 
 
@@ -51,9 +51,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         `steepest_slope` [deg], NaN if the robot does not travel on level ground, `STEEPEST`, with zero derivatives,
         if it climbs that. `status` is that of level ground.
     """
-    level_point = operating_point(
-        robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg))
-    )[0]
+    level_point = operating_point(robot, replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]
     still_robot, still = jax.lax.stop_gradient((robot, conditions))
 
     solution: optx.Solution = optx.root_find(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.quantities import HEAT, VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
-from mmrjax.model.signals import BATTERY_EMPTY, CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
+from mmrjax.model.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, safe_quotient
 from mmrjax.numerics.elementary import magnitude
 from mmrjax.undercarriage.side_contacts import GearReactions
 
@@ -69,7 +70,7 @@ class History(eqx.Module):
             nan = jnp.full_like(signals.current, jnp.nan)
             volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
             unknown: dict[str, Any] = dict.fromkeys(volts, nan)
-            signals = dataclasses.replace(signals, **unknown)
+            signals = replace(signals, **unknown)
         clock, (distance, signals, reading, reactions) = in_table_time(
             robot.rig, time, (distance, signals, reading, reactions)
         )
@@ -236,7 +237,7 @@ def mask_unknown(robot: Robot, found: Result) -> Result:
     """Copy of `found` in which numbers that depend on unknown parameters of the robot are NaN."""
     unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
-    return dataclasses.replace(found, **nan)
+    return replace(found, **nan)
 
 
 def exceeded_limits(robot: Robot, signals: Signals) -> dict[str, Scalar]:
@@ -275,11 +276,6 @@ def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
-def status_unless_empty(status: Array, robot: Robot, conditions: Conditions, discharge: Scalar) -> Array:
-    """A status, or `battery_empty` if the charge taken [C] has emptied the on-board battery."""
-    return jnp.where((conditions.battery > 0.5) & robot.battery.empty(discharge), BATTERY_EMPTY, status)
-
-
 def movers_slip(robot: Robot, signals: Signals) -> Array:
     """True if the movers slide over the ground faster than V_s."""
     return jnp.abs(signals.speed_sliding) > robot.chassis(signals.configuration).speed_grip
@@ -301,4 +297,4 @@ def withhold_numbers(answer: Result, valid: Array, sound: Array) -> Result:
         lambda x: jnp.where(valid, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
     )
     stands = {name: jnp.where(sound, getattr(answer, name), jnp.nan) for name in ("mass", "adhesion_used")}
-    return dataclasses.replace(blank, **stands, status=answer.status)
+    return replace(blank, **stands, status=answer.status)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -19,7 +19,6 @@ from mmrjax.fidelities.base import (
     Progress,
     RunBatch,
     result_of_signals,
-    status_unless_empty,
     withhold_numbers,
 )
 from mmrjax.fidelities.rest import HELD, holds, standing_signals, status_moving, voltage_at_rest
@@ -366,7 +365,7 @@ def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: A
     voltage = voltage_at_rest(robot, conditions) if conditions.voltage_follows else end.voltage
     status = status_moving(robot, conditions, end, voltage)
     status = jnp.where(parked, STALLED, status)
-    status = status_unless_empty(status, robot, conditions, end.discharge)
+    status = jnp.where(robot.battery.emptied(conditions.battery, end.discharge), BATTERY_EMPTY, status)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
 
 
@@ -429,7 +428,7 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
 
     def left(current: Array) -> Array:
         total = signals.total_current + robot.sides * signals.share_drawn * (current - signals.current)
-        shifted = dataclasses.replace(signals, current=current, total_current=total)
+        shifted = replace(signals, current=current, total_current=total)
         return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
     voltage, slope = value_and_slope(left, signals.current)

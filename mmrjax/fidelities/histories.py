@@ -40,7 +40,7 @@ from mmrjax.fidelities.drive import (
 )
 from mmrjax.fidelities.rest import HELD, shaft_direction, standing_signals
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Pair, Scalar
+from mmrjax.model.params import Pair, Scalar, Times
 from mmrjax.model.rig import interpolate
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
@@ -244,13 +244,13 @@ class RunStep(eqx.Module):
         return jax.vmap(rate)(states, stacked)
 
 
-def _slopes(speed: Array, times: Float[Array, " times"]) -> Array:
+def _slopes(speed: Array, times: Times) -> Array:
     """Slopes of the lines between the imposed speeds of instants, 0 in steps of no length."""
     length = jnp.diff(times)
     return jnp.where(length > 0, jnp.diff(speed) / jnp.where(length > 0, length, 1.0), 0.0)
 
 
-def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[RunStep, Conditions]:
+def run_steps(conditions: Conditions, times: Times) -> tuple[RunStep, Conditions]:
     """All steps of a run, and the conditions that do not change.
 
     In a step an imposed speed follows the line between the instants. At an instant it has the acceleration that the
@@ -398,7 +398,7 @@ class _StepPart(eqx.Module):
     end: Unknowns
 
 
-def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> RunStates:
+def solve_states(robot: Robot, conditions: Conditions, times: Times) -> RunStates:
     """Solves the equations of one run from standstill.
 
     Friction jumps when a shaft turns through rest. Each step therefore uses the friction of one direction. A step in
@@ -480,7 +480,7 @@ def _shaft_side(robot: Robot, conditions: Conditions, y: Array, length: Array) -
 
 
 def linearise_run(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: RunStates | None = None
+    robot: Robot, conditions: Conditions, times: Times, known: RunStates | None = None
 ) -> LinearisedRun:
     """A solved run, with its equations linearised along it.
 
@@ -549,7 +549,7 @@ def linearise_run(
 def _unknowns_at_ends(
     robot: Robot,
     conditions: Conditions,
-    times: Float[Array, " times"],
+    times: Times,
     known: RunStates | LinearisedRun,
 ) -> Array:
     """Unknowns at the end of every step of a solved run, with their derivatives with respect to the robot."""
@@ -655,7 +655,7 @@ def _sensitivity_jump(robot: Robot, conditions: Conditions, y: Unknowns, sides: 
 def history_signals(
     robot: Robot,
     conditions: Conditions,
-    times: Float[Array, " times"],
+    times: Times,
     known: LinearisedRun | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> Signals:
@@ -690,7 +690,7 @@ def history_signals(
 
 
 def _unknowns_of_run(
-    robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: LinearisedRun | None
+    robot: Robot, conditions: Conditions, times: Times, known: LinearisedRun | None
 ) -> tuple[Float[Array, "times unknowns"], Float[Array, "steps 2"]]:
     """Unknowns at every instant, and `sides` of every step."""
     constant_robot = jax.lax.stop_gradient(robot)
@@ -741,7 +741,7 @@ class StepCourse(eqx.Module):
 def course_between_instants(
     robot: Robot,
     conditions: Conditions,
-    times: Float[Array, " times"],
+    times: Times,
     known: LinearisedRun | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> StepCourse:

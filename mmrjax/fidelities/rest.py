@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,7 @@ def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tu
 
 def without_diode(robot: Robot) -> Robot:
     """Same robot on a supply that takes current back, for balances at an `admitted_current`."""
-    return dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=True))
+    return replace(robot, driver=replace(robot.driver, returns_current=True))
 
 
 def _signals_about_to_turn(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
@@ -109,7 +109,7 @@ def _signals_about_to_turn(robot: Robot, conditions: Conditions, state: State, d
     """
     signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
-    carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
+    carried = replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
     return balances.gearbox(robot, robot.chassis(conditions.configuration), carried, settled=True)
 
 
@@ -152,7 +152,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         loads = [jnp.where(conditions.held > 0.5, *both) for both in zip(inputs, loads, strict=True)]
     torque = elementary.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
     none = jnp.zeros_like(carried)
-    return dataclasses.replace(
+    return replace(
         ahead,
         direction=none,
         direction_travel=none,
@@ -173,7 +173,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
 
 
 def _without_motion(state: State) -> State:
-    return dataclasses.replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
+    return replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:
@@ -185,7 +185,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     none = jnp.zeros_like(conditions.voltage)
     memory = {effect.name: none for effect in robot.remembering}
     rest = State(none, none, none, conditions.discharge, memory, distance=none, gap=none if robot.loose else None)
-    settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
+    settled = replace(rest, current=current_at_rest(robot, conditions, rest))
     return jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0
 
 
@@ -234,7 +234,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
         return way, at_once
 
     def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
-        settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
+        settled = replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
         leaving_sense, later_sense = (
             1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then)
@@ -266,11 +266,11 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     none = jnp.zeros_like(conditions.voltage)
     still = State(none, none, none, conditions.discharge)
     turning = sense * chassis.ground.friction.speed_static * robot.gearbox.ratio / chassis.radius
-    spun = dataclasses.replace(still, speed_motor=turning * jnp.ones_like(still.speed))
+    spun = replace(still, speed_motor=turning * jnp.ones_like(still.speed))
     if conditions.motor_speed is not None:
         spins = sense * conditions.motor_speed > sense * turning
     else:
-        spun = dataclasses.replace(spun, current=current_settled(robot, conditions, spun))
+        spun = replace(spun, current=current_settled(robot, conditions, spun))
         spins = sense * _signals_about_to_turn(robot, conditions, spun, sense).torque_net > 0
     forward, backward = (balances.demanded_signals(robot, conditions, still, way + none) for way in (1.0, -1.0))
     return (_ground_margin(forward, backward) < 0) | spins
@@ -281,7 +281,7 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
 
     def left(wanted: Scalar) -> Scalar:
         current, is_limited = admitted_current(robot, conditions, wanted)
-        state_there = dataclasses.replace(state, current=current)
+        state_there = replace(state, current=current)
         none = jnp.zeros_like(state.speed)
         return balances.driven_signals(without_diode(robot), conditions, state_there, none).voltage_left - is_limited
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import jax
@@ -231,7 +232,7 @@ class Results:
     def __post_init__(self) -> None:
         result = self.result
         if isinstance(result, Result) and (coded := _comparable_codes(result.status)) is not result.status:
-            object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
+            object.__setattr__(self, "result", replace(result, status=coded))
 
     @staticmethod
     def pending(batch: PendingBatch, configurations: Names, model: str) -> Results:
@@ -266,7 +267,7 @@ class Results:
             columns = cache.get("_shown", {})
             reading = {k: columns.get(k, x) for k, x in batch_result.reading.items()}
             status = columns.get(STATUS, _comparable_codes(batch_result.status))
-            cache["result"] = dataclasses.replace(batch_result, reading=reading, status=status)
+            cache["result"] = replace(batch_result, reading=reading, status=status)
 
     def __getattr__(self, name: str) -> Any:
         self._compute(name)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox.internal as eqxi
@@ -240,16 +241,10 @@ def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     names, configuration = robot.configurations.names, conditions.configuration
     if isinstance(configuration, NamedConfigurations):
         try:
-            return dataclasses.replace(conditions, configuration=configuration.among(names))
+            return replace(conditions, configuration=configuration.among(names))
         except KeyError as error:
             raise UsageError(f"configuration: got {error.args[0]}; {allowed_words(error.args[0], names)}") from error
-    if (
-        not has_tracer(configuration)
-        and configuration.size
-        and not _all_within(_smallest_and_largest(configuration), 0, len(names) - 1)
-    ):
-        wrong = _first_outside(configuration, 0, len(names) - 1)
-        assert wrong is not None
+    if not has_tracer(configuration) and (wrong := _first_outside(configuration, 0, len(names) - 1)):
         numbered_names = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
         raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {numbered_names}")
     return conditions
@@ -288,9 +283,8 @@ def _check_conditions(conditions: Conditions) -> None:
         (low, high), unit = condition.range, condition.unit_shown
         if id(value) not in ends:
             ends[id(value)] = _smallest_and_largest(value)
-        if not _all_within(ends[id(value)], low, high):
-            wrong = _first_outside(value, low, high)
-            assert wrong is not None
+        least, most = ends[id(value)]
+        if not low <= least <= most <= high and (wrong := _first_outside(value, low, high)):
             raise UsageError(
                 f"{field.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {unit}".rstrip()
             )
@@ -311,11 +305,6 @@ def _smallest_and_largest(values: jax.Array | np.ndarray) -> tuple[float, float]
     numbers = np.asarray(values) if on_host else values
     least, most = jax.device_get((numbers.min(), numbers.max()))
     return float(least), float(most)
-
-
-def _all_within(ends: tuple[float, float], low: float, high: float) -> bool:
-    """True if every number is finite and within the limits."""
-    return low <= ends[0] and ends[1] <= high and math.isfinite(ends[0]) and math.isfinite(ends[1])
 
 
 def _first_outside(value: Any, low: float, high: float) -> tuple[str, float] | None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -20,7 +20,6 @@ from mmrjax.fidelities.base import (
     Progress,
     RunBatch,
     result_of_signals,
-    status_unless_empty,
     travel_status,
     withhold_numbers,
 )
@@ -38,6 +37,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
+    BATTERY_EMPTY,
     CODES,
     CONVERGED,
     FAILED,
@@ -92,7 +92,7 @@ def _signals_and_residuals(
         )
     if not robot.driver.returns_current:  # a diode takes the rest of the voltage
         settled = signals.voltage_back + signals.voltage_drop
-        signals = dataclasses.replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
+        signals = replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
     return state, signals, (slip, voltage, torque)
 
 
@@ -108,7 +108,7 @@ def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditio
     if conditions.held is None:
         return conditions, third
     is_clamped, load = _is_held(conditions), 0.0 if conditions.load_torque is None else conditions.load_torque
-    carried = dataclasses.replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
+    carried = replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
     return carried, jnp.where(is_clamped, 0.0, third)
 
 
@@ -121,7 +121,7 @@ def _residuals(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) ->
 
 def _residuals_without_limit(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
     """`_residuals` in most runs: linear, without the driver's limit and diode."""
-    return _residuals(unknowns, dataclasses.replace(robot, driver=robot.driver.unlimited()), own)
+    return _residuals(unknowns, replace(robot, driver=robot.driver.unlimited()), own)
 
 
 def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
@@ -136,7 +136,7 @@ def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, 
         sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
     # Without adhesion the robot slides, and the share of adhesion used has no value.
-    return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
+    return sound, replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
 def _initial_guess(robot: Robot, conditions: Conditions) -> Vector:
@@ -213,7 +213,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     reading = {**point.reading, "speed": speed}
     # The ground of a standing robot does not carry more than its limit either, although the shafts creep.
     exceeds_adhesion = parked & (point.adhesion_used > 1)
-    point = dataclasses.replace(
+    point = replace(
         point,
         reading=reading,
         slip=jnp.where(parked, contact.slip_ratio(speed, point.theoretical_speed), point.slip),
@@ -290,7 +290,7 @@ def _state_at_unknowns(
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
     status = jnp.where(_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
-    status = status_unless_empty(status, robot, conditions, conditions.discharge)
+    status = jnp.where(robot.battery.emptied(conditions.battery, conditions.discharge), BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
     return signals, status, sound, residual
 

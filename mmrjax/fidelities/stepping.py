@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -150,7 +151,7 @@ def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions
         raise UsageError("conditions: got a command for each side; a step travels straight, use mmrjax.simulate")
     if conditions.shape:
         raise UsageError(f"conditions: got runs of shape {conditions.shape}; expected one, and jax.vmap over several")
-    conditions = check_conditions(robot, dataclasses.replace(conditions, **values))
+    conditions = check_conditions(robot, replace(conditions, **values))
     if conditions.motor_speed is not None:
         raise UsageError("conditions: the motors' speed is imposed; a step needs a voltage or a current")
     return conditions

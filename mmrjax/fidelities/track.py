@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -190,7 +190,7 @@ def _assemble_trajectory(
     aloft = window & (load < ALOFT * jnp.sum(averages.signals.normal))
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | flag_mask({"jumps": jumps})
-    answer = withhold_numbers(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
+    answer = withhold_numbers(replace(answer, flags=flags), valid, status != FAILED)
     return TrackTrajectory(time[1:], motions.q, motions.v, signals, reactions, averages, answer)
 
 

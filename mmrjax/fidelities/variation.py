@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -114,7 +115,7 @@ class Variation(eqx.Module):
         if "configuration" in condition_values:
             condition_values["configuration"] = jnp.round(condition_values["configuration"]).astype(int)
         robot = params.replace(self.robot, values_by_name) if values_by_name else self.robot
-        return robot, dataclasses.replace(conditions, **condition_values)
+        return robot, replace(conditions, **condition_values)
 
 
 def variable_names(robot: Robot) -> Names:

@@ -7,7 +7,7 @@ Derivatives pass through their moments.
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -311,7 +311,7 @@ def _assemble_mission(
     outcome = jnp.where(c.ended, _early_end_status(c), outcome)
     end = jax.tree.map(lambda x: x[-1], ends.found)
     answer = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
-    answer = dataclasses.replace(answer, flags=c.flags)
+    answer = replace(answer, flags=c.flags)
 
     def named(x: Array) -> dict[str, Array]:
         signs = {"cell_low": -1.0}

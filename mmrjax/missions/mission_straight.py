@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -60,8 +60,8 @@ def with_consumers(robot: Robot, asked: Profile) -> Robot:
     """Robot with the current of its other consumers at an instant."""
     if asked.current_other is None:
         return robot
-    battery = dataclasses.replace(robot.battery, current_other=asked.current_other)
-    return dataclasses.replace(robot, battery=battery)
+    battery = replace(robot.battery, current_other=asked.current_other)
+    return replace(robot, battery=battery)
 
 
 def source_voltage(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
@@ -107,7 +107,7 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
     robot, conditions = with_consumers(robot, demand), demand.conditions(otherwise)
     state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
     duty, rate, error = controlled_duty(robot, demand.mode, demand.demand, conditions, state, integral)
-    return SegmentInputs(robot, dataclasses.replace(conditions, duty=duty), rate, error)
+    return SegmentInputs(robot, replace(conditions, duty=duty), rate, error)
 
 
 @compiled
@@ -219,7 +219,7 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
 
 def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
     """Status of a moving robot at its last instant."""
-    conditions_now = dataclasses.replace(conditions, discharge=found.discharge)
+    conditions_now = replace(conditions, discharge=found.discharge)
     return rest.status_moving(robot, conditions_now, found, found.duty * found.voltage_source)
 
 

@@ -6,8 +6,8 @@ sides give a mission of straight travel.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -105,11 +105,11 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
             * volts
             / jnp.maximum(mission_straight.source_voltage(robot, of_sides, state.discharge), 1e-3)
         )
-        of_sides = dataclasses.replace(of_sides, duty=jnp.where(segment_demand.mode == VOLTAGE, share, of_sides.duty))
+        of_sides = replace(of_sides, duty=jnp.where(segment_demand.mode == VOLTAGE, share, of_sides.duty))
     demand = demanded(robot, conditions, segment_demand)
     law = jax.vmap(functools.partial(mission_straight.controlled_duty, robot, segment_demand.mode))
     duty, rate, error = law(demand, of_sides, state, y[INTEGRAL] * _EACH[-1])
-    return SegmentInputs(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
+    return SegmentInputs(robot, replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
 
 
 @compiled
@@ -228,4 +228,4 @@ def status(robot: Robot, conditions: Conditions, found: TurningInstant) -> Array
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:
     """Signals over time, with the position of the robot."""
     x, y = (jnp.stack([so_far[name]] * 2, -1) for name in ("place_x", "place_y"))
-    return dataclasses.replace(signals, place_x=x, place_y=y)
+    return replace(signals, place_x=x, place_y=y)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -116,8 +116,8 @@ class Profile(eqx.Module):
 
         still: dict[str, Any] = {"time": self.time[0], "mode": self.mode[0]}
         nothing: dict[str, Any] = dict.fromkeys(still)
-        values = jax.tree.map(interpolate, dataclasses.replace(self, **nothing))
-        return dataclasses.replace(values, **still)
+        values = jax.tree.map(interpolate, replace(self, **nothing))
+        return replace(values, **still)
 
     def conditions(self, otherwise: Conditions) -> Conditions:
         """Conditions at an instant (see `at`). Those that the profile does not state are from `otherwise`."""
@@ -129,7 +129,7 @@ class Profile(eqx.Module):
             duty = condition_values.get(name, getattr(otherwise, name))
             condition_values[name] = None if duty is None else jnp.where(is_undriven, 0.0, duty)
         opened = jnp.where(self.mode == COAST, 1.0, jnp.where(self.mode == BRAKE, -1.0, otherwise.open))
-        return dataclasses.replace(otherwise, **condition_values, open=opened)
+        return replace(otherwise, **condition_values, open=opened)
 
 
 Index = Int[Array, ""] | int

@@ -6,9 +6,9 @@ fidelities are compositions of these functions.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import equinox as eqx
@@ -26,7 +26,7 @@ from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.numerics.elementary import at_least, clip, cosine, sine, value_and_slope
-from mmrjax.turning.two_sides import SIDES, GroundForceInputs, GroundForces, Stance, ground_forces, sum_of_sides
+from mmrjax.turning.two_sides import SIDES, GroundForceInputs, GroundForces, Stance, sum_of_sides
 
 #: Each balance with its unit and its equation.
 BALANCES = {
@@ -80,7 +80,7 @@ def effects_sum(robot: Robot, signals: Signals, balance: str, channel: str = "")
 
 
 def _fill_unset(signals: Signals, **values: Any) -> Signals:
-    return dataclasses.replace(signals, **values)
+    return replace(signals, **values)
 
 
 #: Motion in the plane of the ground, which straight travel does not have.
@@ -165,7 +165,7 @@ def sampled_controller(robot: Robot, conditions: Conditions, state: State) -> St
     values |= {} if state.pending is None else {"pending": duty}
     due = state.clock <= DUE / own.rate
     changed: Any = {name: jnp.where(due, value, getattr(state, name)) for name, value in values.items()}
-    return dataclasses.replace(state, **changed)
+    return replace(state, **changed)
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
@@ -434,7 +434,7 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
     """
     conditions = with_controller_duty(robot, conditions, state)
     if conditions.motor_speed is not None:
-        state = dataclasses.replace(state, current=_current_for_acceleration(robot, conditions, state, way))
+        state = replace(state, current=_current_for_acceleration(robot, conditions, state, way))
     return _signals_in_motion(robot, conditions, state, way)
 
 
@@ -454,7 +454,7 @@ def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Sca
     )
     signals = track(robot, chassis, _fill_unset(signals, traction=signals.demand))
     carried = signals.mass * (1 / robot.sides)
-    heavy = dataclasses.replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
+    heavy = replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
     signals = gearbox(robot, heavy, signals)
     acceleration = chassis.radius * signals.acceleration_wheel
     return _fill_unset(signals, acceleration=acceleration, traction=signals.demand + carried * acceleration)
@@ -477,7 +477,7 @@ def _current_for_acceleration(robot: Robot, conditions: Conditions, state: State
 
     def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
         robot, conditions, state = given
-        return _signals_in_motion(robot, conditions, dataclasses.replace(state, current=current), way)
+        return _signals_in_motion(robot, conditions, replace(state, current=current), way)
 
     return _solve_current(at, (robot, conditions, state))
 
@@ -591,7 +591,7 @@ def resolved_signals(
         The signals, and the result of `mover.pull`.
     """
     robot = robot.within(conditions.configuration)
-    chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
+    chassis = replace(robot.chassis(conditions.configuration), inertia=inertia)
     signals = _fill_unset(begin_signals(robot, conditions, state), normal=mover.normal)
     signals = _signals_up_to_slip(robot, conditions, chassis, signals)
     pull = mover.pull(chassis, signals)
@@ -613,7 +613,7 @@ def resolved_sides(
     Signals, the normal loads of `mover` and its result have that axis.
     """
     robot = robot.within(conditions.configuration)
-    chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
+    chassis = replace(robot.chassis(conditions.configuration), inertia=inertia)
     sides = conditions.of_sides()
     signals = _fill_unset(_begin_sides(robot, conditions, sides, motion), normal=mover.normal)
     signals = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
@@ -762,7 +762,7 @@ def turning_signals(
     with the load divided equally between the sides.
 
     Args:
-        loads: normal loads of both sides [N], see `turning.ground_forces`.
+        loads: normal loads of both sides [N], see `GroundForceInputs.forces`.
     """
     robot = robot.within(conditions.configuration)
     chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
@@ -778,7 +778,7 @@ def turning_signals(
         stance_loads, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral,
         motion.yaw_rate, rolling,
     )  # fmt: skip
-    contact_forces = ground_forces(inputs, loads)
+    contact_forces = inputs.forces(loads)
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill_unset(even, normal=contact_forces.normal / units, moment_lateral=contact_forces.moment / units)
     )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -183,11 +183,8 @@ class Conditions(eqx.Module):
         if not isinstance(configuration, jax.Array | NamedConfigurations):
             words = np.asarray(configuration)
             configurations = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
-        configurations = (
-            configurations
-            if isinstance(configurations, NamedConfigurations)
-            else _number_array("configuration", configurations, int)
-        )
+        if not isinstance(configurations, NamedConfigurations):
+            configurations = _number_array("configuration", configurations, int)
         numbers = {name: _number_array(name, x) for name, x in condition_values.items()}
         shapes = {name: x.shape for name, x in {"configuration": configurations, **numbers}.items()}
         try:
@@ -235,7 +232,7 @@ class Conditions(eqx.Module):
     def straight(self) -> Conditions:
         """Same conditions without any that belong to one side, heading uphill."""
         alike: dict[str, Any] = dict.fromkeys(OF_TURNS)
-        return dataclasses.replace(self, **alike)
+        return replace(self, **alike)
 
     def of_sides(self) -> Conditions:
         """Conditions of left and right side, with a leading axis of 2."""
@@ -243,7 +240,7 @@ class Conditions(eqx.Module):
         def side(name: str) -> Conditions:
             side_values = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
             fields: dict[str, Any] = dict.fromkeys(OF_SIDES)
-            return dataclasses.replace(self, **fields | {k: x for k, x in side_values.items() if x is not None})
+            return replace(self, **fields | {k: x for k, x in side_values.items() if x is not None})
 
         return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
 
@@ -265,7 +262,7 @@ class Conditions(eqx.Module):
         except KeyError as error:
             robot.configurations.index(error.args[0])  # raises a KeyError that lists the valid names
             raise
-        return dataclasses.replace(self, configuration=configuration)
+        return replace(self, configuration=configuration)
 
 
 def sides_contradiction(stated: Collection[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -75,7 +75,7 @@ def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) ->
 
 def stored_energy_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
     """Same as `stored_energy` for a robot that turns, with lateral and yaw motion [J]."""
-    signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
+    signals = replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
     turning = robot.chassis(jnp.max(signals.configuration)).turning
     mean_energy = jnp.mean(jax.vmap(lambda s: stored_energy(robot, s))(signals))
     across = jnp.mean(signals.mass) * motion.speed_lateral**2

@@ -160,24 +160,21 @@ class Motor(eqx.Module):
         end = jax.scipy.linalg.expm(augmented_matrix * time) @ begin
         return end[0], end[1]
 
-    def time_permissible(
-        self, current: Scalar, winding: Scalar | None = None, housing: Scalar | None = None
-    ) -> Scalar:
-        """Time for which a `current` [A] may flow before the winding reaches its limit [s]. inf: no end, 0: above it.
+    def time_permissible(self, current: Scalar) -> Scalar:
+        """Time for which a `current` [A] may flow from ambient temperature before the winding reaches its limit [s].
 
-        Args:
-            winding, housing: temperatures at the start [°C], None: ambient.
+        inf: no end, 0: above it.
         """
         ambient, limit = self.temperature_ambient, self.temperature_limit
-        begin = (ambient if winding is None else winding, ambient if housing is None else housing)
 
-        def excess(time: Scalar, held: tuple[Motor, Scalar, tuple[Scalar, Scalar]]) -> Array:
-            motor, current, begin = held
+        def excess(time: Scalar, held: tuple[Motor, Scalar]) -> Array:
+            motor, current = held
+            begin = motor.temperature_ambient, motor.temperature_ambient
             temperature_excess = motor.temperatures_after(current, time, *begin)[0] - motor.temperature_limit
             return jnp.where(jnp.isfinite(temperature_excess), temperature_excess, jnp.inf)
 
         bounds = {"lower": math.log(_SHORT), "upper": math.log(_LONG)}
-        inputs = jax.lax.stop_gradient((self, current, begin))
+        inputs = jax.lax.stop_gradient((self, current))
         solution: optx.Solution = optx.root_find(
             lambda log_time, held: excess(jnp.exp(log_time), held),
             optx.Bisection(rtol=0.0, atol=0.0, flip=False),  # type: ignore[call-arg]  # its norm is no field
@@ -189,12 +186,12 @@ class Motor(eqx.Module):
         )
         seconds = jax.lax.stop_gradient(jnp.exp(solution.value))
         # The Newton step from here changes no value; it carries the derivative.
-        hot, around = self.temperatures_after(current, seconds, *begin)
+        hot, around = self.temperatures_after(current, seconds, ambient, ambient)
         rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
         rises = jnp.isfinite(hot) & (rise > 0)
         seconds = seconds - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
         ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), inputs) > 0)
-        return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, seconds, jnp.inf))
+        return jnp.where(jnp.asarray(ambient) >= limit, 0.0, jnp.where(ever, seconds, jnp.inf))
 
 
 #: Torque below which the gearbox counts as unloaded, so that rounding does not decide the direction of power [N·m].

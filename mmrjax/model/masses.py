@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -164,7 +164,7 @@ def check_parts(robot: Robot) -> None:
     without = {"body_gyration": 0.0, "inertia_tracked": 0.0, "inertia_wheeled": 0.0}
     folded = {"lever_front": np.pi, "lever_rear": 0.0}
     gear = params.replace(robot.running_gear, {name: jnp.asarray(x) for name, x in (without | folded).items()})
-    bodiless = dataclasses.replace(robot, running_gear=gear)
+    bodiless = replace(robot, running_gear=gear)
     for k, (name, chassis) in enumerate(robot.configurations.items()):
         half = masses_of_parts(bodiless, Conditions(k).resolved(robot), chassis.mass)
         if np.any(np.asarray(half.body) <= 0):

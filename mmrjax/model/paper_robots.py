@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
@@ -99,14 +99,14 @@ def blank_robot(configurations: Configurations, sides: float = 1.0, rig: Rig | N
         sides: number of motors driven with the same input.
         rig: drive and measurement.
     """
-    motor = dataclasses.replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
-    gearbox = dataclasses.replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
+    motor = replace(Motor(), speed_limit=UNLIMITED, temperature_limit=UNLIMITED)
+    gearbox = replace(Gearbox(), speed_limit=UNLIMITED, torque_limit=None)
     robot = Robot(Battery(), motor, gearbox, configurations, sides=sides)
     unknown = tuple(
         p.name for p in params.walk_parameters(robot) if p.name.startswith(_OF_A_SHEET) and p.name not in _ASSUMED
     )
-    rig = dataclasses.replace(rig or Rig(), inherits=False, unknown=unknown)
-    return params.replace(dataclasses.replace(robot, rig=rig), _NOTHING)
+    rig = replace(rig or Rig(), inherits=False, unknown=unknown)
+    return params.replace(replace(robot, rig=rig), _NOTHING)
 
 
 def _simplified_robot(track_torque: float) -> Robot:

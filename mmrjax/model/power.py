@@ -93,6 +93,10 @@ class Battery(eqx.Module):
         """True if the charge taken [C] has reached the capacity."""
         return jnp.asarray(discharge >= self.capacity)
 
+    def emptied(self, on_board: Scalar, discharge: Scalar) -> Bool[Array, "..."]:
+        """True if it feeds the motors and is empty."""
+        return (on_board > 0.5) & self.empty(discharge)
+
 
 def cutoff_error(battery: Battery) -> str | None:
     """Reason why no mission can start on a battery, without naming its place. None: one can. Not traceable."""

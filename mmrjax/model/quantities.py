@@ -12,6 +12,7 @@ import functools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 #: Names in order, such as those of effects or columns.
@@ -288,7 +289,7 @@ class Channel(Quantity):
     def of_side(self, side: int) -> Channel:
         """The same channel of one side."""
         name, label = f"{self.name}_{SIDES[side]}", f"{self.label}, {SIDES[side]}"
-        return dataclasses.replace(self, name=name, label=label, word=name, side=side, in_profiles=False)
+        return replace(self, name=name, label=label, word=name, side=side, in_profiles=False)
 
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
         """Pickles the channel by its name, so that tables and results can go to other processes."""

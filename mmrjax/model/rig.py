@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.model import channels
-from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.params import Index, Scalar, Times, parameter
 from mmrjax.model.quantities import GOALS, Names
 
 #: Ways in which histories may begin.
@@ -138,11 +139,11 @@ class Rig(eqx.Module):
         if usual and not (self.instruments or self.columns or self.priors or self.surfaces):
             return self
         rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if i.signed is False)
-        return dataclasses.replace(
+        return replace(
             self, instruments=rectified, columns=(), priors=(), start=STARTS[0], between_rows=BETWEEN[0], surfaces=()
         )
 
-    def before(self, times: Float[Array, " times"], at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
+    def before(self, times: Times, at: Scalar | Float[Array, "..."]) -> tuple[Array, Array]:
         """Index of the last of `times` before each instant, and the share of the way to the next one [-].
 
         Both are held before the first and after the last. The imposed quantity acts `delay` later than its column
@@ -167,7 +168,7 @@ class Rig(eqx.Module):
             return values[k]
         return interpolate(values[k], values[k + 1], share)
 
-    def clock(self, times: Float[Array, " times"]) -> Array:
+    def clock(self, times: Times) -> Array:
         """Instants of the tables' clock [s] for a run known at `times` since the imposed quantity acts.
 
         They are `delay` later and start at 0, with rest before the run. If the delay is traced, `times` are returned.

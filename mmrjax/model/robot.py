@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -117,7 +118,7 @@ class Robot(eqx.Module):
         rig, effects = self.rig.for_equations(), tuple(e.for_equations() for e in self.effects)
         if rig is self.rig and all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
-        return dataclasses.replace(self, rig=rig, effects=effects)
+        return replace(self, rig=rig, effects=effects)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -129,7 +130,7 @@ class Robot(eqx.Module):
         shown_channels = self.rig.channels
         read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
         more = [c.name for c in read if c.name not in shown_channels]
-        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*shown_channels, *more)))
+        return replace(self, rig=replace(self.rig, channels=(*shown_channels, *more)))
 
     @property
     def unlike(self) -> Names:
@@ -205,7 +206,7 @@ class Robot(eqx.Module):
         copied_robot = eqx.tree_at(
             lambda c: c.chosen, self.configurations, self.chassis(configuration), is_leaf=lambda x: x is None
         )
-        return dataclasses.replace(self, configurations=copied_robot)
+        return replace(self, configurations=copied_robot)
 
     @property
     def radius_pulley(self) -> Scalar:

@@ -5,8 +5,8 @@ The fidelities `steady` and `drive` use both for conditions that distinguish the
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects.base import Effect
 from mmrjax.fidelities import rest
-from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, status_unless_empty, withhold_numbers
+from mmrjax.fidelities.base import mask_unknown, power_ratio, result_of_signals, withhold_numbers
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
@@ -354,13 +354,11 @@ def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tu
     current, is_limited = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(
         conditions.of_sides(), motion.current
     )
-    motion = dataclasses.replace(motion, current=jnp.asarray(current))
+    motion = replace(motion, current=jnp.asarray(current))
     travel = _turning(rest.without_diode(robot), conditions, motion, y[SETTLING:] * _load_units(robot, conditions))
     signals = travel.signals
-    signals = dataclasses.replace(
-        signals, voltage=signals.voltage - is_limited, voltage_left=signals.voltage_left - is_limited
-    )
-    return dataclasses.replace(travel, signals=signals), motion
+    signals = replace(signals, voltage=signals.voltage - is_limited, voltage_left=signals.voltage_left - is_limited)
+    return replace(travel, signals=signals), motion
 
 
 def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
@@ -420,7 +418,7 @@ def status_of_steady_motion(
     grip, load = travel.grip, jnp.sum(travel.grip.normal)
     tips = (jnp.abs(grip.moved) >= load / 2) | (jnp.abs(grip.centre) >= robot.running_gear.wheelbase / 2)
     status = jnp.where(tips, TIPS, status)
-    return status_unless_empty(status, robot, conditions, motion.discharge)
+    return jnp.where(robot.battery.emptied(conditions.battery, motion.discharge), BATTERY_EMPTY, status)
 
 
 def status_after_run(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
@@ -447,7 +445,7 @@ def _sides_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) ->
     sides = conditions.of_sides()
     slope_along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
     return (
-        dataclasses.replace(sides, slope_deg=slope_along, heading_deg=None),
+        replace(sides, slope_deg=slope_along, heading_deg=None),
         balances.states_of_sides(robot, conditions, motion),
     )
 
@@ -474,7 +472,7 @@ def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) ->
 def holds(robot: Robot, conditions: Conditions) -> Array:
     """True if friction holds a standing robot at the currents one millisecond after the start."""
     motion = motion_of_unknowns(robot, turning_start(robot, conditions))
-    settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
+    settled = replace(motion, current=current_at_rest(robot, conditions, motion))
     return jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0
 
 
@@ -487,7 +485,7 @@ def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Resu
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), side_results)
     flags = side_results.flags[0] | side_results.flags[1]
     limit = robot.sides / 2 * signals.adhesion_limit
-    result = dataclasses.replace(
+    result = replace(
         mean,
         reading=balances.readings_of_sides(robot, signals),
         slip=contact.slip_ratio(mean.speed, mean.theoretical_speed),

@@ -262,26 +262,24 @@ class GroundForceInputs(NamedTuple):
     yaw_rate: Scalar
     resistance: Array
 
+    def forces(self, loads: Pair | None = None) -> GroundForces:
+        """Ground forces and loads of both sides, which depend on each other.
 
-def ground_forces(inputs: GroundForceInputs, loads: Pair | None = None) -> GroundForces:
-    """Ground forces and loads of both sides, which depend on each other.
+        The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR). The load of
+        a side is never negative.
 
-    The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR). The load of a
-    side is never negative.
-
-    Args:
-        inputs: motion and stance of both sides.
-        loads: load transfer T [N] and centre of pressure x_p [m], if they are unknowns of a larger search. None: they
-            are solved here.
-    """
-    if loads is not None:
-        return _forces_at_loads(loads, None, inputs)
-    detached_inputs = jax.lax.stop_gradient(inputs)
-    at, rise = _solve_loads(detached_inputs)
-    forces = _forces_at_loads(at, None, inputs)
-    # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
-    change = _load_step(forces.lacking, rise.lacking)
-    return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
+        Args:
+            loads: load transfer T [N] and centre of pressure x_p [m], if they are unknowns of a larger search. None:
+                they are solved here.
+        """
+        if loads is not None:
+            return _forces_at_loads(loads, None, self)
+        detached_inputs = jax.lax.stop_gradient(self)
+        at, rise = _solve_loads(detached_inputs)
+        forces = _forces_at_loads(at, None, self)
+        # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
+        change = _load_step(forces.lacking, rise.lacking)
+        return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
 
 
 def _load_step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:

@@ -10,9 +10,9 @@ replaces the straight-travel law of Fig. 7. Roll is small.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -69,7 +69,7 @@ class _ContactsOfSides(eqx.Module):
             along = side_contacts.sliding_speeds(signals, at)
             friction_force = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
             pulled = side_contacts.contact_forces(self.path, chassis, signals, at, height, friction_force * along)
-            return dataclasses.replace(pulled, aside=-self.lateral * friction_force * aside)
+            return replace(pulled, aside=-self.lateral * friction_force * aside)
 
         return jax.vmap(side)(signals, self.at, self.aside, self.height)
 
@@ -143,12 +143,12 @@ def _loss_derivatives(run: HalfRobotSystem, motion: PlaneMotion, sides: _Contact
     """
 
     def along(change: Scalar) -> Array:
-        signals, pulled = _resolve_signals(run, dataclasses.replace(motion, speed=motion.speed + change), sides)
+        signals, pulled = _resolve_signals(run, replace(motion, speed=motion.speed + change), sides)
         return jnp.sum(pulled.force, axis=-1) - signals.resistance
 
     def shaft(change: Scalar) -> Array:
         faster = motion.speed_motor + run.robot.gearbox.ratio * change
-        return _resolve_signals(run, dataclasses.replace(motion, speed_motor=faster), sides)[0].torque_net
+        return _resolve_signals(run, replace(motion, speed_motor=faster), sides)[0].torque_net
 
     zero, one = jnp.zeros_like(motion.speed), jnp.ones_like(motion.speed)
     return jnp.stack([jnp.maximum(-jax.jvp(f, (zero,), (one,))[1], 0.0) for f in (along, shaft)])
@@ -179,9 +179,7 @@ def generalized_forces(
     y, several = _places_of_sides(run), run.robot.sides / 2
     assert pulled.aside is not None
     moment_lateral = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
-    lateral, yaw = balances.lateral_and_yaw_effects(
-        run.robot, dataclasses.replace(signals, moment_lateral=moment_lateral)
-    )
+    lateral, yaw = balances.lateral_and_yaw_effects(run.robot, replace(signals, moment_lateral=moment_lateral))
     forward, normal, moment, rear = pulled.generalized.T
     ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral
     turn = several * (jnp.sum(pulled.aside * at.lever_x) - y @ forward) - yaw
@@ -329,7 +327,7 @@ def _state_after_step(
     v = motion.v + gained
 
     def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
-        of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
+        of_side = replace(run, conditions=own), replace(motion, memory=memory)
         return half_robot.other_states_after_step(*of_side, signals)
 
     current, discharge, memory = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
@@ -364,14 +362,14 @@ def _signals_after_step(
     forward = run.half.centre[0]
     arm = touching.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
-    signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
+    signals = replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
     # Of the centre of mass, in the rotating frame of the robot.
     speed, lateral = _mid_wheelbase_speeds(motion, motion.v)
     ahead_gained, aside_gained = _mid_wheelbase_speeds(motion, gained / run.step)
     turn = gained[YAW] / run.step
     y = _places_of_sides(run)
     acceleration = ahead_gained + motion.v[YAW] * lateral
-    signals = dataclasses.replace(signals, acceleration=acceleration - turn * y)
+    signals = replace(signals, acceleration=acceleration - turn * y)
     grip = GroundForces(
         normal=several * load,
         ahead=several * jnp.sum(ahead, axis=-1),
@@ -393,9 +391,7 @@ def stand(run: HalfRobotSystem) -> HalfRobotState:
     heading_deg = run.conditions.heading_deg
     heading = jnp.zeros(()) if heading_deg is None else jnp.radians(heading_deg)
     slope_along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
-    half = half_robot.stand(
-        dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=slope_along))
-    )
+    half = half_robot.stand(replace(run, conditions=replace(run.conditions, slope_deg=slope_along)))
     q = (
         jnp.zeros(COORDINATES, half.q.dtype)
         .at[np.array([HEIGHT, PITCH, YAW])]
@@ -414,7 +410,7 @@ def roll(run: HalfRobotSystem) -> HalfRobotState:
     shafts = rolls.speed_motor / run.robot.gearbox.ratio
     plane = [cos * rolls.speed - sin * lateral, sin * rolls.speed + cos * lateral, rolls.yaw_rate]
     v = begins.v.at[PLANE].set(jnp.stack(plane)).at[PULLEYS].set(shafts[:, None])
-    return dataclasses.replace(begins, v=v, current=rolls.current, memory=rolls.memory)
+    return replace(begins, v=v, current=rolls.current, memory=rolls.memory)
 
 
 def loads(run: HalfRobotSystem, at: ContactState, pulled: ContactPull) -> GearReactions:
@@ -443,7 +439,7 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     travel, signals = averages.travel, jax.tree.map(jnp.mean, averages.signals)
     assert travel is not None
     limits = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
-    keeps = dataclasses.replace(plane_motion(run, end), **limits)
+    keeps = replace(plane_motion(run, end), **limits)
     status = circling.status_of_steady_motion(run.robot, run.conditions, travel, keeps)
     status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
     tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))

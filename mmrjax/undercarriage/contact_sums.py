@@ -6,8 +6,8 @@ once per parameter of a derivative. Each tangent then costs only a small product
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -161,13 +161,13 @@ def linearize(
 
     def sums(numbers: Float[Array, " varied"]) -> tuple[ContactSums, ContactSums]:
         values = {**given, **dict(zip(varied, numbers, strict=True))}
-        gear = dataclasses.replace(path.gear, **{name: values[name] for name in GEAR})
+        gear = replace(path.gear, **{name: values[name] for name in GEAR})
         ground = chassis.ground
-        friction = dataclasses.replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
-        ground = dataclasses.replace(ground, friction=friction)
+        friction = replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
+        ground = replace(ground, friction=friction)
         changed = {name: values[f"chassis_{name}"] for name in CHASSIS}
         path_now = BeltPath(values["pulley"], gear)
-        chassis_now = dataclasses.replace(chassis, ground=ground, **changed)
+        chassis_now = replace(chassis, ground=ground, **changed)
         z, pitch, front, rear, *v = (values[name] for name in MOTION)
         touching = compute_contacts(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
         return (sums_of_contacts(path_now, chassis_now, touching, values["slip"], values["adhesion"], gained),) * 2
@@ -213,7 +213,7 @@ class SummedContacts(eqx.Module):
         slip_change = slip - self.linearized.at["slip"]
         sums = jax.tree.map(lambda a, b: a + b * slip_change, self.sums, slip_derivative)
         rise, rise_front = self.sums.rise - was.rise, self.sums.rise_front - was.rise_front
-        return dataclasses.replace(
+        return replace(
             sums,
             traction=sums.traction - (rise + slip_derivative.rise * slip_change / 2) * slip_change,
             front=sums.front - (rise_front + slip_derivative.rise_front * slip_change / 2) * slip_change,

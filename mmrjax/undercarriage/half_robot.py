@@ -6,8 +6,8 @@ MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`). Grousers or whe
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mmrjax.fidelities.base import result_of_signals, status_unless_empty, travel_status
+from mmrjax.fidelities.base import result_of_signals, travel_status
 from mmrjax.fidelities.drive import current_after
 from mmrjax.fidelities.rest import STARTS, is_at_rest, status_with_slip, travel_direction, voltage_at_rest
 from mmrjax.fidelities.steady import steady
@@ -26,6 +26,7 @@ from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
+    BATTERY_EMPTY,
     FAILED,
     GRAVITY,
     NOT_SETTLED,
@@ -273,7 +274,7 @@ def _state_after_motion(
     v = motion.v + gained
     after = HalfRobotState(motion.q + step * v, v, *later)
     traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
-    return after, dataclasses.replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
+    return after, replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
 
 
 @eqx.filter_custom_jvp
@@ -303,7 +304,7 @@ def _differentiated(
     run, motion = primals
     step = _implicit_step(run, motion)
     # The model's constants follow from the rest of the run.
-    run, d_run = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
+    run, d_run = (replace(x, model=None, data=None) for x in (run, tangents[0]))
     d_motion = tangents[1]
     # the contacts' sums with derivatives with respect to the motion and to the `changed` inputs
     constants = contact_sums.contact_inputs(d_run.path, d_run.chassis, d_run.conditions.adhesion)
@@ -433,10 +434,10 @@ def roll(run: HalfRobotSystem) -> HalfRobotState:
     speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
     current = jnp.where(solved, guess.reading["total_current"] / run.robot.sides, 0.0)
     v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
-    start = dataclasses.replace(start, v=v, current=current)
+    start = replace(start, v=v, current=current)
     signals, _, _ = instant(run, start)  # memories of effects are settled too
     memory = {e.name: e.settled(run.robot, signals) * jnp.ones_like(current) for e in run.robot.remembering}
-    return dataclasses.replace(start, memory=memory)
+    return replace(start, memory=memory)
 
 
 def loads(run: HalfRobotSystem, at: ContactState, pulled: ContactPull) -> GearReactions:
@@ -476,7 +477,7 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     status = status_with_slip(
         status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, at_rest
     )
-    status = status_unless_empty(status, robot, conditions, end.discharge)
+    status = jnp.where(robot.battery.emptied(conditions.battery, end.discharge), BATTERY_EMPTY, status)
     status = jnp.where(tipping_margin(run) < 0, TIPS, status)
     return status_unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
 

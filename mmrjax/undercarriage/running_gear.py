@@ -7,9 +7,9 @@ rear pulley (up), upper run (forwards), front pulley (down).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -21,8 +21,6 @@ from mmrjax.model.paper_tables import GROUSERS, TEETH_BELT, TEETH_PULLEY
 from mmrjax.model.params import Scalar, parameter
 from mmrjax.numerics.elementary import cosine, sine
 
-_UNSTATED = "not stated in the paper"
-
 
 class Levers(eqx.Module):
     """Roller at the tip of a lever, and drive of a pair of levers: motor, planetary gear, worm (Fig. A1: 11-14).
@@ -33,39 +31,39 @@ class Levers(eqx.Module):
 
     roller: Scalar = parameter(
         13.5e-3, "m", "radius of the roller at a lever's tip over the grousers of its track", (1e-3, 0.5),
-        "Table 6, d/2. With the resulting pitch radius of 8 mm, the track of 112 teeth closes to 0.4 mm",
+        "Table 6, d/2. The track of 112 teeth then closes to 0.4 mm",
         relative_sd=0.05,
     )  # fmt: skip
     worm_ratio: Scalar = parameter(
         30.0, "-", "ratio of the worm gear of a pair of levers", (1.0, 1e3), "Fig. 5b", relative_sd=0.01
     )
     worm_efficiency: Scalar = parameter(
-        0.5, "-", "efficiency of the worm gear, driven by its worm; self-locking up to 0.5", (0.05, 0.99),
-        "Fig. 5b, without a table. Single-start worm: 0.4-0.6", sd=0.15,
+        0.5, "-", "efficiency of the worm gear, self-locking up to 0.5", (0.05, 0.99),
+        "Fig. 5b. Single-start worm: 0.4-0.6", sd=0.15,
     )  # fmt: skip
     planetary_ratio: Scalar = parameter(
         23.04, "-", "ratio of the planetary gear between motor and worm", (1.0, 1e4),
-        f"that of the traction drive, Fig. A1: 12 next to 2; {_UNSTATED}", relative_sd=0.8,
+        "as the traction drive, Fig. A1: 12 next to 2", relative_sd=0.8,
     )  # fmt: skip
     planetary_efficiency: Scalar = parameter(
         0.75, "-", "efficiency of the planetary gear between motor and worm", (0.1, 1.0),
-        f"catalogue of the traction drive's gear; {_UNSTATED}", sd=0.1,
+        "assumed: catalogue of the traction drive's gear", sd=0.1,
     )  # fmt: skip
     rate: Scalar = parameter(
         1.0, "rad/s", "rate of a pair of levers with an imposed angle", (1e-3, 100.0),
-        f"8810 rpm over the two gears' ratios: 1.3 rad/s without load; {_UNSTATED}", relative_sd=0.5,
+        "assumed: 8810 rpm over both ratios are 1.3 rad/s without load", relative_sd=0.5,
     )  # fmt: skip
     angle_least: Scalar = parameter(
         -math.pi, "rad", "least angle of a lever, straight back under the belt", (-2 * math.pi, 0.0),
-        f"no stop for a lever in Fig. A2; {_UNSTATED}", sd=0.5,
+        "assumed: no stop in Fig. A2", sd=0.5,
     )  # fmt: skip
     angle_most: Scalar = parameter(
         math.pi, "rad", "greatest angle of a lever, folded along the body", (0.0, 2 * math.pi),
-        f"transport posture, Table 6; {_UNSTATED}", sd=0.5,
+        "assumed: transport posture, Table 6", sd=0.5,
     )  # fmt: skip
     current_limit: Scalar = parameter(
-        1000.0, "A", "largest current of a motor of the levers that its driver permits", (0.01, 1e4),
-        "no limit on the bench: above any current", relative_sd=0.1,
+        1000.0, "A", "current limit of a motor of the levers", (0.01, 1e4),
+        "no limit on the bench", relative_sd=0.1,
     )  # fmt: skip
     share_coulomb: Scalar = parameter(
         0.4, "-", "share of a side's static loss torque in the track of each lever",
@@ -80,9 +78,7 @@ class Levers(eqx.Module):
         """Main track of a side, and track of one lever, with their parts of the losses."""
 
         def share(coulomb: Scalar, viscous: Scalar) -> Track:
-            return dataclasses.replace(
-                side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous
-            )
+            return replace(side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous)
 
         own_share = share(self.share_coulomb, self.share_viscous)
         return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own_share
@@ -91,8 +87,6 @@ class Levers(eqx.Module):
 __all__ = ["GROUSERS", "TEETH_BELT", "TEETH_PULLEY", "WHEELS", "RunningGear"]
 
 WHEELS = 2  # of one side, 4W2T
-
-_ASSUMED = "assumed; not stated in the paper"
 
 
 class RunningGear(eqx.Module):
@@ -103,71 +97,71 @@ class RunningGear(eqx.Module):
     """
 
     wheelbase: Scalar = parameter(
-        0.300, "m", "distance of the axles L_b and length of a straight run of the belt", (0.05, 3.0),
+        0.300, "m", "distance of the axles L_b, length of a straight run of the belt", (0.05, 3.0),
         "Table 6", relative_sd=0.005,
     )  # fmt: skip
     grouser_height: Scalar = parameter(
         5.5e-3, "m", "height of a grouser over the belt's pitch line", (0.0, 0.05),
-        "Table 6 over the grousers: 87.4/2 less the pitch radius 38.2 mm (bottom: clearance, Table 6)",
+        "Table 6: 87.4/2 less the pitch radius of 38.2 mm",
         relative_sd=0.1,
     )  # fmt: skip
     grouser_length: Scalar = parameter(
         5e-3, "m", "length of a grouser's rigid base along the belt",
-        (5e-4, 0.03), "one tooth pitch: the rigid link that carries a grouser, Section 3.2.4", relative_sd=0.3,
+        (5e-4, 0.03), "one tooth pitch, Section 3.2.4", relative_sd=0.3,
     )  # fmt: skip
     guide_recess: Scalar = parameter(
         0.0, "m", "height of the lower guide above the line that touches both pulleys", (-2e-3, 5e-3),
-        f"flush; {_ASSUMED}. Decides the guides' share of the weight (docs/explanation/track-model.md)", sd=2e-4,
+        "assumed: flush. Decides the guides' share of the weight (docs/explanation/track-model.md)", sd=2e-4,
     )  # fmt: skip
     guide_gap: Scalar = parameter(
         20e-3, "m", "free length of the belt between the end of an arc and the lower guide", (1e-3, 0.14),
-        "clearance of a guide 5 mm thick from a pulley of 38.2 mm: sqrt(38.2² - 33.2²) = 19 mm", relative_sd=0.3,
+        "clearance of a guide 5 mm thick from a pulley: sqrt(38.2² - 33.2²) = 19 mm", relative_sd=0.3,
     )  # fmt: skip
     pretension: Scalar = parameter(
         100.0, "N", "pre-tension of the belt at rest P_0", (1.0, 2000.0),
-        f"twice the largest traction of one side (21.1 kg, 20 deg) keeps the slack run tight; {_ASSUMED}",
+        "assumed: twice the largest traction of a side (21.1 kg, 20 deg)",
         relative_sd=0.3,
     )  # fmt: skip
     span_stiffness: Scalar = parameter(
         1e5, "N/m", "tensile stiffness of one straight run of the belt", (1e3, 1e8),
-        f"EA/L of 3e4 N for a reinforced polyurethane belt of 5 mm pitch, about 10 mm wide; {_ASSUMED}",
+        "assumed: EA/L of 3e4 N, a reinforced polyurethane belt 10 mm wide",
         relative_sd=0.5,
     )  # fmt: skip
     span_damping: Scalar = parameter(
         10.0, "N·s/m", "tensile damping of one straight run of the belt", (0.0, 1e4),
-        f"a tenth of critical for a pulley on two runs; {_ASSUMED}", relative_sd=0.5,
+        "assumed: a tenth of critical for a pulley on two runs", relative_sd=0.5,
     )  # fmt: skip
     belt_mass: Scalar = parameter(40e-3, "kg", "mass of one main track", (0.0, 2.0), "Table 7", relative_sd=0.05)
     contact_stiffness: Scalar = parameter(
         3e7, "N/m^1.5", "stiffness c of a grouser or wheel on the ground, eq. (27) (unit at e = 1.5)", (1e4, 1e11),
-        f"0.04 mm under 8 N, polyurethane on wood; {_ASSUMED}", relative_sd=0.5,
+        "assumed: 0.04 mm under 8 N, polyurethane on wood", relative_sd=0.5,
     )  # fmt: skip
     contact_exponent: Scalar = parameter(
         1.5, "-", "exponent e of the contact force, eq. (27)", (1.0, 3.0),
-        "elastic bodies (Hertz 1881). The paper says e > 1 is hard contact", relative_sd=0.1,
+        "elastic bodies (Hertz 1881). Paper: e > 1 is hard contact", relative_sd=0.1,
     )  # fmt: skip
     contact_damping: Scalar = parameter(
         300.0, "N·s/m", "damping b_max of a grouser or wheel on the ground, eq. (27)", (0.0, 1e5),
-        f"a tenth to a half of critical for half a robot on its contacts; {_ASSUMED}", relative_sd=0.5,
+        "assumed: a tenth to a half of critical for half a robot", relative_sd=0.5,
     )  # fmt: skip
     contact_depth: Scalar = parameter(
         1e-4, "m", "penetration depth d for full damping, Fig. 9a", (1e-6, 1e-2),
-        "default of the multibody package of ref. [48]: 0.1 mm", relative_sd=0.5,
+        "default of the multibody package of ref. [48]", relative_sd=0.5,
     )  # fmt: skip
     centre_height: Scalar = parameter(
         5e-3, "m", "centre of mass above the axles, without payload and levers", (-0.1, 0.3),
-        "middle of the body (Table 6), half of its height of 76 mm over its underside (`clearance`)", sd=0.01,
+        "middle of the body, 76 mm high (Table 6), over `clearance`", sd=0.01,
     )  # fmt: skip
     clearance: Scalar = parameter(
         10.7e-3, "m", "ground clearance under the body on tracks", (0.0, 0.3), "Table 6", sd=1e-3
     )
     centre_offset: Scalar = parameter(
         0.0, "m", "centre of mass ahead of the middle of the wheelbase, without levers", (-0.3, 0.3),
-        f"symmetric layout, Fig. A2; {_ASSUMED}", sd=0.01,
+        "assumed: symmetric layout, Fig. A2", sd=0.01,
     )  # fmt: skip
     payload_height: Scalar = parameter(
         73e-3, "m", "centre of the payload above the axles", (0.0, 0.5),
-        "platform 43 mm above the axles (Table 6) and half of a weight 60 mm tall, Fig. 19", sd=0.02,
+        "platform 43 mm above the axles (Table 6), half of a weight of 60 mm (Fig. 19)", sd=0.02,
     )  # fmt: skip
     payload_offset: Scalar = parameter(
         0.0, "m", "centre of the payload ahead of the middle of the wheelbase", (-0.5, 0.5), "Fig. 19", sd=0.02
@@ -180,30 +174,30 @@ class RunningGear(eqx.Module):
         0.0, "kg·m^2",
         "moment of inertia in pitch on tracks, levers folded, no payload; 0: body_gyration and parts",
         (0.0, 20.0),
-        "not stated: the sum of the parts (Table 7's 0.251 is that of the robot with its levers outstretched)",
+        "sum of the parts (Table 7: 0.251 with outstretched levers)",
         sd=5e-3,
     )  # fmt: skip
     inertia_wheeled: Scalar = parameter(
         0.0, "kg·m^2", "moment of inertia in pitch on wheels, as a whole", (0.0, 20.0),
-        "not stated: the sum of the parts (0.146; Table 7: 0.145)", sd=5e-3,
+        "sum of the parts, 0.146 (Table 7: 0.145)", sd=5e-3,
     )  # fmt: skip
     lever_mass: Scalar = parameter(
         0.495, "kg", "mass of one lever with its track, 6T2A", (0.0, 10.0), "Table 7: 470 + 25 g", relative_sd=0.05
     )
     lever_centre: Scalar = parameter(
         0.083, "m", "centre of a lever with its track from its axle", (0.0, 1.0),
-        "with it the parts of the outstretched robot have Table 7's 0.251 kg·m²; middle of its track: 80 mm", sd=5e-3,
+        "gives Table 7's 0.251 kg·m² outstretched; middle of its track: 80 mm", sd=5e-3,
     )  # fmt: skip
     lever_inertia: Scalar = parameter(
         1.6e-3, "kg·m^2", "moment of inertia of one lever with its track about its own centre", (0.0, 10.0),
-        "Table 7: 1470 kg·mm²; 170 of its track of 560 mm, less what turns with the pulley (40)", relative_sd=0.1,
+        "Table 7: 1470 kg·mm², and 170 of its track, less 40 that turn with the pulley", relative_sd=0.1,
     )  # fmt: skip
     lever_length: Scalar = parameter(
         0.205, "m", "length of a lever from axle to tip l_p", (0.0, 2.0), "Table 6", relative_sd=0.01
     )
     lever_front: Scalar = parameter(
         math.pi, "rad", "fixed angle of the front lever, 0 pointing forward, positive upward",
-        (-math.pi, 2 * math.pi), "transport posture, folded along the body (overall length 390 mm, Table 6)", sd=0.05,
+        (-math.pi, 2 * math.pi), "transport posture, folded along the body (length 390 mm, Table 6)", sd=0.05,
     )  # fmt: skip
     lever_rear: Scalar = parameter(
         0.0, "rad", "fixed angle of the rear lever, 0 pointing forward, positive upward", (-math.pi, 2 * math.pi),
@@ -215,7 +209,7 @@ class RunningGear(eqx.Module):
     )  # fmt: skip
     additional_pulley_mass: Scalar = parameter(
         104e-3, "kg",
-        "mass of the axle's pulley for the lever's track or the wheel", (0.0, 10.0),
+        "mass of the axle's pulley for lever track or wheel", (0.0, 10.0),
         "Table 7: two a side, as 13.1 and 11.5 kg need", relative_sd=0.05,
     )  # fmt: skip
     wheel_mass: Scalar = parameter(86e-3, "kg", "mass of one wheel, 4W2T", (0.0, 10.0), "Table 7", relative_sd=0.05)

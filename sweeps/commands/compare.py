@@ -26,8 +26,8 @@ from sweeps.report import comparison_report
 from sweeps.report.comparison_report import Comparison, compare_readings
 from sweeps.store import RunFolder, open_folder, print_report
 
-#: Fidelity for time histories, and further axes over which their errors are shown.
-HISTORIES, OVER = "drive", {"time_s": "time [s]"}
+#: Fidelity for time histories.
+HISTORIES = "drive"
 
 
 def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -> int:
@@ -48,11 +48,13 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             raise BadConfiguration(f"{option}: {Path(runs.source).name} contains time histories; remove this option")
         ready = preparation.prepare_input(runs, file.robot)
         robot, remarks = ready.robot, (*ready.checked, *ready.begins, *ready.weighed)
+        other = None if second is None else preparation.prepare_input(runs, second.robot).robot
     else:
         robot = inferred_facts.with_inferred_instruments(file.robot, runs)
         if beside.own_mass:
             runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
         remarks = tuple(check_ranges(runs, robot))
+        other = None if second is None else inferred_facts.with_inferred_instruments(second.robot, runs)
         posterior = None if config.posterior is None else posterior_beside_robot(file)
 
     def simulated(robot: Robot, folder: RunFolder | None) -> Columns:
@@ -63,12 +65,8 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     with open_folder("compare", config, robot, beside, runs) as folder:
         table = simulated(robot, folder)
         comparison, summary = compare_readings(measured_runs, table, robot)
-        comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.sampled and runs.has(column)}
-        if second is not None:
-            if runs.sampled:
-                other = preparation.prepare_input(runs, second.robot).robot
-            else:
-                other = inferred_facts.with_inferred_instruments(second.robot, runs)
+        comparison |= {column: runs[column] for column in ("time_s", "run_id") if runs.sampled and runs.has(column)}
+        if other is not None:
             readings = simulated(other, None)
             comparison |= {f"against_{c.column}": readings[c.column] for c in runs.channels}
         after_steps = None
@@ -91,14 +89,16 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         if second is not None:  # with its folder if both files have the same name
             against = capabilities.displayed_name(second)
             against = str(config.against) if against == name else against
-        found = Comparison(
+        compared = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES if runs.sampled else config.model,
-            name, recorded_fit(file, runs), OVER if runs.sampled else None, (*notes, *of_draws), against, after_steps,
+            name, recorded_fit(file, runs), (*notes, *of_draws), against, runs.sampled, after_steps,
         )  # fmt: skip
-        document = print_report(comparison_report.comparison_document(found), dataclasses.replace(file, robot=robot))
-        answer = comparison_report.comparison_answer(found)
+        document = print_report(
+            comparison_report.comparison_document(compared), dataclasses.replace(file, robot=robot)
+        )
+        answer = comparison_report.comparison_answer(compared)
         further = {"statement": answer, "errors": summary, "notes": [*file.remarks, *notes]}
-        result = run.SimulationResult("compare", found.model, robot, runs, table, further)
+        result = run.SimulationResult("compare", compared.model, robot, runs, table, further)
         return run.write_run_folder(folder, config, result, document)
 
 

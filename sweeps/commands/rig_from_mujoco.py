@@ -179,7 +179,7 @@ class _MujocoModel:
             "damping": (np.ravel(model.dof_damping[dof])[0], "damping"),
             "armature": (armature, "armature"),
         }
-        found = {
+        numbers = {
             "mass": (float(model.body_subtreemass[root]), "mass of its body tree"),
             "sides": self._sides(joint, radius[0]) if rolls and radius is not None else None,
             "radius": radius,
@@ -189,7 +189,7 @@ class _MujocoModel:
             "angle": None if weight is None else (weight[1], f"{joint_words}, hanging position"),
             **{key: (float(x), f"{joint_words}, {what}") if x else None for key, (x, what) in losses.items()},
         }
-        return JointNumbers(self.file, self.joints[joint], rolls, found, drive)
+        return JointNumbers(self.file, self.joints[joint], rolls, numbers, drive)
 
     def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
         """Inertia of the rotating parts, and their weight as `hanging`, with other joints in the reference pose."""

@@ -121,7 +121,7 @@ class UrdfRobot:
             # without the component of the first moment along the axis
             torque = axis @ np.cross(np.cross(across, axis), gravity)
             weight = hanging_torque_and_angle(float(torque), float(axis @ np.cross(across, gravity)))
-        found = {
+        numbers = {
             "mass": self._mass(),
             "sides": self._sides(joint, radius[0]) if rolls and radius is not None else None,
             "radius": radius,
@@ -133,8 +133,8 @@ class UrdfRobot:
         for key, unit in {"friction": "N·m", "damping": "N·m·s", "armature": "kg·m²"}.items():
             place = f"joint {joint}, <dynamics {key}>"
             value = self._number(element.find("dynamics"), key, place, unit, 0.0)
-            found[key] = (value, place) if value else None
-        return JointNumbers(self.file, joint, rolls, found)
+            numbers[key] = (value, place) if value else None
+        return JointNumbers(self.file, joint, rolls, numbers)
 
     # --- frames
 

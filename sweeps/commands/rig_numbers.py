@@ -45,7 +45,7 @@ class JointNumbers:
     Attributes:
         file, joint: names of the file and the joint.
         rolls: True if the joint turns a wheel of a body that is free to move.
-        found: number [SI] for each key of `LINES`, None if the model has none. `mass` is that of the whole model,
+        stated: number [SI] for each key of `LINES`, None if the model has none. `mass` is that of the whole model,
             `sides` the number of equal joints, `inertia` that of everything that turns with the joint, without
             `armature`, `weight` the largest gravity torque, and `angle` that of the load at rest under gravity.
         drive: numbers of the motor by dotted name. They take precedence over values that follow from the others.
@@ -54,7 +54,7 @@ class JointNumbers:
     file: str
     joint: str
     rolls: bool
-    found: Mapping[str, Found | None]
+    stated: Mapping[str, Found | None]
     drive: Mapping[str, StatedNumber] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
@@ -64,7 +64,7 @@ class JointNumbers:
             BadConfiguration: the load of this kind slides.
         """
         if stated is None:
-            return "wheeled" if self.rolls else "bench" if self.found["weight"] is None else "pendulum"
+            return "wheeled" if self.rolls else "bench" if self.stated["weight"] is None else "pendulum"
         if stated not in TURNING:
             raise BadConfiguration(f"--kind: got {stated} with --from, which reads a revolute joint; "
                                    f"{allowed_words(stated, TURNING)}")  # fmt: skip
@@ -75,20 +75,20 @@ class JointNumbers:
         moving = kind in VEHICLES
         losses = "load.track.loss" if moving else "load.loss"
         others = ("weight", "angle") if moving else ("mass", "radius")
-        found = {key: pair for key, pair in self.found.items() if pair is not None and key not in others}
+        pairs = {key: pair for key, pair in self.stated.items() if pair is not None and key not in others}
         by_name: dict[str, StatedNumber] = {}
-        if "armature" in found:
-            armature, source = found.pop("armature")
-            inertia, source_inertia = found["inertia"]
-            if "ratio" in found:
-                found["armature"] = armature / found["ratio"][0] ** 2, f"{source} / ratio²"
+        if "armature" in pairs:
+            armature, source = pairs.pop("armature")
+            inertia, source_inertia = pairs["inertia"]
+            if "ratio" in pairs:
+                pairs["armature"] = armature / pairs["ratio"][0] ** 2, f"{source} / ratio²"
             else:
-                found["inertia"] = inertia + armature, f"{source_inertia}, and armature"
+                pairs["inertia"] = inertia + armature, f"{source_inertia}, and armature"
                 source = "no ratio found: the load inertia includes it"
                 by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", source)
         for key, (name, unit, width) in LINES.items():
-            if key in found:
-                value, source = found[key]
+            if key in pairs:
+                value, source = pairs[key]
                 by_name[name] = StatedNumber(value, unit, f"{self.file}, {source}", width)
         return {name.replace("load.loss", losses): number for name, number in {**by_name, **self.drive}.items()}
 

@@ -122,21 +122,20 @@ def _operating_points(
         if not set(OF_TURNS).isdisjoint(ranges):  # which settle only on level ground
             usual_axes = {**usual_axes, "slopes_deg": (0.0,)}
     axes = {key: getattr(config, key) or usual_axes.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
-    for name in ranges:
+    for name, (low, high) in ranges.items():
         ground, shaft = ([f"--vary {name}"] * (name in own) for own in (axes_room.ON_GROUND, axes_room.ON_SHAFT))
         capabilities.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {layout.imposed.replace('_', ' ')}; vary it instead"
             )
-    if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: has no effect on a battery")
-    for name, (low, high) in ranges.items():
-        if name in AXES:
-            if getattr(config, AXES[name]) is not None:
-                option = AXES[name].partition("_")[0]
-                raise BadConfiguration(f"--vary {name}: --{option} sets it too; give one of them")
-            axes[AXES[name]] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
+        if config.battery and name == "voltage":
+            raise BadConfiguration("--vary voltage: has no effect on a battery")
+        key = AXES.get(name)
+        if key is not None and getattr(config, key) is not None:
+            raise BadConfiguration(f"--vary {name}: --{key.partition('_')[0]} sets it too; give one of them")
+        if key is not None:
+            axes[key] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
     try:
         grid = GridPart(configurations=config.configurations, surface=config.surface, **axes)
     except ValueError:

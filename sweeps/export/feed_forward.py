@@ -133,15 +133,11 @@ def table_law_function(situation: ComparisonRuns, constants: Sequence[LawConstan
 
 def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list[EffectFate]:
     """Fates of the base's terms, and of effects outside the joint."""
-    fates = [
-        f
-        for f in jax_actuator.fates_in_actuator(joint)
-        if f.name not in ("rotor inertia", "current limit of the driver")
-    ]
+    fates = [f for f in jax_actuator.fates_in_actuator(joint) if f.name not in (mujoco.ROTOR, mujoco.LIMIT)]
     means = {c.name: c.value for c in constants}
     changed = []
     for fate in fates:
-        if fate.name == "friction from the joint's surroundings":
+        if fate.name == jax_actuator.SURROUNDINGS:
             values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
             changed.append(EffectFate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
         elif fate.name == mujoco.PLAY:
@@ -156,7 +152,7 @@ def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list
             )
     how = "add armature · acceleration to the torque"
     lines = EffectFate("steady states", HELD, "linear interpolation between points")
-    return [*changed, EffectFate("rotor inertia", APPROXIMATED, how), lines]
+    return [*changed, EffectFate(mujoco.ROTOR, APPROXIMATED, how), lines]
 
 
 def table_files(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> dict[str, str | bytes]:

@@ -16,15 +16,17 @@ import numpy as np
 from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.numerics.elementary import value_and_slope
-from sweeps.export.comparison import DROPPED, HELD, ComparisonRuns, EffectFate
+from sweeps.export.comparison import HELD, ComparisonRuns, EffectFate
 from sweeps.export.joint import DriveJoint
 from sweeps.export.law_source import LawConstant, jax_source, module_from_source
-from sweeps.export.mujoco import CONTROLLER, PLAY, fates_outside_joint
+from sweeps.export.mujoco import CONTROLLER, GROUND, LIMIT, PLAY, ROTOR, fates_outside_joint
 
 #: Steps to the steady state, and their length [s]. An implicit step of this length is a step of Newton's method.
 SETTLING, LONG = 10, 1e9
 #: Newton steps for the speed at a load.
 STEPS = 25
+#: Name of a base term.
+SURROUNDINGS = "friction from the joint's surroundings"
 #: Platforms for which the serialised program is lowered.
 PLATFORMS = ("cpu", "cuda")
 #: Setting of JAX: frames of the call stack that a lowered program keeps for each operation.
@@ -103,22 +105,19 @@ def fates_in_actuator(joint: DriveJoint) -> list[EffectFate]:
     robot = joint.robot
     fates = [
         EffectFate("motor, winding and gearbox", HELD, "functions of the law"),
-        EffectFate("rotor inertia", HELD, "`armature(params)`, to be set as the joint's own armature"),
+        EffectFate(ROTOR, HELD, "`armature(params)`, to be set as the joint's own armature"),
     ]
     if joint.surroundings():
         names = ", ".join(joint.surroundings())
-        fates.append(
-            EffectFate("friction from the joint's surroundings", HELD, f"parameters {names}, free to change")
-        )
+        fates.append(EffectFate(SURROUNDINGS, HELD, f"parameters {names}, free to change"))
     if robot.has_ground:
-        how = "the simulator's own contact with the ground"
-        fates.append(EffectFate("ground: slip and rolling resistance", DROPPED, how))
+        fates.append(GROUND)
     if joint.loose:
         fates.append(EffectFate(PLAY, HELD, "states of the law: gap, and speed of the motor's side"))
     if joint.controller is not None:
         fates.append(EffectFate(CONTROLLER, HELD, "functions of the law. The command is its goal"))
     if joint.limit is not None:
-        fates.append(EffectFate("current limit of the driver", HELD, "a bound of the current"))
+        fates.append(EffectFate(LIMIT, HELD, "a bound of the current"))
     return [*fates, *fates_outside_joint(joint)]
 
 

@@ -52,7 +52,11 @@ LEAST_SHARE = 0.05
 #: Fixed-point steps of heat and falling friction.
 STEPS = 12
 #: Names of base terms.
-PLAY, CONTROLLER = "backlash and elasticity", "controller"
+PLAY, CONTROLLER, ROTOR, LIMIT = (
+    "backlash and elasticity", "controller", "rotor inertia", "current limit of the driver",
+)  # fmt: skip
+#: Fate of the ground in simulators.
+GROUND = EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
 #: Impedance of a tendon's limit, so low that the limit acts as a spring and a damper in addition to other torques.
 IMPEDANCE = 1e-3
 #: Names of the format's parameters.
@@ -154,7 +158,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     fates = [
         EffectFate("winding and back-EMF", HELD, "resistance, motorconst, inductance"),
         EffectFate("friction of motor and gearbox", HELD, "frictionloss and damping of the joint"),
-        EffectFate("rotor inertia", HELD, "armature of the joint, for a motor that drives"),
+        EffectFate(ROTOR, HELD, "armature of the joint, for a motor that drives"),
     ]
     if float(gear.efficiency_load) != 1:
         fates.append(
@@ -169,16 +173,14 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
         if float(load.track.guide_friction * load.track.guide_share) > 0:
             how = f"frictionloss at the mean normal load of these runs, {normal:.4g} N a side"
             fates.append(EffectFate("friction of track guides", APPROXIMATED, how))
-        fates.append(
-            EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
-        )
+        fates.append(GROUND)
     if joint.loose:
         how = "a joint for the motor's side, and a tendon"
         fates.append(EffectFate(PLAY, HELD, how))
     if joint.controller is not None:
         fates.append(_controller_fate(joint, joint.controller))
     if joint.limit is not None:
-        fates.append(EffectFate("current limit of the driver", HELD, "saturation"))
+        fates.append(EffectFate(LIMIT, HELD, "saturation"))
     return [*fates, *fates_outside_joint(joint)]
 
 

@@ -224,23 +224,9 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
     return program
 
 
-@dataclasses.dataclass(frozen=True)
-class Piece:
-    """A chunk in progress.
-
-    Attributes:
-        chunk: number of chunk.
-        arrays: results by variable, possibly still on a device.
-        values: values of its points, one row each.
-        told: number of its points that have been reported as done.
-    """
-
-    chunk: int
-    arrays: Json
-    values: Float[np.ndarray, "points names"]
-    told: float = 0.0
-
-
+#: A chunk in progress: its number, results by variable (possibly still on a device), values of its points, and the
+#: number of its points that have been reported as done.
+Piece = tuple[int, dict[str, Array], np.ndarray, float]
 Advance = Callable[[float], None]
 #: Stores a chunk by its number: values of its points by variable, and values of its samples, one row for each
 #: name, None if another chunk writes them.
@@ -266,12 +252,12 @@ def produce_chunks(compiled: Compiled, chunks: Iterable[int], advance: Advance) 
 def _start_chunk(compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], advance: Advance) -> Piece:
     values = points.result()
     if not compiled.in_parts:
-        return Piece(chunk, compiled(values), values)
+        return chunk, compiled(values), values, 0.0
     count = compiled.job.blocks.count(chunk)
     counter = share_counter(advance, count)
-    piece = Piece(chunk, compiled(values, counter), values, count)
+    arrays = compiled(values, counter)
     counter(1.0)
-    return piece
+    return chunk, arrays, values, count
 
 
 @contextlib.contextmanager
@@ -313,28 +299,28 @@ def write_chunks(keep: Keep, compiled: Compiled, chunks: Iterable[int], advance:
     waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
     stop, failures = threading.Event(), list[BaseException]()
 
-    def write(piece: Piece) -> None:
-        is_ready = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
+    def write(chunk: int, arrays: dict[str, Array], values: np.ndarray, told: float) -> None:
+        is_ready = all(x.is_ready() for x in arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
         if stop.is_set() and not is_ready:
             return
-        jax.block_until_ready(list(piece.arrays.values()))
-        count = compiled.job.blocks.count(piece.chunk)
-        host_values = fetch_values(piece.arrays, count)
+        jax.block_until_ready(list(arrays.values()))
+        count = compiled.job.blocks.count(chunk)
+        host_values = fetch_values(arrays, count)
         if stop.is_set() and not is_ready:  # interrupted during its computation
             return
         design, blocks, drawn = compiled.job.plan.design, compiled.job.blocks, None
-        if design.samples is not None and not any(blocks.place(piece.chunk)[:-1]):
+        if design.samples is not None and not any(blocks.place(chunk)[:-1]):
             # samples vary fastest; other chunks along their dimension repeat them
-            along = blocks.box(piece.chunk)[-1]
-            drawn = piece.values[: along.stop - along.start, len(design.axes) :].T
-        keep(piece.chunk, host_values, drawn)
-        advance(count - piece.told)
+            along = blocks.box(chunk)[-1]
+            drawn = values[: along.stop - along.start, len(design.axes) :].T
+        keep(chunk, host_values, drawn)
+        advance(count - told)
 
     def keep_writing() -> None:
         while (piece := waiting.get()) is not None:
             try:
                 if not failures:
-                    write(piece)
+                    write(*piece)
             except BaseException as error:
                 failures.append(error)
                 stop.set()

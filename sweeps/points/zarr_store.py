@@ -230,9 +230,7 @@ class SweepStore(Folder):
             ) from error
         mark = interrupted_run(self.partial)
         if mark is not None and mark["command"] not in ("", COMMAND) and not try_to_lock(self._lock):
-            raise BadConfiguration(
-                f"--out: another process is using {self.partial}; wait for it, or choose another path"
-            )
+            raise self._busy("")
         with self._locked():
             if not self._present():
                 return self._finished_by_another(force)
@@ -310,7 +308,7 @@ class SweepStore(Folder):
         Raises:
             BadConfiguration: another process is writing to the store that would be replaced.
         """
-        share = self._at_work()
+        share = share_at_work(self.partial, self._share)
         if share is not None:
             raise self._busy(share)
         self._clear()
@@ -379,14 +377,10 @@ class SweepStore(Folder):
             self._journal.write("\n")
             self._journal.flush()
 
-    def _at_work(self) -> str | None:
-        """Share that another process is computing, or None. Call within `_locked`."""
-        return share_at_work(self.partial, self._share)
-
     def _busy(self, name: str) -> BadConfiguration:
+        share = f", share {name.replace('-', ' ')}" * bool(name)
         return BadConfiguration(
-            f"--out: another process is using {self.partial}, share {name.replace('-', ' ')}; wait for it, or "
-            "choose another path"
+            f"--out: another process is using {self.partial}{share}; wait for it, or choose another path"
         )
 
     def done(self) -> dict[int, Done]:
@@ -523,7 +517,7 @@ class SweepStore(Folder):
         if self.finished or self._share is None:
             return
         with self._locked(), contextlib.suppress(OSError):
-            if self._present() and not self.done() and self._at_work() is None:
+            if self._present() and not self.done() and share_at_work(self.partial, self._share) is None:
                 self._remove_partial()
 
 

@@ -96,12 +96,10 @@ class LinearHistories(LinearRows, Histories):
 
 def grid_of_effects(effects: tuple[ScoredEffect, ...]) -> tuple[Array, Array]:
     """Effect of each instance, and its neighbours on the grid of its shape, see `LinearRows`."""
-    grid = [np.asarray(e.at) for e in effects]
-    before, after = (
-        [np.r_[x, np.inf * s][1:] if s > 0 else np.r_[np.inf * s, x][:-1] for x in grid] for s in (-1, 1)
-    )
-    index = np.repeat(np.arange(len(grid)), [len(x) for x in grid])
-    return jnp.asarray(index), jnp.asarray(np.stack([np.concatenate(x) for x in (before, grid, after)]))
+    index = np.repeat(np.arange(len(effects)), [len(e.at) for e in effects])
+    padded = [np.r_[-np.inf, e.at, np.inf] for e in effects]
+    grid = [np.concatenate(x) for x in zip(*((x[:-2], x[1:-1], x[2:]) for x in padded), strict=True)]
+    return jnp.asarray(index), jnp.asarray(np.stack(grid))
 
 
 def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEffect, ...], width: float) -> Problem:
@@ -117,11 +115,11 @@ def problem_of_readings(problem: Problem, z: np.ndarray, effects: tuple[ScoredEf
     linear: Any = jax.device_get(observe.linearise(problem, jnp.asarray(z), effects))
     scale = np.asarray(data.weight / data.sd)
     raw = jax.tree.map(jnp.asarray, linear.rescaled(np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)))
-    fields = {f.name: getattr(observe, f.name) for f in dataclasses.fields(observe) if f.name != "known"}
     index, grid = grid_of_effects(effects)
-    simulated: Any = observe.at_fit(problem, z)
+    simulated = observe.at_fit(problem, z)
+    fields: Any = {f.name: getattr(simulated, f.name) for f in dataclasses.fields(simulated)}
     rows = LinearHistories(
-        **fields, known=simulated.known, linear=raw, origin=jnp.asarray(z), start=jnp.asarray(z), width=width,
+        **fields, linear=raw, origin=jnp.asarray(z), start=jnp.asarray(z), width=width,
         effect=index, grid=grid,
     )  # fmt: skip
     return dataclasses.replace(problem, observe=rows)

@@ -274,7 +274,7 @@ def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
 
 
 @compiled
-def _reading_misfits(problem: Problem, zs: Array) -> Array:
+def _reading_misfits(problem: Problem, zs: np.ndarray) -> Array:
     """Whitened residuals of the readings at each point, shape (points, rows, channels)."""
     shape = problem.data.measured.shape
     return jax.vmap(lambda z: problem.misfit(z)[: problem.data.measured.size].reshape(shape))(zs)

@@ -21,8 +21,8 @@ from jaxtyping import Array, Float, Int
 from calibration.data import Columns, Names
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
+from calibration.inference.lack_of_fit import variance_of_sums
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect
-from calibration.inference.noise_factor import variance_of_sums
 from calibration.inference.observers.linear_rows import LinearRows, grid_of_effects
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.problem import Problem, data_from_readings
@@ -199,8 +199,10 @@ def problem_of_windows(
     def linearised(unknown: np.ndarray) -> tuple[WindowsLinearization, list[np.ndarray]]:
         factors = [covariance_factor(plan, w, sd, terms, unknown) for w in parts]
         white = np.stack([np.linalg.inv(x) for x in factors])
-        arrays = [jnp.asarray(x) for x in (windows.rows, windows.weight, slope, white)]
-        integrals = Integrals(arrays[0], arrays[1], arrays[2], arrays[3], places, count)
+        integrals = Integrals(
+            jnp.asarray(windows.rows), jnp.asarray(windows.weight), jnp.asarray(slope), jnp.asarray(white), places,
+            count,
+        )  # fmt: skip
 
         whitened = np.asarray(_whitened(integrals, *plain)).reshape(-1, plain[0].shape[2])
         prior = np.concatenate([np.zeros(len(run)), fit.origin - fit.centre])
