@@ -143,8 +143,8 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
         motor_speed, speed, geared, free_speed, motors, resistance, constant, motor.temperature_limit,
         robot.rig.imposed,
         _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),
-        robot.has_ground, _levels(np.abs(np.asarray(conditions.duty))),
-        () if conditions.load_torque is None else _levels(np.abs(np.asarray(conditions.load_torque))),
+        robot.has_ground, _levels(np.abs(conditions.duty)),
+        () if conditions.load_torque is None else _levels(np.abs(conditions.load_torque)),
     )  # fmt: skip
 
 

@@ -122,7 +122,7 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
         if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
         else known_stages.left.test.null
     )
-    if np.max(np.abs(np.asarray(screened.diagnosed[1].single))) > LIKELY:
+    if np.max(np.abs(screened.diagnosed[1].single)) > LIKELY:
         while given.later:
             given.later.pop()(screened.base)
     return screened, outliers.diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)

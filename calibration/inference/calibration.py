@@ -350,7 +350,7 @@ def _calibration_result(
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = {k: scans.scan_coordinate(posed, z, k) for k in scans.scanned_coordinates(posed)}
+    scanned = {k: scans.scan_coordinate(posed, z, k) for k in posed.observe.scanned(posed)}
     sd = about.sd.copy()
     for k, scan in scanned.items():
         sd[k] = scan.sd()
