@@ -304,6 +304,23 @@ def test_conditions_that_change_between_many_levels_are_few(observer, runs, robo
     assert varying.times.shape[1] < 1.5 * observer.times.shape[1]  # changes of a thousandth need no short steps
 
 
+@pytest.mark.nightly
+def test_loop_finds_what_was_not_declared_on_a_stair(engine):
+    stairs = engine({**NOMINAL, f"effects.{UNDECLARED}.amplitude": 0.4}, ("stair", "reversal"))
+    analyst = Analyst(
+        dataclasses.replace(settings_for(Histories, 300), slots=1),
+        {n: BY_NAME[n] for n in ("rotating_inertia", UNDECLARED, "churning", "windage")},
+        {"6T2A.ground.friction.static": (0.32, 0.05)},
+    )
+    found = analyst.discover(stairs)
+    # nothing tells it from a winding's resistance that is not what its sheet says
+    assert found.verdict == "class" and [list(e.members) for e in found.effects] == [[UNDECLARED]]
+    assert list(found.effects[0].stated) == ["motor.resistance"]
+    amplitude = found.effects[0].parameters["amplitude"]
+    assert abs(amplitude.value - 0.4) < 4 * amplitude.sd and amplitude.sd < 0.05
+    assert {"mode", "supply_voltage_V"} <= set(found.rows_table())
+
+
 # --- files
 
 HEADER = "run_id,time_s,configuration,supply_voltage_V,payload_kg,slope_deg,speed_mm_s,total_mass_kg"

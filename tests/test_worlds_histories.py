@@ -1,13 +1,13 @@
-"""Synthetic histories: physics and effects against `drive`."""
+"""Synthetic histories: physics and effects against `drive`, surfaces and samplings, gaps, events, sizes and labels."""
 
 import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from worlds import histories, laws, machines
+from worlds import histories, laws, machines, settled
 from worlds.histories import SERIES, simulated
-from worlds.settled import CLIMBING
+from worlds.settled import CLIMBING, of_rows
 
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive_batch
@@ -97,6 +97,37 @@ def test_effect_of_a_series_agrees_with_drive(package, name):
     assert apart(there, package(battery)) > 3e-5
 
 
+def at_rest(w, **changes):
+    """Of a world's settled travel, rates of its states, shape (states, runs), and these states."""
+    s, sound = settled.solve(w.conditions, w.constants)
+    assert sound.all()
+    y = np.zeros((len(histories.STATES), len(s.I)))
+    y[:3] = s.x
+    return histories.rates(10.0, y, w.conditions, 0.0, of_rows(w.conditions, dict(w.constants) | changes), ()), y
+
+
+def test_settled_travel_of_another_robot_does_not_change():
+    for variety in range(3):
+        w = world("robots", variety, seed=2)
+        rates, y = at_rest(w)
+        assert np.abs(rates[:3] / y[:3]).max() < 1e-5
+        moved, _ = at_rest(w, **{"gearbox.efficiency_load": 1.01 * w.constants["gearbox.efficiency_load"]})
+        assert np.abs(moved[1]).max() > 1.0  # rad/s²
+
+
+@pytest.mark.slow
+def test_steps_are_fine_enough_for_the_stickiest_contact():
+    w = brief(world("plain"), 0.06)
+    p = dict(w.constants)
+    for role in machines.ROLES:
+        p |= {f"{role}.ground.friction.static": 1.0, f"{role}.ground.friction.speed_static": 0.002,
+              f"{role}.ground.friction.speed_dynamic": 0.02}  # fmt: skip
+    assert histories.fastest(w.conditions, p) > 2.0 / histories.STEP
+    _, y = simulated(w, p, w.conditions)
+    _, finer = histories.histories(w.conditions, 0.06, histories.BASE, p, step=4e-5)
+    assert apart(finer, y) < 2e-4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("variety", range(3))
 def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):
@@ -110,3 +141,9 @@ def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):
     run = Conditions(index, c.U, np.degrees(c.slope), c.payload, total_mass=c.mass)
     times, y = simulated(w, w.constants, c)
     assert apart(y, driven(robot, run, times)) < 1e-4
+
+
+# --- worlds and tables ----------------------------------------------------------------------------------
+
+
+# --- effects --------------------------------------------------------------------------------------------
